@@ -1,0 +1,96 @@
+/* Completions become columns of numbers in engineering units. */
+#include "multidrop.h"
+
+#include <math.h>
+#include <string.h>
+
+static const uint8_t wire_bytes[] = {
+    [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_U32_SWAPPED] = 4,
+    [MD_I32_SWAPPED] = 4, [MD_U32_EITHER] = 4, [MD_F32] = 4, [MD_F32_SWAPPED] = 4,
+};
+
+static uint32_t word(const uint8_t *at)
+{
+    return (uint32_t)at[0] << 8 | at[1];
+}
+
+static double as_float(uint32_t bits)
+{
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return (double)value;
+}
+
+double md_value(const uint8_t *data, size_t len, size_t at, int wire)
+{
+    if (wire == MD_BIT) /* the first coil is the least significant bit of the first byte */
+        return at / 8 < len ? (data[at / 8] >> (at % 8)) & 1 : (double)NAN;
+    if (wire < 0 || (size_t)wire >= sizeof wire_bytes || 2 * at + wire_bytes[wire] > len)
+        return (double)NAN;
+    const uint8_t *first = data + 2 * at;
+    uint32_t one = word(first), two = wire_bytes[wire] == 4 ? word(first + 2) : 0;
+    switch (wire) {
+    case MD_I16: return (int16_t)one;
+    case MD_U32: return one << 16 | two;
+    case MD_I32: return (int32_t)(one << 16 | two);
+    case MD_U32_SWAPPED: return two << 16 | one;
+    case MD_I32_SWAPPED: return (int32_t)(two << 16 | one);
+    case MD_U32_EITHER: return one | two; /* word order not stated, and one of the words is 0 */
+    case MD_F32: return as_float(one << 16 | two);
+    case MD_F32_SWAPPED: return as_float(two << 16 | one);
+    default: return one;
+    }
+}
+
+static void set_bit(uint8_t *bits, size_t at, int on)
+{
+    uint8_t mask = (uint8_t)(1u << (at % 8));
+    bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
+}
+
+static uint16_t status_of(const struct md_completion *completion)
+{
+    if (completion->result <= 0)
+        return (uint16_t)-completion->result;
+    return completion->reply.exception ? (uint16_t)(256 + completion->reply.exception) : 0;
+}
+
+int md_columns_add(struct md_columns *columns, const struct md_block *block,
+                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns)
+{
+    if (columns->room - columns->rows < (size_t)block->count)
+        return 0;
+    uint16_t status = status_of(completion);
+    for (int i = 0; i < block->count; i++) {
+        const struct md_field *field = &block->fields[i];
+        size_t row = columns->rows++;
+        double value = status ? (double)NAN
+                              : md_value(completion->reply.data, completion->reply.data_len, field->at, field->wire);
+        columns->time[row] = completion->sent_ns + utc_minus_monotonic_ns;
+        columns->sent[row] = completion->sent_ns;
+        columns->uncertainty[row] = status ? 0 : completion->first_ns - completion->sent_ns;
+        columns->drive[row] = field->drive;
+        columns->reg[row] = field->reg;
+        columns->status[row] = status;
+        columns->value[row] = status ? 0 : value * field->multiplier / field->divisor;
+        set_bit(columns->valid, row, status == 0);
+    }
+    return block->count;
+}
+
+int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets,
+                 int32_t *out_offsets, uint8_t *out, size_t room)
+{
+    size_t used = 0;
+    out_offsets[0] = 0;
+    for (size_t i = 0; i < n; i++) {
+        int32_t from = offsets[codes[i]];
+        size_t len = (size_t)(offsets[codes[i] + 1] - from);
+        if (room - used < len || used + len > INT32_MAX)
+            return -1;
+        memcpy(out + used, bytes + from, len);
+        used += len;
+        out_offsets[i + 1] = (int32_t)used;
+    }
+    return (int64_t)used;
+}

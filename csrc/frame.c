@@ -1,0 +1,405 @@
+/* Requests and replies in three framings: Modbus RTU, Modbus ASCII, Delixi's own ASCII.
+ *
+ * Both Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3, serial-line
+ * guide V1.02); here they are called the body. Delixi's body is A K P1 P0 D3 D2 D1 D0. */
+#include "multidrop.h"
+
+#include <string.h>
+
+/* What follows address and function code. */
+enum shape {
+    NONE,         /* no such function */
+    RANGE,        /* start, count */
+    DATA,         /* byte count, data */
+    ECHO,         /* start, two bytes */
+    RANGE_DATA    /* start, count, byte count, data */
+};
+
+enum { BIT = 1, WORD = 16 };
+
+static const struct function {
+    uint8_t request, reply; /* enum shape */
+    uint8_t unit_bits;      /* BIT or WORD: what count counts */
+    uint16_t most;          /* the largest count */
+} functions[] = {
+    [0x01] = {RANGE, DATA, BIT, 2000},
+    [0x02] = {RANGE, DATA, BIT, 2000},
+    [0x03] = {RANGE, DATA, WORD, 125},
+    [0x04] = {RANGE, DATA, WORD, 125},
+    [0x05] = {ECHO, ECHO, BIT, 1},
+    [0x06] = {ECHO, ECHO, WORD, 1},
+    [0x08] = {ECHO, ECHO, WORD, 1},
+    [0x0F] = {RANGE_DATA, RANGE, BIT, 1968},
+    [0x10] = {RANGE_DATA, RANGE, WORD, 123},
+};
+
+enum {
+    MOST_ADDRESS = 247,
+    MOST_BODY = 254,
+    EXCEPTION_BODY = 3,
+    EXCEPTION_BIT = 0x80,
+    DELIXI_BODY = 8,
+    DELIXI_FRAME = 21,
+    DELIXI_BROADCAST_COMMAND = 2 /* only K=02 may be broadcast */
+};
+
+static const struct function *find_function(uint8_t code)
+{
+    static const struct function none = {NONE, NONE, 0, 0};
+    return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
+}
+
+static size_t data_bytes(const struct function *function, unsigned count)
+{
+    return (count * function->unit_bits + 7) / 8;
+}
+
+static void put16(uint8_t *at, unsigned value)
+{
+    at[0] = (uint8_t)(value >> 8);
+    at[1] = (uint8_t)value;
+}
+
+static uint16_t get16(const uint8_t *at)
+{
+    return (uint16_t)(at[0] << 8 | at[1]);
+}
+
+/* ---- bodies ---- */
+
+static size_t put_body(int shape, const struct md_message *message, uint8_t *body)
+{
+    size_t data_at = 2;
+    if (shape != DATA) {
+        put16(body + 2, message->start);
+        data_at = 4;
+    }
+    if (shape == RANGE || shape == RANGE_DATA) {
+        put16(body + 4, message->count);
+        data_at = 6;
+    }
+    if (shape == RANGE)
+        return data_at;
+    if (shape == DATA || shape == RANGE_DATA)
+        body[data_at++] = (uint8_t)message->data_len;
+    memcpy(body + data_at, message->data, message->data_len);
+    return data_at + message->data_len;
+}
+
+static void get_body(int shape, const uint8_t *body, struct md_message *message)
+{
+    size_t data_at = 2, data_len = 0;
+    if (shape != DATA) {
+        message->start = get16(body + 2);
+        data_at = 4;
+    }
+    if (shape == RANGE || shape == RANGE_DATA) {
+        message->count = get16(body + 4);
+        data_at = 6;
+    }
+    if (shape == DATA || shape == RANGE_DATA)
+        data_len = body[data_at++];
+    if (shape == ECHO)
+        data_len = 2;
+    message->data_len = (uint16_t)data_len;
+    memcpy(message->data, body + data_at, data_len);
+}
+
+/* Length of a request's body from its first bytes; 0 when they do not tell yet. */
+static int request_length(int framing, const uint8_t *body, size_t have)
+{
+    if (framing == MD_DELIXI)
+        return DELIXI_BODY;
+    if (have < 2)
+        return MD_INCOMPLETE;
+    const struct function *function = find_function(body[1]);
+    if (function->request == NONE)
+        return MD_BAD_FUNCTION;
+    if (function->request != RANGE_DATA)
+        return 6;
+    if (have < 7)
+        return MD_INCOMPLETE;
+    unsigned count = get16(body + 4);
+    if (count > function->most || body[6] != data_bytes(function, count))
+        return MD_BAD_LENGTH;
+    return 7 + body[6];
+}
+
+/* The same of the reply to `request`, which is refused as soon as its first bytes differ. */
+static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
+{
+    if (have >= 1 && (request->address == 0 || body[0] != request->address))
+        return MD_BAD_ADDRESS;
+    if (framing == MD_DELIXI) {
+        if (have >= 2 && body[1] != request->function && body[1] != 0xF0 && body[1] < 0xFC)
+            return MD_BAD_FUNCTION;
+        return DELIXI_BODY;
+    }
+    if (have < 2)
+        return MD_INCOMPLETE;
+    const struct function *function = find_function(request->function);
+    /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
+    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == 0x08 && body[1] == 0x89)) {
+        if (have >= EXCEPTION_BODY && body[2] == 0)
+            return MD_BAD_FUNCTION;
+        return EXCEPTION_BODY;
+    }
+    if (body[1] != request->function)
+        return MD_BAD_FUNCTION;
+    if (function->reply != DATA)
+        return 6;
+    if (have < 3)
+        return MD_INCOMPLETE;
+    if (body[2] != data_bytes(function, request->count))
+        return MD_BAD_LENGTH;
+    return 3 + body[2];
+}
+
+/* ---- frames ---- */
+
+static int body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
+{
+    return request ? reply_length(framing, body, have, request) : request_length(framing, body, have);
+}
+
+static int hex_digit(uint8_t character)
+{
+    if (character >= '0' && character <= '9')
+        return character - '0';
+    if (character >= 'A' && character <= 'F')
+        return character - 'A' + 10;
+    return -1;
+}
+
+static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
+{
+    return framing == MD_ASCII ? md_lrc(body, len) : md_sum(body, len);
+}
+
+static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request, uint8_t *body)
+{
+    if (len > 0 && text[0] != ':')
+        return MD_NO_START;
+    size_t have = 0;
+    int stopped = MD_INCOMPLETE; /* why no more digits can be read */
+    while (have <= MOST_BODY && 2 * have + 2 < len) {
+        int high = hex_digit(text[2 * have + 1]), low = hex_digit(text[2 * have + 2]);
+        if (high < 0 || low < 0) {
+            stopped = MD_BAD_CHARACTER;
+            break;
+        }
+        body[have++] = (uint8_t)(high << 4 | low);
+    }
+    int length = body_length(framing, body, have, request);
+    if (length < 0)
+        return length;
+    if (length == 0 || have <= (size_t)length) /* the checksum's byte follows the body */
+        return stopped;
+    size_t end = 2 * (size_t)length + 3;
+    if ((len > end && text[end] != '\r') || (len > end + 1 && text[end + 1] != '\n'))
+        return MD_BAD_CHARACTER;
+    if (len < end + 2)
+        return MD_INCOMPLETE;
+    if (body[length] != text_checksum(framing, body, (size_t)length))
+        return MD_BAD_CHECKSUM;
+    return (int)end + 2;
+}
+
+static int open_rtu(const uint8_t *bytes, size_t len, const struct md_message *request, const uint8_t **body)
+{
+    int length = body_length(MD_RTU, bytes, len, request);
+    if (length <= 0)
+        return length;
+    if (len < (size_t)length + 2)
+        return MD_INCOMPLETE;
+    uint16_t crc = md_crc16(bytes, (size_t)length);
+    if (bytes[length] != (crc & 0xFF) || bytes[length + 1] != crc >> 8)
+        return MD_BAD_CHECKSUM;
+    *body = bytes;
+    return length + 2;
+}
+
+/* Find the body of the frame that begins at `bytes`: in place, or unhexed into `text`. */
+static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
+                      uint8_t text[MOST_BODY + 1], const uint8_t **body)
+{
+    if (framing == MD_RTU)
+        return open_rtu(bytes, len, request, body);
+    *body = text;
+    return open_text(framing, bytes, len, request, text);
+}
+
+static int close_frame(int framing, uint8_t *body, size_t len, uint8_t *out, size_t room)
+{
+    static const uint8_t digits[] = "0123456789ABCDEF";
+    if (framing == MD_RTU) {
+        if (room < len + 2)
+            return MD_BAD_REQUEST;
+        uint16_t crc = md_crc16(body, len);
+        memcpy(out, body, len);
+        out[len] = (uint8_t)crc;
+        out[len + 1] = (uint8_t)(crc >> 8);
+        return (int)len + 2;
+    }
+    if (room < 2 * len + 5)
+        return MD_BAD_REQUEST;
+    body[len] = text_checksum(framing, body, len);
+    uint8_t *at = out;
+    *at++ = ':';
+    for (size_t i = 0; i <= len; i++) {
+        *at++ = digits[body[i] >> 4];
+        *at++ = digits[body[i] & 15];
+    }
+    *at++ = '\r';
+    *at++ = '\n';
+    return (int)(at - out);
+}
+
+/* ---- Delixi's bodies ---- */
+
+static int build_delixi(const struct md_message *message, uint8_t function, uint8_t *out, size_t room)
+{
+    uint8_t body[MOST_BODY + 1] = {message->address, function};
+    if (message->data_len != 4)
+        return MD_BAD_REQUEST;
+    put16(body + 2, message->start);
+    memcpy(body + 4, message->data, 4);
+    return close_frame(MD_DELIXI, body, DELIXI_BODY, out, room);
+}
+
+static void read_delixi(const uint8_t *body, struct md_message *message)
+{
+    message->address = body[0];
+    message->function = body[1];
+    message->start = get16(body + 2);
+    message->data_len = 4;
+    memcpy(message->data, body + 4, 4);
+}
+
+/* A set-type packet is answered with its copy (part 3, note 1), a query with what was asked for. */
+static int check_delixi(const struct md_message *request, struct md_message *reply)
+{
+    enum { STATE_QUERY = 3, PARAMETER_QUERY = 7 };
+    if (reply->function != request->function) {
+        reply->exception = reply->function;
+        reply->function = request->function;
+        return 0;
+    }
+    if (request->function == STATE_QUERY) { /* the one answer that lies in P1P0: show it as data too */
+        put16(reply->data + 2, reply->start);
+        return 0;
+    }
+    if (reply->start != request->start)
+        return MD_BAD_ECHO;
+    if (request->function != PARAMETER_QUERY && memcmp(reply->data, request->data, 4) != 0)
+        return MD_BAD_ECHO;
+    return 0;
+}
+
+/* ---- the contract ---- */
+
+static int is_sendable(const struct function *function, const struct md_message *message)
+{
+    if (message->address > MOST_ADDRESS)
+        return 0;
+    switch (function->request) {
+    case RANGE:
+    case RANGE_DATA:
+        return message->count >= 1 && message->count <= function->most &&
+               message->start + message->count <= 0x10000 &&
+               message->data_len == (function->request == RANGE ? 0 : data_bytes(function, message->count));
+    case ECHO:
+        /* A coil is FF00H or 0000H and nothing else. */
+        return message->data_len == 2 &&
+               (message->function != 0x05 || (message->data[1] == 0 && (message->data[0] == 0xFF || message->data[0] == 0)));
+    default:
+        return 0;
+    }
+}
+
+int md_build_request(int framing, const struct md_message *message, uint8_t *out, size_t room)
+{
+    if (framing == MD_DELIXI) {
+        if (message->address > MOST_ADDRESS || message->function < 2 || message->function > 7 ||
+            (message->address == 0 && message->function != DELIXI_BROADCAST_COMMAND))
+            return MD_BAD_REQUEST;
+        return build_delixi(message, message->function, out, room);
+    }
+    const struct function *function = find_function(message->function);
+    if (!is_sendable(function, message))
+        return MD_BAD_REQUEST;
+    uint8_t body[MOST_BODY + 1] = {message->address, message->function};
+    return close_frame(framing, body, put_body(function->request, message, body), out, room);
+}
+
+int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room)
+{
+    if (framing == MD_DELIXI)
+        return build_delixi(message, message->exception ? message->exception : message->function, out, room);
+    uint8_t body[MOST_BODY + 1] = {message->address, message->function};
+    if (message->exception) {
+        body[1] |= EXCEPTION_BIT;
+        body[2] = message->exception;
+        return close_frame(framing, body, EXCEPTION_BODY, out, room);
+    }
+    const struct function *function = find_function(message->function);
+    if (function->reply == NONE || message->data_len > MD_MOST_DATA ||
+        (function->reply == ECHO && message->data_len != 2))
+        return MD_BAD_REQUEST;
+    return close_frame(framing, body, put_body(function->reply, message, body), out, room);
+}
+
+int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
+{
+    uint8_t text[MOST_BODY + 1];
+    const uint8_t *body;
+    int used = open_frame(framing, bytes, len, NULL, text, &body);
+    if (used <= 0)
+        return used;
+    *message = (struct md_message){.address = body[0], .function = body[1]};
+    if (framing == MD_DELIXI)
+        read_delixi(body, message);
+    else
+        get_body(find_function(body[1])->request, body, message);
+    return used;
+}
+
+int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
+                   const struct md_message *request, struct md_message *reply)
+{
+    uint8_t text[MOST_BODY + 1];
+    const uint8_t *body;
+    int used = open_frame(framing, bytes, len, request, text, &body);
+    if (used <= 0)
+        return used;
+    *reply = (struct md_message){.address = body[0], .function = request->function};
+    if (framing == MD_DELIXI) {
+        read_delixi(body, reply);
+        int refusal = check_delixi(request, reply);
+        return refusal ? refusal : used;
+    }
+    if (body[1] & EXCEPTION_BIT) {
+        reply->exception = body[2];
+        return used;
+    }
+    int shape = find_function(body[1])->reply;
+    get_body(shape, body, reply);
+    if (shape == DATA) {
+        reply->start = request->start;
+        reply->count = request->count;
+    } else if (reply->start != request->start || reply->count != request->count ||
+               memcmp(reply->data, request->data, reply->data_len) != 0)
+        return MD_BAD_ECHO;
+    return used;
+}
+
+int md_reply_length(int framing, const struct md_message *request)
+{
+    if (request->address == 0)
+        return 0;
+    if (framing == MD_DELIXI)
+        return DELIXI_FRAME;
+    const struct function *function = find_function(request->function);
+    int body = function->reply == DATA ? 3 + (int)data_bytes(function, request->count) : 6;
+    return framing == MD_RTU ? body + 2 : 2 * body + 5;
+}

@@ -1,0 +1,203 @@
+/* One line as a state machine: silence, request, reply or time-out. It knows neither descriptor
+ * nor clock: bytes and time come in as arguments.
+ *
+ * The expected reply may begin anywhere in what was received, because driver turn-on junk, local
+ * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
+ * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
+#include "multidrop.h"
+
+#include <errno.h>
+#include <string.h>
+
+enum state {
+    IDLE,
+    SILENT,    /* waits until the line has been silent for long enough */
+    LOOKING,   /* looks for bytes that came meanwhile, once, before it sends */
+    SENDING,
+    LISTENING
+};
+
+/* How much a reason says about what went wrong: the one that says most is reported. */
+static int weight(int reason)
+{
+    static const uint8_t weights[] = {
+        [-MD_NO_START] = 1,
+        [-MD_BAD_ADDRESS] = 2,
+        [-MD_BAD_FUNCTION] = 3,
+        [-MD_BAD_LENGTH] = 4,
+        [-MD_BAD_CHARACTER] = 5,
+        [-MD_CUT_SHORT] = 6,
+        [-MD_BAD_CHECKSUM] = 7,
+        [-MD_BAD_ECHO] = 8,
+    };
+    return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
+}
+
+static int64_t later(int64_t a, int64_t b)
+{
+    return a > b ? a : b;
+}
+
+static void finish(struct md_line *line, int result, const uint8_t *raw, size_t raw_len)
+{
+    struct md_completion *completion = line->completion;
+    if (raw_len > sizeof completion->raw) {
+        raw += raw_len - sizeof completion->raw;
+        raw_len = sizeof completion->raw;
+    }
+    completion->result = result;
+    completion->raw_len = (uint16_t)raw_len;
+    memcpy(completion->raw, raw, raw_len);
+    line->quiet_ns = later(line->quiet_ns, completion->last_ns);
+    line->silence_ns = line->exchange->silence_ns;
+    line->state = IDLE;
+}
+
+static void time_out(struct md_line *line)
+{
+    if (line->completion->last_ns == 0)
+        finish(line, MD_NO_REPLY, line->rx, 0);
+    else
+        finish(line, line->reason, line->rx, line->rx_len);
+}
+
+/* Look for the reply at every place where it may still begin. */
+static void search(struct md_line *line)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_completion *completion = line->completion;
+    uint16_t first_open = line->rx_len;
+    for (uint16_t at = line->rx_from; at < line->rx_len; at++) {
+        int used = md_parse_reply(exchange->framing, line->rx + at, (size_t)(line->rx_len - at),
+                                  &exchange->request, &completion->reply);
+        if (used > 0) {
+            completion->skipped += (uint32_t)(line->rx_len - used);
+            finish(line, used, line->rx + at, (size_t)used);
+            return;
+        }
+        if (used == MD_INCOMPLETE && at < first_open)
+            first_open = at;
+        int reason = used == MD_INCOMPLETE ? MD_CUT_SHORT : used;
+        if (weight(reason) > weight(line->reason))
+            line->reason = reason;
+    }
+    line->rx_from = first_open;
+}
+
+/* Make room: what lies before the first place where a reply may begin is of no more use, and of
+ * endless garbage the older half goes. */
+static void forget(struct md_line *line)
+{
+    uint16_t gone = line->rx_from > 0 ? line->rx_from : (uint16_t)(sizeof line->rx / 2);
+    line->completion->skipped += gone;
+    line->rx_len = (uint16_t)(line->rx_len - gone);
+    line->rx_from = 0;
+    memmove(line->rx, line->rx + gone, line->rx_len);
+}
+
+void md_line_init(struct md_line *line, int64_t now_ns)
+{
+    *line = (struct md_line){.state = IDLE, .quiet_ns = now_ns};
+}
+
+void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
+                   struct md_completion *completion, int64_t now_ns)
+{
+    *completion = (struct md_completion){0};
+    line->exchange = exchange;
+    line->completion = completion;
+    line->tx_at = line->rx_len = line->rx_from = 0;
+    line->reason = 0;
+    line->silence_ns = later(line->silence_ns, exchange->silence_ns);
+    line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->timeout_ns;
+    line->state = SILENT;
+    int length = md_build_request(exchange->framing, &exchange->request, line->tx, sizeof line->tx);
+    if (length < 0)
+        finish(line, length, line->rx, 0);
+    else
+        line->tx_len = (uint16_t)length;
+}
+
+int md_line_want(struct md_line *line, int64_t now_ns)
+{
+    switch (line->state) {
+    case SILENT:
+        line->wake_ns = line->quiet_ns + line->silence_ns;
+        if (line->wake_ns > line->give_up_ns)
+            line->wake_ns = line->give_up_ns;
+        if (now_ns >= line->wake_ns)
+            line->state = LOOKING;
+        return MD_READ;
+    case LOOKING:
+        line->state = SENDING;
+        line->wake_ns = now_ns + line->exchange->timeout_ns + line->tx_len * line->exchange->character_ns;
+        return MD_WRITE;
+    case SENDING: /* a port that takes nothing is a broken port */
+        if (now_ns < line->wake_ns)
+            return MD_WRITE;
+        md_line_lost(line, MD_LINE_LOST, ETIMEDOUT);
+        return MD_DONE;
+    case LISTENING:
+        if (now_ns < line->wake_ns)
+            return MD_READ;
+        time_out(line);
+        return MD_DONE;
+    default:
+        return MD_DONE;
+    }
+}
+
+void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    if (line->state != SENDING)
+        return;
+    if (line->tx_at == 0)
+        line->completion->sent_ns = now_ns;
+    line->tx_at = (uint16_t)(line->tx_at + len);
+    if (line->tx_at < line->tx_len)
+        return;
+    line->quiet_ns = line->completion->sent_ns + line->tx_len * exchange->character_ns;
+    int reply_len = md_reply_length(exchange->framing, &exchange->request);
+    if (reply_len == 0) {
+        finish(line, 0, line->rx, 0);
+        line->silence_ns = later(exchange->silence_ns, exchange->turnaround_ns);
+        return;
+    }
+    line->wake_ns = line->quiet_ns + exchange->timeout_ns + reply_len * exchange->character_ns;
+    line->state = LISTENING;
+}
+
+void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    struct md_completion *completion = line->completion;
+    if (line->state == SILENT || line->state == LOOKING) {
+        completion->stale += (uint32_t)len;
+        line->quiet_ns = now_ns;
+        line->state = SILENT;
+        return;
+    }
+    if (line->state != LISTENING || len == 0)
+        return;
+    if (completion->first_ns == 0)
+        completion->first_ns = now_ns;
+    completion->last_ns = now_ns;
+    while (len > 0 && line->state == LISTENING) {
+        if (line->rx_len == sizeof line->rx)
+            forget(line);
+        size_t room = sizeof line->rx - line->rx_len, taken = len < room ? len : room;
+        memcpy(line->rx + line->rx_len, bytes, taken);
+        line->rx_len = (uint16_t)(line->rx_len + taken);
+        bytes += taken;
+        len -= taken;
+        search(line);
+    }
+}
+
+void md_line_lost(struct md_line *line, int result, int error)
+{
+    if (line->state == IDLE)
+        return;
+    line->completion->error = error;
+    finish(line, result, line->rx, line->rx_len);
+}

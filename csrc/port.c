@@ -1,0 +1,97 @@
+/* Serial settings of a descriptor, made by ioctl and read back.
+ *
+ * tcsetattr() reports EINVAL when nothing of what it was asked for took effect, so that a pty
+ * cannot be reopened at even parity; the ioctl does not, and takes any baud rate. */
+#include "multidrop.h"
+
+#include <errno.h>
+#include <string.h>
+
+#ifdef __linux__
+#include <asm/termbits.h>
+#include <sys/ioctl.h>
+typedef struct termios2 attributes;
+
+static int get(int fd, attributes *now)
+{
+    return ioctl(fd, TCGETS2, now) ? -errno : 0;
+}
+
+static int set(int fd, attributes *wanted, uint32_t baudrate)
+{
+    wanted->c_cflag = (wanted->c_cflag & ~(tcflag_t)(CBAUD | CBAUD << IBSHIFT)) | BOTHER | BOTHER << IBSHIFT;
+    wanted->c_ispeed = wanted->c_ospeed = baudrate;
+    return ioctl(fd, TCSETS2, wanted) ? -errno : 0;
+}
+
+static uint32_t speed(const attributes *now)
+{
+    return now->c_ospeed;
+}
+#else
+#include <termios.h>
+typedef struct termios attributes;
+
+static int get(int fd, attributes *now)
+{
+    return tcgetattr(fd, now) ? -errno : 0;
+}
+
+static int set(int fd, attributes *wanted, uint32_t baudrate)
+{
+    if (cfsetspeed(wanted, baudrate))
+        return -errno;
+    return tcsetattr(fd, TCSANOW, wanted) && errno != EINVAL ? -errno : 0;
+}
+
+static uint32_t speed(const attributes *now)
+{
+    return (uint32_t)cfgetospeed(now);
+}
+#endif
+
+static struct md_settings describe(const attributes *now)
+{
+    return (struct md_settings){
+        .baudrate = speed(now),
+        .databits = (now->c_cflag & CSIZE) == CS7 ? 7 : 8,
+        .parity = !(now->c_cflag & PARENB) ? 'N' : now->c_cflag & PARODD ? 'O' : 'E',
+        .stopbits = now->c_cflag & CSTOPB ? 2 : 1,
+    };
+}
+
+int md_port_get(int fd, struct md_settings *settings)
+{
+    attributes now;
+    int failure = get(fd, &now);
+    if (!failure)
+        *settings = describe(&now);
+    return failure;
+}
+
+int md_port_set(int fd, const struct md_settings *settings)
+{
+    attributes port;
+    int failure = get(fd, &port);
+    if (failure)
+        return failure;
+    port.c_iflag = 0;
+    port.c_oflag = 0;
+    port.c_lflag = 0;
+    port.c_cflag &= ~(tcflag_t)(CSIZE | PARENB | PARODD | CSTOPB | CRTSCTS);
+    port.c_cflag |= CREAD | CLOCAL;
+    port.c_cflag |= settings->databits == 7 ? CS7 : CS8;
+    port.c_cflag |= settings->stopbits == 2 ? CSTOPB : 0;
+    port.c_cflag |= settings->parity == 'N' ? 0 : settings->parity == 'O' ? PARENB | PARODD : PARENB;
+    /* A character with a parity error is dropped: the frame is damaged, and must not look whole. */
+    port.c_iflag |= settings->parity == 'N' ? 0 : INPCK | IGNPAR;
+    port.c_cc[VMIN] = 1;
+    port.c_cc[VTIME] = 0;
+    if ((failure = set(fd, &port, settings->baudrate)) != 0 || (failure = get(fd, &port)) != 0)
+        return failure;
+    struct md_settings taken = describe(&port);
+    return (taken.baudrate != settings->baudrate ? MD_REFUSED_BAUDRATE : 0) |
+           (taken.databits != settings->databits ? MD_REFUSED_DATABITS : 0) |
+           (taken.parity != settings->parity ? MD_REFUSED_PARITY : 0) |
+           (taken.stopbits != settings->stopbits ? MD_REFUSED_STOPBITS : 0);
+}

@@ -1,0 +1,400 @@
+"""The only importer of the compiled module: frames, exchanges and columns for Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Literal, NamedTuple
+
+from multidrop._core import ffi, lib
+
+now_ns = lib.md_now_ns
+crc16 = lib.md_crc16
+lrc = lib.md_lrc
+sum8 = lib.md_sum
+
+
+class Framing(IntEnum):
+    RTU = lib.MD_RTU
+    ASCII = lib.MD_ASCII
+    DELIXI = lib.MD_DELIXI
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Wire(IntEnum):
+    """How a number lies in a reply's data; words are big-endian, SWAPPED has the low word first."""
+
+    U16 = lib.MD_U16
+    I16 = lib.MD_I16
+    U32 = lib.MD_U32
+    I32 = lib.MD_I32
+    U32_SWAPPED = lib.MD_U32_SWAPPED
+    I32_SWAPPED = lib.MD_I32_SWAPPED
+    U32_EITHER = lib.MD_U32_EITHER
+    F32 = lib.MD_F32
+    F32_SWAPPED = lib.MD_F32_SWAPPED
+    BIT = lib.MD_BIT
+
+
+class Result(IntEnum):
+    """Why there is no reply, or why bytes are not what was looked for (enum md_result)."""
+
+    INCOMPLETE = lib.MD_INCOMPLETE
+    NO_START = lib.MD_NO_START
+    BAD_CHARACTER = lib.MD_BAD_CHARACTER
+    BAD_CHECKSUM = lib.MD_BAD_CHECKSUM
+    BAD_ADDRESS = lib.MD_BAD_ADDRESS
+    BAD_FUNCTION = lib.MD_BAD_FUNCTION
+    BAD_LENGTH = lib.MD_BAD_LENGTH
+    BAD_ECHO = lib.MD_BAD_ECHO
+    BAD_REQUEST = lib.MD_BAD_REQUEST
+    CUT_SHORT = lib.MD_CUT_SHORT
+    NO_REPLY = lib.MD_NO_REPLY
+    LINE_LOST = lib.MD_LINE_LOST
+    SETTINGS_REFUSED = lib.MD_SETTINGS_REFUSED
+    NOT_ASKED = lib.MD_NOT_ASKED
+
+    def __str__(self) -> str:
+        return _REASONS[self]
+
+
+_REASONS = {
+    Result.INCOMPLETE: "ok",
+    Result.NO_START: "no frame in what was received",
+    Result.BAD_CHARACTER: "bad character",
+    Result.BAD_CHECKSUM: "bad checksum",
+    Result.BAD_ADDRESS: "reply from another address",
+    Result.BAD_FUNCTION: "reply to another function",
+    Result.BAD_LENGTH: "reply of another length",
+    Result.BAD_ECHO: "write confirmed with another address or value",
+    Result.BAD_REQUEST: "request cannot be built",
+    Result.CUT_SHORT: "reply cut short",
+    Result.NO_REPLY: "no reply",
+    Result.LINE_LOST: "port lost",
+    Result.SETTINGS_REFUSED: "port refused its settings",
+    Result.NOT_ASKED: "not asked: the drive is silent",
+}
+
+EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
+
+
+def status_text(status: int) -> str:
+    """What a status column says for the core's status code."""
+    if status >= EXCEPTION_STATUS:
+        return f"exception {status - EXCEPTION_STATUS:02X}"
+    return str(Result(-status))
+
+
+@dataclass(frozen=True)
+class Message:
+    """One frame's meaning, whatever its framing (struct md_message)."""
+
+    address: int
+    function: int
+    start: int = 0
+    count: int = 0
+    data: bytes = b""
+    exception: int = 0
+
+
+def _to_c(message: Message) -> Any:
+    if len(message.data) > lib.MD_MOST_DATA:
+        raise ValueError(f"{len(message.data)} data bytes do not fit a frame: {lib.MD_MOST_DATA} at most")
+    return ffi.new(
+        "struct md_message *",
+        {
+            "address": message.address,
+            "function": message.function,
+            "exception": message.exception,
+            "start": message.start,
+            "count": message.count,
+            "data_len": len(message.data),
+            "data": list(message.data),
+        },
+    )
+
+
+def _from_c(found: Any) -> Message:
+    return Message(
+        found.address,
+        found.function,
+        found.start,
+        found.count,
+        bytes(ffi.buffer(found.data, found.data_len)),
+        found.exception,
+    )
+
+
+def _build(build: Any, framing: Framing, message: Message) -> bytes:
+    room = lib.MD_MOST_FRAME
+    out = ffi.new("uint8_t[]", room)
+    length = build(framing, _to_c(message), out, room)
+    if length < 0:
+        raise ValueError(f"no {framing} frame can say {message}")
+    return bytes(ffi.buffer(out, length))
+
+
+def build_request(framing: Framing, message: Message) -> bytes:
+    """The frame of a request; ValueError when a field is out of bounds."""
+    return _build(lib.md_build_request, framing, message)
+
+
+def build_reply(framing: Framing, message: Message) -> bytes:
+    """The frame of a reply, for the drive's side; ValueError when a field is out of bounds."""
+    return _build(lib.md_build_reply, framing, message)
+
+
+def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | None]:
+    """The request at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    found = ffi.new("struct md_message *")
+    used = lib.md_parse_request(framing, received, len(received), found)
+    return used, _from_c(found) if used > 0 else None
+
+
+def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
+    """The reply to `request` at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    found = ffi.new("struct md_message *")
+    used = lib.md_parse_reply(framing, received, len(received), _to_c(request), found)
+    return used, _from_c(found) if used > 0 else None
+
+
+def reply_length(framing: Framing, request: Message) -> int:
+    """Length in bytes of the good reply to `request`; 0 after a broadcast."""
+    return int(lib.md_reply_length(framing, _to_c(request)))
+
+
+def raw_value(data: bytes, at: int, wire: Wire) -> float:
+    """The number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it."""
+    return float(lib.md_value(data, len(data), at, wire))
+
+
+def get_settings(fd: int) -> tuple[int, str]:
+    """Baud rate and format in force on a port; OSError where it has none."""
+    settings = ffi.new("struct md_settings *")
+    failure = lib.md_port_get(fd, settings)
+    if failure:
+        raise OSError(-failure, "no serial settings")
+    return settings.baudrate, f"{settings.databits}{settings.parity.decode()}{settings.stopbits}"
+
+
+def set_settings(fd: int, baudrate: int, format: str) -> int:
+    """Make a port raw with these settings; the mask of what it did not take. OSError where it has none."""
+    refused = lib.md_port_set(fd, ffi.new("struct md_settings *", _settings(baudrate, format)))
+    if refused < 0:
+        raise OSError(-refused, "no serial settings")
+    return int(refused)
+
+
+def _settings(baudrate: int, format: str) -> dict[str, object]:
+    return {
+        "baudrate": baudrate,
+        "databits": int(format[0]),
+        "parity": format[1].encode(),
+        "stopbits": int(format[2]),
+    }
+
+
+REFUSALS = {
+    lib.MD_REFUSED_BAUDRATE: "baud rate",
+    lib.MD_REFUSED_DATABITS: "data bits",
+    lib.MD_REFUSED_PARITY: "parity",
+    lib.MD_REFUSED_STOPBITS: "stop bits",
+}
+
+
+class Exchange:
+    """One request and all that is needed to carry it out; made once, run as often as wanted.
+
+    Times are in seconds: `character` of one character, `silence` before the request and after
+    its reply, `timeout` to the reply's first character, `turnaround` after a broadcast.
+    """
+
+    __slots__ = ("c", "framing", "request")
+
+    def __init__(
+        self,
+        framing: Framing,
+        request: Message,
+        *,
+        baudrate: int,
+        format: str,
+        character: float,
+        silence: float,
+        timeout: float,
+        turnaround: float = 0.1,
+    ) -> None:
+        build_request(framing, request)  # raises for what no frame can say
+        self.framing = framing
+        self.request = request
+        self.c = ffi.new(
+            "struct md_exchange *",
+            {
+                "framing": framing,
+                "request": _to_c(request)[0],
+                "settings": _settings(baudrate, format),
+                "character_ns": round(character * 1e9),
+                "silence_ns": round(silence * 1e9),
+                "timeout_ns": round(timeout * 1e9),
+                "turnaround_ns": round(turnaround * 1e9),
+            },
+        )
+
+
+@dataclass(frozen=True)
+class Completion:
+    """What became of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
+
+    result: int
+    error: int
+    sent_ns: int
+    first_ns: int
+    last_ns: int
+    stale: int
+    skipped: int
+    reply: Message
+    raw: bytes
+
+
+class Completions:
+    """What became of a run of exchanges, in the core's own memory until it is looked at."""
+
+    def __init__(self, room: int) -> None:
+        self.c = ffi.new("struct md_completion[]", room)
+        self.room = room
+        self.count = 0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, at: int) -> Completion:
+        if not 0 <= at < self.count:
+            raise IndexError(at)
+        found = self.c[at]
+        return Completion(
+            found.result,
+            found.error,
+            found.sent_ns,
+            found.first_ns,
+            found.last_ns,
+            found.stale,
+            found.skipped,
+            _from_c(found.reply),
+            bytes(ffi.buffer(found.raw, found.raw_len)),
+        )
+
+    def __iter__(self) -> Iterator[Completion]:
+        return (self[at] for at in range(self.count))
+
+
+class Port:
+    """A line driven on a descriptor (struct md_port).
+
+    `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings.
+    """
+
+    def __init__(self, fd: int, must_take: int) -> None:
+        self.c = ffi.new("struct md_port *")
+        lib.md_port_init(self.c, fd, must_take)
+
+    def run(self, exchanges: Sequence[Exchange], completions: Completions) -> int:
+        """Carry them out one after another, without the interpreter lock; how many were completed."""
+        if len(exchanges) > completions.room:
+            raise ValueError(f"{len(exchanges)} exchanges, but room for {completions.room} completions")
+        todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
+        completions.count = lib.md_run(self.c, todo, completions.c, len(exchanges))
+        return int(completions.count)
+
+    def yield_now(self, wanted: bool) -> None:
+        """Make a run under way return after its present exchange, until this is taken back."""
+        lib.md_port_yield(self.c, wanted)
+
+
+class Field(NamedTuple):
+    """Where a register lies in a block's reply, its scale, and the codes of its names."""
+
+    at: int
+    wire: Wire
+    drive: int
+    register: int
+    multiplier: float
+    divisor: float
+
+
+class Block:
+    """The fields that one exchange's reply holds (struct md_block)."""
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self._fields = ffi.new("struct md_field[]", [tuple(field) for field in fields])
+        self.c = ffi.new("struct md_block *", {"fields": self._fields, "count": len(fields)})
+        self.count = len(fields)
+
+
+COLUMNS = {
+    "time": "int64_t[]",
+    "sent": "int64_t[]",
+    "uncertainty": "int64_t[]",
+    "drive": "uint16_t[]",
+    "reg": "uint16_t[]",
+    "status": "uint16_t[]",
+    "value": "double[]",
+}
+_ITEMS: dict[str, tuple[int, Literal["q", "H", "d"]]] = {
+    "int64_t[]": (8, "q"),
+    "uint16_t[]": (2, "H"),
+    "double[]": (8, "d"),
+}
+
+
+class Columns:
+    """Rows in the core's own memory: one array a column (struct md_columns)."""
+
+    def __init__(self, room: int) -> None:
+        self._arrays = {name: ffi.new(kind, room) for name, kind in COLUMNS.items()}
+        self._arrays["valid"] = ffi.new("uint8_t[]", (room + 7) // 8)
+        self.c = ffi.new("struct md_columns *", {**self._arrays, "rows": 0, "room": room})
+
+    def __len__(self) -> int:
+        return int(self.c.rows)
+
+    def add(self, block: Block, completions: Completions, at: int, utc_minus_monotonic_ns: int) -> bool:
+        """Append the rows of one completion; False when there is no room for all of them."""
+        return bool(lib.md_columns_add(self.c, block.c, completions.c + at, utc_minus_monotonic_ns))
+
+    def add_miss(self, block: Block, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
+        """Append rows for values that were due at `due_ns` but never asked for."""
+        missed = ffi.new("struct md_completion *", {"result": result, "sent_ns": due_ns})
+        return bool(lib.md_columns_add(self.c, block.c, missed, utc_minus_monotonic_ns))
+
+    def array(self, name: str) -> memoryview[Any]:
+        """A column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
+        rows = len(self)
+        if name == "valid":
+            return memoryview(ffi.buffer(self._arrays[name], (rows + 7) // 8))
+        size, kind = _ITEMS[COLUMNS[name]]
+        return memoryview(ffi.buffer(self._arrays[name], rows * size)).cast(kind)
+
+
+def spell(codes: memoryview[Any], names: Sequence[str]) -> tuple[memoryview[Any], memoryview[Any]]:
+    """Offsets (int32) and text of an Arrow utf8 column that has names[code] for each of `codes`."""
+    encoded = [name.encode() for name in names]
+    ends = [0]
+    for text in encoded:
+        ends.append(ends[-1] + len(text))
+    rows = len(codes)
+    room = rows * max(map(len, encoded), default=0)
+    offsets, text = ffi.new("int32_t[]", rows + 1), ffi.new("uint8_t[]", max(room, 1))
+    used = lib.md_spell(
+        ffi.from_buffer("uint16_t[]", codes),
+        rows,
+        b"".join(encoded),
+        ffi.new("int32_t[]", ends),
+        offsets,
+        text,
+        room,
+    )
+    if used < 0:
+        raise OverflowError("more than 2 GiB of names in one batch")
+    return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))

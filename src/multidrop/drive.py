@@ -1,0 +1,362 @@
+"""Drive: what a family's manual says, collected from its registers, and the verbs that command it.
+
+A family is a subclass that declares registers. Its verbs are scripts: generators that yield steps
+(read, write, wait) and receive results, so that they are written down without any I/O. Called on
+a drive that is attached to a bus, a verb is carried out there.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
+
+from multidrop.core import Framing
+from multidrop.errors import BusError, Refused, Unsupported
+from multidrop.register import Access, Register, Table
+from multidrop.timing import Settings
+
+__all__ = [  # also the names of other modules that a family's file needs
+    "VERBS",
+    "BusError",
+    "Condition",
+    "Direction",
+    "Drive",
+    "Framing",
+    "Option",
+    "Read",
+    "Refused",
+    "Script",
+    "State",
+    "Step",
+    "Unsupported",
+    "Wait",
+    "Write",
+    "read",
+    "until",
+    "verb",
+    "wait",
+    "write",
+]
+
+T = TypeVar("T", bound=float)
+R = TypeVar("R")
+P = ParamSpec("P")
+
+
+class Direction(Enum):
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+
+class Condition(Enum):
+    STOPPED = "stopped"
+    RUNNING = "running"
+    ACCELERATING = "accelerating"
+    DECELERATING = "decelerating"
+    FAULT = "fault"
+    UNKNOWN = "unknown"  # the drive cannot say; never to be taken for stopped
+
+
+@dataclass(frozen=True)
+class State:
+    """What a drive says of itself: never more than its document lets it say."""
+
+    condition: Condition
+    direction: Direction | None = None
+    fault: str | None = None
+    note: str = ""
+
+    def __str__(self) -> str:
+        words = [self.condition.value]
+        if self.direction:
+            words.append(self.direction.value)
+        if self.fault:
+            words.append(f"({self.fault})")
+        if self.note:
+            words.append(f"- {self.note}")
+        return " ".join(words)
+
+
+@dataclass(frozen=True)
+class Option:
+    """A fact about one drive that only its owner knows, such as its maximum frequency."""
+
+    unit: str
+    span: tuple[float, float]
+    meaning: str
+
+
+# ---- scripts: the steps a verb consists of ----
+
+
+@dataclass(frozen=True)
+class Read:
+    register: Register[Any]
+
+
+@dataclass(frozen=True)
+class Write:
+    register: Register[Any]
+    value: Any
+
+
+@dataclass(frozen=True)
+class Wait:
+    seconds: float
+
+
+Step = Read | Write | Wait
+Script = Generator[Step, Any, R]
+
+
+def read(register: Register[T]) -> Script[T]:
+    """The register's value, as `value = yield from read(register)`."""
+    return cast(T, (yield Read(register)))
+
+
+def write(register: Register[T], value: T) -> Script[None]:
+    yield Write(register, value)
+
+
+def wait(seconds: float) -> Script[None]:
+    yield Wait(seconds)
+
+
+def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
+    """Look again and again until it is true; False when `limit` seconds have passed."""
+    waited = 0.0
+    while not (yield from look()):
+        if waited >= limit:
+            return False
+        yield from wait(every)
+        waited += every
+    return True
+
+
+class _BoundVerb(Generic[P, R]):
+    """A verb of one drive: calling it carries it out."""
+
+    def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
+        self.name = name
+        self.drive = drive
+        self._script = script
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return self.drive.perform(self._script(self.drive, *args, **kwargs))
+
+    def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
+        """The steps, to be carried out by someone else: another verb or a test."""
+        return self._script(self.drive, *args, **kwargs)
+
+
+class verb(Generic[P, R]):  # noqa: N801 - it is used as a decorator
+    """A method that is a script, and is carried out on the drive's bus when it is called."""
+
+    def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
+        self._script = script
+        self.__doc__ = script.__doc__
+        self.name = script.__name__
+
+    @overload
+    def __get__(self, drive: None, owner: type) -> verb[P, R]: ...
+    @overload
+    def __get__(self, drive: Drive, owner: type) -> _BoundVerb[P, R]: ...
+    def __get__(self, drive: Drive | None, owner: type) -> verb[P, R] | _BoundVerb[P, R]:
+        return self if drive is None else _BoundVerb(self.name, drive, self._script)
+
+
+VERBS = (
+    "start",
+    "stop",
+    "coast",
+    "emergency_stop",
+    "jog",
+    "reset_fault",
+    "set_frequency",
+    "state",
+)
+
+
+class Drive:
+    """One drive on a line; its class is the family: the table of the manual, in the manual's order.
+
+    `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
+    family's. Options are facts that only the owner knows (see `options`).
+    Raises ValueError for anything the family's document does not allow.
+    """
+
+    model: ClassVar[str] = ""
+    title: ClassVar[str] = ""
+    manual: ClassVar[str] = ""
+
+    framings: ClassVar[tuple[Framing, ...]] = (Framing.RTU,)
+    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first is the default
+    baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
+    addresses: ClassVar[range] = range(1, 248)
+
+    silence: ClassVar[float] = 0.0  # s, before and after a frame; t3.5 is the least for RTU
+    silence_characters: ClassVar[float] = 0.0  # the same, in characters
+    response_delay: ClassVar[float] = 0.005  # s, typical, from the request's end to the reply's begin
+    response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
+    turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
+
+    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; 1 where a table is not named
+    readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that may be read across
+    exceptions: ClassVar[Mapping[int, str]] = {
+        1: "illegal function",
+        2: "illegal address",
+        3: "illegal value",
+        4: "device failure",
+        5: "acknowledged, still working",
+        6: "busy",
+    }
+    broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
+    options: ClassVar[Mapping[str, Option]] = {}
+    watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the master dies."
+
+    registers: ClassVar[Mapping[str, Register[Any]]] = {}
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        found: dict[str, Register[Any]] = {}
+        for owner in reversed(cls.__mro__):
+            found.update({name: it for name, it in vars(owner).items() if isinstance(it, Register)})
+        cls.registers = found
+        if not cls.formats:
+            cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
+
+    def __init__(
+        self,
+        address: int,
+        *,
+        name: str | None = None,
+        framing: Framing | str | None = None,
+        baudrate: int | None = None,
+        format: str | None = None,
+        **options: float,
+    ) -> None:
+        self.address = self._checked("address", address, self.addresses)
+        self.framing = self._framing(framing)
+        formats = self.formats[self.framing]
+        self.settings = Settings(
+            self._checked("baud rate", baudrate or self.baudrates[0], self.baudrates),
+            self._checked("format", format or formats[0], formats),
+        )
+        self.name = name or f"{self.model or type(self).__name__}@{address}"
+        self.option = self._options(options)
+        self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
+
+    def _perform_nowhere(self, script: Script[Any]) -> Any:
+        raise RuntimeError(f"{self.name} is not attached to a bus: use bus.attach(...)")
+
+    @classmethod
+    def _checked(cls, what: str, value: Any, allowed: Any) -> Any:
+        if value in allowed:
+            return value
+        choices = (
+            f"{allowed[0]} to {allowed[-1]}"
+            if isinstance(allowed, range)
+            else ", ".join(str(choice) for choice in allowed)
+        )
+        raise ValueError(f"{what} {value!r} is not one of {cls.title or cls.__name__}: {choices}")
+
+    @classmethod
+    def _framing(cls, framing: Framing | str | None) -> Framing:
+        if framing is None:
+            return cls.framings[0]
+        if isinstance(framing, str):
+            framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
+        return cast(Framing, cls._checked("framing", framing, cls.framings))
+
+    @classmethod
+    def _options(cls, given: dict[str, float]) -> dict[str, float]:
+        for name, value in given.items():
+            if name not in cls.options:
+                known = ", ".join(cls.options) or "none"
+                raise ValueError(f"{cls.title or cls.__name__} has no option {name!r}; its options: {known}")
+            low, high = cls.options[name].span
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+                raise ValueError(
+                    f"{name} = {value!r} is outside {low:g} to {high:g} {cls.options[name].unit}"
+                )
+        return given
+
+    @classmethod
+    def register(cls, name: str) -> Register[Any]:
+        """The register of this name; ValueError with the nearest names when there is none."""
+        try:
+            return cls.registers[name]
+        except KeyError:
+            near = difflib.get_close_matches(name, cls.registers, n=3)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"see `multidrop models {cls.model}`"
+            raise ValueError(f"{cls.title or cls.__name__} has no register {name!r}; {hint}") from None
+
+    @classmethod
+    def readings(cls) -> tuple[Register[Any], ...]:
+        """What is polled when nothing else is said."""
+        return tuple(it for it in cls.registers.values() if it.access is Access.READING and it.readable)
+
+    def exception(self, code: int) -> str:
+        """The meaning of an exception code in this family."""
+        return self.exceptions.get(code, "a code that the document does not explain")
+
+    def needed_silence(self) -> float:
+        """Silence in s that this drive demands before a request and after its reply."""
+        t3_5 = self.settings.t3_5 if self.framing is Framing.RTU else 0.0
+        return max(t3_5, self.silence, self.silence_characters * self.settings.character)
+
+    # ---- verbs; each family replaces those that its document has ----
+
+    def _unsupported(self, what: str) -> Unsupported:
+        return Unsupported(f"{self.name}: the document of {self.title or type(self).__name__} has no {what}")
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor at the setpoint in force; without a direction, in the one in force."""
+        raise self._unsupported("start command")
+        yield
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor along its deceleration ramp."""
+        raise self._unsupported("stop command")
+        yield
+
+    @verb
+    def coast(self) -> Script[None]:
+        """Take the voltage off and let the motor run out."""
+        raise self._unsupported("coast command")
+        yield
+
+    @verb
+    def emergency_stop(self) -> Script[None]:
+        """Stop the motor as the drive's own emergency stop does."""
+        raise self._unsupported("emergency stop")
+        yield
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly until stopped."""
+        raise self._unsupported("jog command")
+        yield
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault; never starts the motor."""
+        raise self._unsupported("fault reset")
+        yield
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the frequency setpoint in Hz."""
+        raise self._unsupported("frequency setpoint")
+        yield
+
+    @verb
+    def state(self) -> Script[State]:
+        """What the drive says of itself."""
+        raise self._unsupported("state")
+        yield

@@ -1,0 +1,67 @@
+"""What can go wrong on a bus, as one tree with its data in fields.
+
+A mistake of the caller is a ValueError or TypeError at the call; everything else is a BusError.
+"""
+
+from __future__ import annotations
+
+
+class BusError(Exception):
+    """Anything that goes wrong between the call and the drive."""
+
+
+class LineError(BusError, OSError):
+    """The port failed: it cannot be opened, does not take its settings, or vanished."""
+
+    def __init__(self, port: str, reason: str) -> None:
+        super().__init__(f"{port}: {reason}")
+        self.port = port
+        self.reason = reason
+
+
+class NoReply(BusError, TimeoutError):
+    """The drive said nothing within its time-out."""
+
+    def __init__(self, drive: str) -> None:
+        super().__init__(
+            f"{drive} does not answer: check its address, baud rate, format, wiring, and that it has power"
+        )
+        self.drive = drive
+
+
+class BadReply(BusError):
+    """Something came, but not the reply to the request."""
+
+    def __init__(self, drive: str, reason: str, frame: bytes) -> None:
+        super().__init__(f"{drive}: {reason} (received {frame.hex(' ').upper() or 'nothing'})")
+        self.drive = drive
+        self.reason = reason
+        self.frame = frame
+
+
+class DriveRefused(BusError):
+    """The drive answered with an exception: it did not do what it was asked."""
+
+    def __init__(self, drive: str, code: int, meaning: str) -> None:
+        super().__init__(f"{drive} refuses: code {code:02X}H, {meaning}")
+        self.drive = drive
+        self.code = code
+        self.meaning = meaning
+
+
+class Unconfirmed(BusError):
+    """A write whose effect is not known: it may have happened."""
+
+    def __init__(self, drive: str, what: str, reason: str) -> None:
+        super().__init__(f"{drive}: it is not known whether {what} took effect: {reason}")
+        self.drive = drive
+        self.what = what
+        self.reason = reason
+
+
+class Unsupported(BusError):
+    """The family's document has no such thing."""
+
+
+class Refused(BusError):
+    """The library itself would not send it, and says why."""

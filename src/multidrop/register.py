@@ -1,0 +1,291 @@
+"""Registers: what a drive's manual says about one quantity, as a typed declaration without I/O.
+
+Three words carry the access: a `reading` can be read, a `setting` read and written, a `command`
+only written. `Register[float]` has a unit and a step, `Register[E]` has the names of an enumeration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum, Flag, IntEnum, IntFlag
+from fractions import Fraction
+from typing import Any, Generic, NotRequired, TypedDict, TypeVar, Unpack, cast, overload
+
+from multidrop.core import Wire
+
+__all__ = [
+    "COIL",
+    "DISCRETE",
+    "HOLDING",
+    "INPUT",
+    "Access",
+    "Carrier",
+    "Kept",
+    "Register",
+    "Table",
+    "Wire",
+    "command",
+    "reading",
+    "setting",
+]
+
+T = TypeVar("T", bound=float)
+E = TypeVar("E", bound=IntEnum | IntFlag)
+
+
+class Access(Enum):
+    READING = "reading"
+    SETTING = "setting"
+    COMMAND = "command"
+
+
+class Kept(Enum):
+    """Where a drive keeps what is written: EEPROM bears a limited number of writes."""
+
+    RAM = "RAM"
+    EEPROM = "EEPROM"
+    UNKNOWN = "not stated"
+
+
+class Carrier(Enum):
+    """Where in a frame a table's values travel."""
+
+    BIT = "bit"
+    WORD = "word"
+    LONG = "four bytes"  # Delixi's D3..D0
+    NUMBER = "parameter number"  # Delixi's P1P0
+
+
+@dataclass(frozen=True)
+class Table:
+    """One of a drive's address spaces, and the function codes that reach it."""
+
+    name: str
+    read: int | None
+    write: int | None
+    carrier: Carrier = Carrier.WORD
+
+
+HOLDING = Table("holding register", 0x03, 0x06)
+INPUT = Table("input register", 0x04, None)
+COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
+DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
+
+_LONG_WIRES = (
+    Wire.U32,
+    Wire.I32,
+    Wire.U32_SWAPPED,
+    Wire.I32_SWAPPED,
+    Wire.U32_EITHER,
+    Wire.F32,
+    Wire.F32_SWAPPED,
+)
+
+
+class Details(TypedDict):
+    """What a declaration may say besides address and unit; all of it may be left out.
+
+    step: value of one raw count; None where the document does not state it
+    span: smallest and largest value that may be written
+    wire: how the number lies in the frame
+    table: address space and function codes
+    kept: RAM or EEPROM
+    ram_address: where the same quantity can be written without wearing the EEPROM
+    default: value from the factory
+    while_running: may be changed while the motor turns; None where not stated
+    broadcast: harmless and documented as a broadcast
+    never: why the library never writes it
+    place: where the manual says so
+    outside: the source, where it is not the family's own document
+    note: what else a user must know
+    """
+
+    step: NotRequired[float | None]
+    span: NotRequired[tuple[float, float]]
+    wire: NotRequired[Wire]
+    table: NotRequired[Table]
+    kept: NotRequired[Kept]
+    ram_address: NotRequired[int]
+    default: NotRequired[float]
+    while_running: NotRequired[bool]
+    broadcast: NotRequired[bool]
+    never: NotRequired[str]
+    place: NotRequired[str]
+    outside: NotRequired[str]
+    note: NotRequired[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Register(Generic[T]):
+    """One quantity of a drive: where it is, what it means, what may be done with it."""
+
+    address: int
+    access: Access
+    unit: str = ""
+    values: type[T] | None = None
+    step: float | None = 1
+    span: tuple[float, float] | None = None
+    wire: Wire = Wire.U16
+    table: Table = HOLDING
+    kept: Kept = Kept.UNKNOWN
+    ram_address: int | None = None
+    default: float | None = None
+    while_running: bool | None = None
+    broadcast: bool = False
+    never: str = ""
+    place: str = ""
+    outside: str = ""
+    note: str = ""
+    name: str = field(default="", init=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.address <= 0xFFFF:
+            raise ValueError(f"register address {self.address} is outside 0 to FFFFH")
+        if self.table.carrier is Carrier.BIT:
+            object.__setattr__(self, "wire", Wire.BIT)
+        elif self.table.carrier is not Carrier.WORD:
+            object.__setattr__(self, "wire", Wire.U32)
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        object.__setattr__(self, "name", name)
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def words(self) -> int:
+        """How many addresses it takes in its table."""
+        return 2 if self.table.carrier is Carrier.WORD and self.wire in _LONG_WIRES else 1
+
+    @property
+    def readable(self) -> bool:
+        return self.access is not Access.COMMAND and self.table.read is not None
+
+    @property
+    def writable(self) -> bool:
+        return self.access is not Access.READING and self.table.write is not None and not self.never
+
+    @property
+    def scale(self) -> Fraction:
+        """The step as an exact fraction, 1 where it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
+        return Fraction(str(self.step)) if self.step is not None else Fraction(1)
+
+    @property
+    def decimals(self) -> int:
+        """Digits after the point that the step needs."""
+        text = f"{float(self.scale):.6f}".rstrip("0")
+        return len(text.partition(".")[2])
+
+    def decode(self, raw: float) -> T:
+        """The value of a raw count."""
+        if self.values is not None:
+            try:
+                return cast(T, self.values(int(raw)))
+            except ValueError:
+                return cast(T, int(raw))
+        return cast(T, raw * self.scale.numerator / self.scale.denominator)
+
+    def encode(self, value: T) -> int:
+        """The raw count of a value; ValueError outside the span, TypeError for what is no number."""
+        if self.values is not None:
+            return self._encode_name(value)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{self.name} takes a number, not {value!r}")
+        if not math.isfinite(value):
+            raise ValueError(f"{self.name} takes a finite number, not {value!r}")
+        if self.span is not None and not self.span[0] <= value <= self.span[1]:
+            raise ValueError(
+                f"{self.name} = {value:g} is outside {self.span[0]:g} to {self.span[1]:g} {self.unit}".rstrip()
+            )
+        raw = round(Fraction(str(value)) / self.scale)
+        low, high = self._raw_span()
+        if not low <= raw <= high:
+            least, most = float(low * self.scale), float(high * self.scale)
+            raise ValueError(
+                f"{self.name} = {value:g} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
+            )
+        return raw
+
+    def _encode_name(self, value: T) -> int:
+        values = cast(Any, self.values)
+        known = set(values)
+        if isinstance(value, values):
+            if issubclass(values, Flag):
+                reserved = cast(Any, value).value & ~sum(member.value for member in known)
+                if reserved:
+                    raise ValueError(f"{self.name}: bits {reserved:#x} are reserved and must stay 0")
+            return int(cast(Any, value).value)
+        choices = ", ".join(member.name for member in values)
+        raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
+
+    def _raw_span(self) -> tuple[int, int]:
+        if self.wire is Wire.BIT:
+            return 0, 1
+        bits = 16 if self.wire in (Wire.U16, Wire.I16) else 32
+        if self.wire in (Wire.I16, Wire.I32, Wire.I32_SWAPPED):
+            return -(1 << bits - 1), (1 << bits - 1) - 1
+        return 0, (1 << bits) - 1
+
+    def parse(self, text: str) -> T:
+        """The value that a person typed: a number, or names joined by "|"; ValueError if it is neither."""
+        if self.values is None:
+            try:
+                return cast(T, float(text))
+            except ValueError:
+                unit = self.unit or "counts"
+                raise ValueError(f"{self.name} takes a number in {unit}, not {text!r}") from None
+        values = cast(Any, self.values)
+        names = {member.name.lower(): member for member in values}
+        try:
+            found = [names[part.strip().lower().replace("-", "_")] for part in text.split("|")]
+        except KeyError as unknown:
+            raise ValueError(f"{self.name} has no {unknown}; it takes {', '.join(names)}") from None
+        if len(found) > 1 and not issubclass(values, Flag):
+            raise ValueError(f"{self.name} takes one of {', '.join(names)}")
+        total = found[0]
+        for member in found[1:]:
+            total |= member
+        return cast(T, total)
+
+    def format(self, value: T) -> str:
+        """The value as a person reads it, with its unit."""
+        if isinstance(value, Flag):
+            return "|".join(str(member.name) for member in value) or "none"
+        if isinstance(value, IntEnum):
+            return value.name
+        unit = self.unit if self.step is not None else "(scale not stated)"
+        return f"{value:.{self.decimals}f} {unit}".rstrip()
+
+
+@overload
+def reading(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+@overload
+def reading(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+def reading(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """A quantity that can only be read, with its unit or the enumeration of its values."""
+    return _declare(Access.READING, address, what, details)
+
+
+@overload
+def setting(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+@overload
+def setting(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+def setting(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """A quantity that can be read and written, with its unit or the enumeration of its values."""
+    return _declare(Access.SETTING, address, what, details)
+
+
+@overload
+def command(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+@overload
+def command(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+def command(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """A quantity that can only be written, with its unit or the enumeration of its values."""
+    return _declare(Access.COMMAND, address, what, details)
+
+
+def _declare(access: Access, address: int, what: Any, details: Details) -> Register[Any]:
+    if isinstance(what, str):
+        return Register(address, access, unit=what, **details)
+    return Register(address, access, values=what, **details)
