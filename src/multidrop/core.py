@@ -155,7 +155,7 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """The reply to `request` at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    """The reply to `request` at the beginning of `received`: as parse_request."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), _to_c(request), found)
     return used, _from_c(found) if used > 0 else None

@@ -145,7 +145,7 @@ class _BoundVerb(Generic[P, R]):
         self._script = script
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        return self.drive.perform(self._script(self.drive, *args, **kwargs))
+        return cast(R, self.drive.perform(self._script(self.drive, *args, **kwargs)))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
         """The steps, to be carried out by someone else: another verb or a test."""

@@ -181,7 +181,7 @@ class Register(Generic[T]):
         """The value of a raw count."""
         if self.values is not None:
             try:
-                return cast(T, self.values(int(raw)))
+                return self.values(int(raw))
             except ValueError:
                 return cast(T, int(raw))
         return cast(T, raw * self.scale.numerator / self.scale.denominator)
@@ -195,13 +195,12 @@ class Register(Generic[T]):
         if not math.isfinite(value):
             raise ValueError(f"{self.name} takes a finite number, not {value!r}")
         if self.span is not None and not self.span[0] <= value <= self.span[1]:
-            raise ValueError(
-                f"{self.name} = {value:g} is outside {self.span[0]:g} to {self.span[1]:g} {self.unit}".rstrip()
-            )
+            low, high = self.span
+            raise ValueError(f"{self.name} = {value:g} is outside {low:g} to {high:g} {self.unit}".rstrip())
         raw = round(Fraction(str(value)) / self.scale)
-        low, high = self._raw_span()
-        if not low <= raw <= high:
-            least, most = float(low * self.scale), float(high * self.scale)
+        bottom, top = self._raw_span()
+        if not bottom <= raw <= top:
+            least, most = float(bottom * self.scale), float(top * self.scale)
             raise ValueError(
                 f"{self.name} = {value:g} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
             )

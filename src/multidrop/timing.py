@@ -41,7 +41,7 @@ class Settings:
 
     @property
     def t3_5(self) -> float:
-        """Silence between RTU frames: 3.5 characters, fixed above 19200 (serial-line guide V1.02, 2.5.1.1)."""
+        """Silence between RTU frames: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
         return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character
 
     @property
