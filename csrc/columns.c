@@ -21,12 +21,19 @@ static double as_float(uint32_t bits)
     return (double)value;
 }
 
+static int is_inside(size_t len, size_t at, int wire)
+{
+    if (wire == MD_BIT)
+        return at / 8 < len;
+    return wire >= 0 && (size_t)wire < sizeof wire_bytes && at < len && 2 * at + wire_bytes[wire] <= len;
+}
+
 double md_value(const uint8_t *data, size_t len, size_t at, int wire)
 {
-    if (wire == MD_BIT) /* the first coil is the least significant bit of the first byte */
-        return at / 8 < len ? (data[at / 8] >> (at % 8)) & 1 : (double)NAN;
-    if (wire < 0 || (size_t)wire >= sizeof wire_bytes || 2 * at + wire_bytes[wire] > len)
+    if (!is_inside(len, at, wire))
         return (double)NAN;
+    if (wire == MD_BIT) /* the first coil is the least significant bit of the first byte */
+        return (data[at / 8] >> (at % 8)) & 1;
     const uint8_t *first = data + 2 * at;
     uint32_t one = word(first), two = wire_bytes[wire] == 4 ? word(first + 2) : 0;
     switch (wire) {
@@ -48,11 +55,14 @@ static void set_bit(uint8_t *bits, size_t at, int on)
     bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
 }
 
-static uint16_t status_of(const struct md_completion *completion)
+static uint16_t status_of(const struct md_completion *completion, const struct md_field *field)
 {
-    if (completion->result <= 0)
+    const struct md_message *reply = &completion->reply;
+    if (completion->result < 0)
         return (uint16_t)-completion->result;
-    return completion->reply.exception ? (uint16_t)(256 + completion->reply.exception) : 0;
+    if (reply->exception)
+        return (uint16_t)(256 + reply->exception);
+    return is_inside(reply->data_len, field->at, field->wire) ? 0 : -MD_BAD_LENGTH;
 }
 
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
@@ -60,15 +70,16 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
 {
     if (columns->room - columns->rows < (size_t)block->count)
         return 0;
-    uint16_t status = status_of(completion);
+    const struct md_message *reply = &completion->reply;
+    int64_t sent_ns = completion->sent_ns ? completion->sent_ns : completion->begun_ns;
     for (int i = 0; i < block->count; i++) {
         const struct md_field *field = &block->fields[i];
         size_t row = columns->rows++;
-        double value = status ? (double)NAN
-                              : md_value(completion->reply.data, completion->reply.data_len, field->at, field->wire);
-        columns->time[row] = completion->sent_ns + utc_minus_monotonic_ns;
-        columns->sent[row] = completion->sent_ns;
-        columns->uncertainty[row] = status ? 0 : completion->first_ns - completion->sent_ns;
+        uint16_t status = status_of(completion, field);
+        double value = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->wire);
+        columns->time[row] = sent_ns + utc_minus_monotonic_ns;
+        columns->sent[row] = sent_ns;
+        columns->uncertainty[row] = status ? 0 : completion->first_ns - sent_ns;
         columns->drive[row] = field->drive;
         columns->reg[row] = field->reg;
         columns->status[row] = status;

@@ -29,8 +29,8 @@ void md_port_yield(struct md_port *port, int yield_now)
     atomic_store((_Atomic int *)&port->yield_now, yield_now);
 }
 
-/* Wait for the descriptor or the time; errors of the descriptor show when it is read. */
-static void wait_for(int fd, short events, int64_t until_ns)
+/* Wait for the descriptor or the time: is there something to do? Its errors show when it is read. */
+static int wait_for(int fd, short events, int64_t until_ns)
 {
     struct pollfd pollfd = {.fd = fd, .events = events};
     int64_t left = until_ns - md_now_ns();
@@ -38,9 +38,9 @@ static void wait_for(int fd, short events, int64_t until_ns)
         left = 0;
 #ifdef __linux__
     struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
-    ppoll(&pollfd, 1, &span, NULL);
+    return ppoll(&pollfd, 1, &span, NULL) > 0;
 #else
-    poll(&pollfd, 1, (int)(left / 1000000));
+    return poll(&pollfd, 1, (int)(left / 1000000)) > 0;
 #endif
 }
 
@@ -54,9 +54,9 @@ static void pump_out(struct md_port *port)
     struct md_line *line = &port->line;
     int64_t before = md_now_ns();
     ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
-    if (written >= 0)
+    if (written > 0)
         md_line_sent(line, (size_t)written, before);
-    else if (!is_transient(errno))
+    else if (written < 0 && !is_transient(errno))
         md_line_lost(line, MD_LINE_LOST, errno);
     else
         wait_for(port->fd, POLLOUT, line->wake_ns);
@@ -66,7 +66,8 @@ static void pump_in(struct md_port *port)
 {
     struct md_line *line = &port->line;
     uint8_t bytes[1024];
-    wait_for(port->fd, POLLIN, line->wake_ns);
+    if (!wait_for(port->fd, POLLIN, line->wake_ns))
+        return;
     ssize_t got = read(port->fd, bytes, sizeof bytes);
     if (got > 0)
         md_line_received(line, bytes, (size_t)got, md_now_ns());
@@ -85,6 +86,7 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
 {
     if (port->must_take < 0 || same_settings(&port->settings, settings))
         return;
+    wait_for(-1, 0, port->line.quiet_ns); /* a broadcast may still be on its way out */
     int refused = md_port_set(port->fd, settings);
     if (refused < 0)
         md_line_lost(&port->line, MD_LINE_LOST, -refused);

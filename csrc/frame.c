@@ -12,10 +12,13 @@ enum shape {
     RANGE,        /* start, count */
     DATA,         /* byte count, data */
     ECHO,         /* start, two bytes */
-    RANGE_DATA    /* start, count, byte count, data */
+    RANGE_DATA,   /* start, count, byte count, data */
+    LONG          /* start, four bytes: all of Delixi's */
 };
 
 enum { BIT = 1, WORD = 16 };
+
+enum { COIL = 0x05, LOOPBACK = 0x08 };
 
 static const struct function {
     uint8_t request, reply; /* enum shape */
@@ -39,14 +42,31 @@ enum {
     EXCEPTION_BODY = 3,
     EXCEPTION_BIT = 0x80,
     DELIXI_BODY = 8,
-    DELIXI_FRAME = 21,
-    DELIXI_BROADCAST_COMMAND = 2 /* only K=02 may be broadcast */
+    DELIXI_FRAME = 21
 };
+
+/* Delixi's K (part 3): the master sends 02 to 07, the drive alone F0 and FC to FF. */
+enum { RUN_COMMAND = 2, STATE_QUERY = 3, PARAMETER_QUERY = 7, CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
 static const struct function *find_function(uint8_t code)
 {
     static const struct function none = {NONE, NONE, 0, 0};
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
+}
+
+static int request_shape(int framing, uint8_t code)
+{
+    return framing == MD_DELIXI ? LONG : find_function(code)->request;
+}
+
+static int reply_shape(int framing, uint8_t code)
+{
+    return framing == MD_DELIXI ? LONG : find_function(code)->reply;
+}
+
+static int is_delixi_refusal(uint8_t code)
+{
+    return code == CANNOT_EXECUTE || code >= FIRST_REFUSAL;
 }
 
 static size_t data_bytes(const struct function *function, unsigned count)
@@ -99,17 +119,19 @@ static void get_body(int shape, const uint8_t *body, struct md_message *message)
     }
     if (shape == DATA || shape == RANGE_DATA)
         data_len = body[data_at++];
-    if (shape == ECHO)
-        data_len = 2;
+    if (shape == ECHO || shape == LONG)
+        data_len = shape == ECHO ? 2 : 4;
     message->data_len = (uint16_t)data_len;
     memcpy(message->data, body + data_at, data_len);
 }
 
-/* Length of a request's body from its first bytes; 0 when they do not tell yet. */
+/* Length of a request's body from its first bytes; MD_INCOMPLETE when they do not tell yet. A
+ * count that cannot be answered is still a request, where the length does not depend on it: the
+ * drive's side answers it with an exception. */
 static int request_length(int framing, const uint8_t *body, size_t have)
 {
     if (framing == MD_DELIXI)
-        return DELIXI_BODY;
+        return have >= 2 && body[1] >= CANNOT_EXECUTE ? MD_BAD_FUNCTION : DELIXI_BODY;
     if (have < 2)
         return MD_INCOMPLETE;
     const struct function *function = find_function(body[1]);
@@ -131,7 +153,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
     if (have >= 1 && (request->address == 0 || body[0] != request->address))
         return MD_BAD_ADDRESS;
     if (framing == MD_DELIXI) {
-        if (have >= 2 && body[1] != request->function && body[1] != 0xF0 && body[1] < 0xFC)
+        if (have >= 2 && body[1] != request->function && !is_delixi_refusal(body[1]))
             return MD_BAD_FUNCTION;
         return DELIXI_BODY;
     }
@@ -139,18 +161,18 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
         return MD_INCOMPLETE;
     const struct function *function = find_function(request->function);
     /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
-    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == 0x08 && body[1] == 0x89)) {
+    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == LOOPBACK && body[1] == 0x89)) {
         if (have >= EXCEPTION_BODY && body[2] == 0)
             return MD_BAD_FUNCTION;
         return EXCEPTION_BODY;
     }
-    if (body[1] != request->function)
+    if (body[1] != request->function || function->reply == NONE)
         return MD_BAD_FUNCTION;
     if (function->reply != DATA)
         return 6;
     if (have < 3)
         return MD_INCOMPLETE;
-    if (body[2] != data_bytes(function, request->count))
+    if (request->count == 0 || request->count > function->most || body[2] != data_bytes(function, request->count))
         return MD_BAD_LENGTH;
     return 3 + body[2];
 }
@@ -255,98 +277,105 @@ static int close_frame(int framing, uint8_t *body, size_t len, uint8_t *out, siz
     return (int)(at - out);
 }
 
-/* ---- Delixi's bodies ---- */
+/* ---- what may be said ---- */
 
-static int build_delixi(const struct md_message *message, uint8_t function, uint8_t *out, size_t room)
+static int is_range(const struct function *function, const struct md_message *message)
 {
-    uint8_t body[MOST_BODY + 1] = {message->address, function};
-    if (message->data_len != 4)
-        return MD_BAD_REQUEST;
-    put16(body + 2, message->start);
-    memcpy(body + 4, message->data, 4);
-    return close_frame(MD_DELIXI, body, DELIXI_BODY, out, room);
+    return message->count >= 1 && message->count <= function->most && message->start + message->count <= 0x10000;
 }
 
-static void read_delixi(const uint8_t *body, struct md_message *message)
+static int is_coil(const uint8_t *data)
 {
-    message->address = body[0];
-    message->function = body[1];
-    message->start = get16(body + 2);
-    message->data_len = 4;
-    memcpy(message->data, body + 4, 4);
+    return data[1] == 0 && (data[0] == 0xFF || data[0] == 0);
 }
 
-/* A set-type packet is answered with its copy (part 3, note 1), a query with what was asked for. */
-static int check_delixi(const struct md_message *request, struct md_message *reply)
+/* Nobody answers a broadcast, so that it cannot ask for anything. */
+static int is_request(int framing, const struct md_message *message)
 {
-    enum { STATE_QUERY = 3, PARAMETER_QUERY = 7 };
-    if (reply->function != request->function) {
-        reply->exception = reply->function;
-        reply->function = request->function;
-        return 0;
-    }
-    if (request->function == STATE_QUERY) { /* the one answer that lies in P1P0: show it as data too */
-        put16(reply->data + 2, reply->start);
-        return 0;
-    }
-    if (reply->start != request->start)
-        return MD_BAD_ECHO;
-    if (request->function != PARAMETER_QUERY && memcmp(reply->data, request->data, 4) != 0)
-        return MD_BAD_ECHO;
-    return 0;
-}
-
-/* ---- the contract ---- */
-
-static int is_sendable(const struct function *function, const struct md_message *message)
-{
+    const struct function *function = find_function(message->function);
+    int is_broadcast = message->address == 0;
     if (message->address > MOST_ADDRESS)
         return 0;
-    switch (function->request) {
+    switch (request_shape(framing, message->function)) {
     case RANGE:
+        return !is_broadcast && is_range(function, message) && message->data_len == 0;
     case RANGE_DATA:
-        return message->count >= 1 && message->count <= function->most &&
-               message->start + message->count <= 0x10000 &&
-               message->data_len == (function->request == RANGE ? 0 : data_bytes(function, message->count));
+        return is_range(function, message) && message->data_len == data_bytes(function, message->count);
     case ECHO:
-        /* A coil is FF00H or 0000H and nothing else. */
-        return message->data_len == 2 &&
-               (message->function != 0x05 || (message->data[1] == 0 && (message->data[0] == 0xFF || message->data[0] == 0)));
+        return message->data_len == 2 && (message->function != COIL || is_coil(message->data)) &&
+               (message->function != LOOPBACK || !is_broadcast);
+    case LONG: /* part 3: only a run command may be broadcast */
+        return message->data_len == 4 && message->function >= RUN_COMMAND && message->function <= PARAMETER_QUERY &&
+               (message->function == RUN_COMMAND || !is_broadcast);
     default:
         return 0;
     }
 }
 
+static int is_reply(int framing, const struct md_message *message)
+{
+    const struct function *function = find_function(message->function);
+    if (message->address == 0 || message->address > MOST_ADDRESS)
+        return 0;
+    if (message->exception)
+        return framing != MD_DELIXI || is_delixi_refusal(message->exception);
+    switch (reply_shape(framing, message->function)) {
+    case RANGE:
+        return is_range(function, message);
+    case DATA:
+        return message->data_len >= 1 && message->data_len <= data_bytes(function, function->most) &&
+               8 * message->data_len % function->unit_bits == 0;
+    case ECHO:
+        return message->data_len == 2;
+    case LONG:
+        return message->data_len == 4 && message->function >= RUN_COMMAND && message->function <= PARAMETER_QUERY;
+    default:
+        return 0;
+    }
+}
+
+/* Does the reply say what the request asked for? A write is confirmed by its own address and value,
+ * or address and count. Of Delixi's (part 3, note 1) a query is answered in P1P0 or in D3..D0, and
+ * everything else with a copy. */
+static int confirms(int framing, const uint8_t *body, const struct md_message *request)
+{
+    switch (reply_shape(framing, request->function)) {
+    case RANGE:
+        return get16(body + 2) == request->start && get16(body + 4) == request->count;
+    case ECHO:
+        return get16(body + 2) == request->start && memcmp(body + 4, request->data, 2) == 0;
+    case LONG:
+        return (request->function == STATE_QUERY || get16(body + 2) == request->start) &&
+               (request->function == PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
+    default:
+        return 1;
+    }
+}
+
+/* ---- the contract ---- */
+
 int md_build_request(int framing, const struct md_message *message, uint8_t *out, size_t room)
 {
-    if (framing == MD_DELIXI) {
-        if (message->address > MOST_ADDRESS || message->function < 2 || message->function > 7 ||
-            (message->address == 0 && message->function != DELIXI_BROADCAST_COMMAND))
-            return MD_BAD_REQUEST;
-        return build_delixi(message, message->function, out, room);
-    }
-    const struct function *function = find_function(message->function);
-    if (!is_sendable(function, message))
+    if (!is_request(framing, message))
         return MD_BAD_REQUEST;
     uint8_t body[MOST_BODY + 1] = {message->address, message->function};
-    return close_frame(framing, body, put_body(function->request, message, body), out, room);
+    return close_frame(framing, body, put_body(request_shape(framing, message->function), message, body), out, room);
 }
 
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room)
 {
-    if (framing == MD_DELIXI)
-        return build_delixi(message, message->exception ? message->exception : message->function, out, room);
-    uint8_t body[MOST_BODY + 1] = {message->address, message->function};
-    if (message->exception) {
-        body[1] |= EXCEPTION_BIT;
-        body[2] = message->exception;
-        return close_frame(framing, body, EXCEPTION_BODY, out, room);
-    }
-    const struct function *function = find_function(message->function);
-    if (function->reply == NONE || message->data_len > MD_MOST_DATA ||
-        (function->reply == ECHO && message->data_len != 2))
+    if (!is_reply(framing, message))
         return MD_BAD_REQUEST;
-    return close_frame(framing, body, put_body(function->reply, message, body), out, room);
+    uint8_t body[MOST_BODY + 1] = {message->address, message->function};
+    if (!message->exception)
+        return close_frame(framing, body, put_body(reply_shape(framing, message->function), message, body), out, room);
+    if (framing == MD_DELIXI) { /* the rest is 0: "no meaning" */
+        body[1] = message->exception;
+        return close_frame(framing, body, DELIXI_BODY, out, room);
+    }
+    body[1] |= EXCEPTION_BIT;
+    body[2] = message->exception;
+    return close_frame(framing, body, EXCEPTION_BODY, out, room);
 }
 
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
@@ -357,10 +386,7 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
     if (used <= 0)
         return used;
     *message = (struct md_message){.address = body[0], .function = body[1]};
-    if (framing == MD_DELIXI)
-        read_delixi(body, message);
-    else
-        get_body(find_function(body[1])->request, body, message);
+    get_body(request_shape(framing, body[1]), body, message);
     return used;
 }
 
@@ -372,24 +398,22 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
     int used = open_frame(framing, bytes, len, request, text, &body);
     if (used <= 0)
         return used;
+    int is_exception = body[1] != request->function;
+    if (!is_exception && !confirms(framing, body, request))
+        return MD_BAD_ECHO;
     *reply = (struct md_message){.address = body[0], .function = request->function};
-    if (framing == MD_DELIXI) {
-        read_delixi(body, reply);
-        int refusal = check_delixi(request, reply);
-        return refusal ? refusal : used;
-    }
-    if (body[1] & EXCEPTION_BIT) {
-        reply->exception = body[2];
+    if (is_exception) {
+        reply->exception = framing == MD_DELIXI ? body[1] : body[2];
         return used;
     }
-    int shape = find_function(body[1])->reply;
+    int shape = reply_shape(framing, body[1]);
     get_body(shape, body, reply);
     if (shape == DATA) {
         reply->start = request->start;
         reply->count = request->count;
-    } else if (reply->start != request->start || reply->count != request->count ||
-               memcmp(reply->data, request->data, reply->data_len) != 0)
-        return MD_BAD_ECHO;
+    }
+    if (framing == MD_DELIXI && body[1] == STATE_QUERY) /* show the answer where all others have theirs */
+        put16(reply->data + 2, reply->start);
     return used;
 }
 

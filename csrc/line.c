@@ -14,23 +14,31 @@ enum state {
     SILENT,    /* waits until the line has been silent for long enough */
     LOOKING,   /* looks for bytes that came meanwhile, once, before it sends */
     SENDING,
-    LISTENING
+    LISTENING,
+    ENDING     /* the time-out is over: looks once more, because it may be late to look at all */
 };
 
-/* How much a reason says about what went wrong: the one that says most is reported. */
+/* How much a reason says about what went wrong. The one that says most is reported, and of several
+ * that say as much the first: a frame from another address may hold our own further on. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {
         [-MD_NO_START] = 1,
         [-MD_BAD_ADDRESS] = 2,
-        [-MD_BAD_FUNCTION] = 3,
-        [-MD_BAD_LENGTH] = 4,
-        [-MD_BAD_CHARACTER] = 5,
-        [-MD_CUT_SHORT] = 6,
-        [-MD_BAD_CHECKSUM] = 7,
-        [-MD_BAD_ECHO] = 8,
+        [-MD_BAD_FUNCTION] = 2,
+        [-MD_BAD_LENGTH] = 3,
+        [-MD_BAD_CHARACTER] = 4,
+        [-MD_CUT_SHORT] = 5,
+        [-MD_BAD_CHECKSUM] = 6,
+        [-MD_BAD_ECHO] = 7,
     };
     return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
+}
+
+static void blame(struct md_line *line, int reason)
+{
+    if (weight(reason) > weight(line->reason))
+        line->reason = reason;
 }
 
 static int64_t later(int64_t a, int64_t b)
@@ -49,16 +57,18 @@ static void finish(struct md_line *line, int result, const uint8_t *raw, size_t 
     completion->raw_len = (uint16_t)raw_len;
     memcpy(completion->raw, raw, raw_len);
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
-    line->silence_ns = line->exchange->silence_ns;
+    if (completion->sent_ns) /* else what went before it still has its say */
+        line->silence_ns = line->exchange->silence_ns;
     line->state = IDLE;
 }
 
 static void time_out(struct md_line *line)
 {
     if (line->completion->last_ns == 0)
-        finish(line, MD_NO_REPLY, line->rx, 0);
-    else
-        finish(line, line->reason, line->rx, line->rx_len);
+        line->reason = MD_NO_REPLY;
+    else if (line->rx_from < line->rx_len)
+        blame(line, MD_CUT_SHORT);
+    finish(line, line->reason, line->rx, line->rx_len);
 }
 
 /* Look for the reply at every place where it may still begin. */
@@ -71,28 +81,25 @@ static void search(struct md_line *line)
         int used = md_parse_reply(exchange->framing, line->rx + at, (size_t)(line->rx_len - at),
                                   &exchange->request, &completion->reply);
         if (used > 0) {
-            completion->skipped += (uint32_t)(line->rx_len - used);
+            completion->skipped -= (uint32_t)used;
             finish(line, used, line->rx + at, (size_t)used);
             return;
         }
+        blame(line, used);
         if (used == MD_INCOMPLETE && at < first_open)
             first_open = at;
-        int reason = used == MD_INCOMPLETE ? MD_CUT_SHORT : used;
-        if (weight(reason) > weight(line->reason))
-            line->reason = reason;
     }
     line->rx_from = first_open;
 }
 
-/* Make room: what lies before the first place where a reply may begin is of no more use, and of
- * endless garbage the older half goes. */
+/* Make room: the older half goes. No reply can have begun there and not be whole by now. */
 static void forget(struct md_line *line)
 {
-    uint16_t gone = line->rx_from > 0 ? line->rx_from : (uint16_t)(sizeof line->rx / 2);
-    line->completion->skipped += gone;
-    line->rx_len = (uint16_t)(line->rx_len - gone);
-    line->rx_from = 0;
-    memmove(line->rx, line->rx + gone, line->rx_len);
+    enum { GONE = sizeof line->rx / 2 };
+    _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
+    line->rx_len = (uint16_t)(line->rx_len - GONE);
+    line->rx_from = (uint16_t)(line->rx_from - GONE);
+    memmove(line->rx, line->rx + GONE, line->rx_len);
 }
 
 void md_line_init(struct md_line *line, int64_t now_ns)
@@ -103,7 +110,7 @@ void md_line_init(struct md_line *line, int64_t now_ns)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
                    struct md_completion *completion, int64_t now_ns)
 {
-    *completion = (struct md_completion){0};
+    *completion = (struct md_completion){.begun_ns = now_ns};
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = line->rx_len = line->rx_from = 0;
@@ -138,8 +145,10 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         md_line_lost(line, MD_LINE_LOST, ETIMEDOUT);
         return MD_DONE;
     case LISTENING:
-        if (now_ns < line->wake_ns)
-            return MD_READ;
+        if (now_ns >= line->wake_ns)
+            line->state = ENDING;
+        return MD_READ;
+    case ENDING:
         time_out(line);
         return MD_DONE;
     default:
@@ -150,14 +159,14 @@ int md_line_want(struct md_line *line, int64_t now_ns)
 void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
-    if (line->state != SENDING)
+    if (line->state != SENDING || len == 0)
         return;
     if (line->tx_at == 0)
         line->completion->sent_ns = now_ns;
+    line->quiet_ns = later(line->quiet_ns, now_ns) + (int64_t)len * exchange->character_ns;
     line->tx_at = (uint16_t)(line->tx_at + len);
     if (line->tx_at < line->tx_len)
         return;
-    line->quiet_ns = line->completion->sent_ns + line->tx_len * exchange->character_ns;
     int reply_len = md_reply_length(exchange->framing, &exchange->request);
     if (reply_len == 0) {
         finish(line, 0, line->rx, 0);
@@ -171,18 +180,22 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_completion *completion = line->completion;
+    if (len == 0)
+        return;
     if (line->state == SILENT || line->state == LOOKING) {
         completion->stale += (uint32_t)len;
         line->quiet_ns = now_ns;
-        line->state = SILENT;
+        if (now_ns < line->give_up_ns)
+            line->state = SILENT;
         return;
     }
-    if (line->state != LISTENING || len == 0)
+    if (line->state != LISTENING && line->state != ENDING)
         return;
     if (completion->first_ns == 0)
         completion->first_ns = now_ns;
     completion->last_ns = now_ns;
-    while (len > 0 && line->state == LISTENING) {
+    completion->skipped += (uint32_t)len;
+    while (len > 0 && line->state != IDLE) {
         if (line->rx_len == sizeof line->rx)
             forget(line);
         size_t room = sizeof line->rx - line->rx_len, taken = len < room ? len : room;

@@ -107,6 +107,7 @@ struct md_exchange {
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; else enum md_result */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
+    int64_t begun_ns;          /* it was taken up: the line's silence may not have been over yet */
     int64_t sent_ns;           /* the request began to leave; 0: it never did */
     int64_t first_ns, last_ns; /* the first and the last byte after the request were seen */
     uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */
@@ -127,7 +128,7 @@ struct md_line {
     int64_t quiet_ns;   /* since when nobody has been sending */
     int64_t silence_ns; /* demanded after what went last */
     int64_t wake_ns;
-    int64_t give_up_ns; /* until then it waits for a babbling line to fall silent */
+    int64_t give_up_ns; /* until then it waits for a babbling line to fall silent; then it sends */
     const struct md_exchange *exchange;
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
@@ -187,7 +188,9 @@ struct md_block {
 
 /* Rows; all arrays have room for the same number. `valid` is a bitmap, least significant bit first. */
 struct md_columns {
-    int64_t *time, *sent, *uncertainty; /* UTC and monotonic ns of the request; ns until the reply began */
+    /* UTC and monotonic ns of the request (of the time it was taken up, where it never left);
+     * ns until the reply began */
+    int64_t *time, *sent, *uncertainty;
     uint16_t *drive, *reg, *status;     /* status: 0, -result, or 256 + exception code */
     double *value;
     uint8_t *valid;                     /* value and uncertainty exist */

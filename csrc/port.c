@@ -19,7 +19,8 @@ static int get(int fd, attributes *now)
 
 static int set(int fd, attributes *wanted, uint32_t baudrate)
 {
-    wanted->c_cflag = (wanted->c_cflag & ~(tcflag_t)(CBAUD | CBAUD << IBSHIFT)) | BOTHER | BOTHER << IBSHIFT;
+    wanted->c_cflag &= ~(tcflag_t)(CBAUD | CBAUD << IBSHIFT | CMSPAR);
+    wanted->c_cflag |= BOTHER | BOTHER << IBSHIFT;
     wanted->c_ispeed = wanted->c_ospeed = baudrate;
     return ioctl(fd, TCSETS2, wanted) ? -errno : 0;
 }
@@ -60,6 +61,13 @@ static struct md_settings describe(const attributes *now)
     };
 }
 
+/* Adapters report the rate that their divisor makes; a character bears 2 % (as the kernel has it). */
+static int is_near(uint32_t baudrate, uint32_t wanted)
+{
+    uint32_t off = baudrate > wanted ? baudrate - wanted : wanted - baudrate;
+    return off <= wanted / 50;
+}
+
 int md_port_get(int fd, struct md_settings *settings)
 {
     attributes now;
@@ -90,7 +98,7 @@ int md_port_set(int fd, const struct md_settings *settings)
     if ((failure = set(fd, &port, settings->baudrate)) != 0 || (failure = get(fd, &port)) != 0)
         return failure;
     struct md_settings taken = describe(&port);
-    return (taken.baudrate != settings->baudrate ? MD_REFUSED_BAUDRATE : 0) |
+    return (!is_near(taken.baudrate, settings->baudrate) ? MD_REFUSED_BAUDRATE : 0) |
            (taken.databits != settings->databits ? MD_REFUSED_DATABITS : 0) |
            (taken.parity != settings->parity ? MD_REFUSED_PARITY : 0) |
            (taken.stopbits != settings->stopbits ? MD_REFUSED_STOPBITS : 0);

@@ -212,7 +212,7 @@ class Exchange:
     its reply, `timeout` to the reply's first character, `turnaround` after a broadcast.
     """
 
-    __slots__ = ("c", "framing", "request")
+    __slots__ = ("c", "framing", "reply_length", "request", "request_length", "settings")
 
     def __init__(
         self,
@@ -226,9 +226,11 @@ class Exchange:
         timeout: float,
         turnaround: float = 0.1,
     ) -> None:
-        build_request(framing, request)  # raises for what no frame can say
+        self.request_length = len(build_request(framing, request))  # raises for what no frame can say
+        self.reply_length = reply_length(framing, request)
         self.framing = framing
         self.request = request
+        self.settings = (baudrate, format)
         self.c = ffi.new(
             "struct md_exchange *",
             {
@@ -241,6 +243,18 @@ class Exchange:
                 "turnaround_ns": round(turnaround * 1e9),
             },
         )
+
+    @property
+    def timeout_ns(self) -> int:
+        return int(self.c.timeout_ns)
+
+    @property
+    def silence_ns(self) -> int:
+        return int(self.c.silence_ns)
+
+    @property
+    def character_ns(self) -> int:
+        return int(self.c.character_ns)
 
 
 @dataclass(frozen=True)
@@ -256,6 +270,13 @@ class Completion:
     skipped: int
     reply: Message
     raw: bytes
+
+    @property
+    def status(self) -> int:
+        """As a column has it: 0, the reason's number, or EXCEPTION_STATUS + exception code."""
+        if self.result <= 0:
+            return -self.result
+        return EXCEPTION_STATUS + self.reply.exception if self.reply.exception else 0
 
 
 class Completions:

@@ -94,7 +94,7 @@ class Details(TypedDict):
     ram_address: where the same quantity can be written without wearing the EEPROM
     default: value from the factory
     while_running: may be changed while the motor turns; None where not stated
-    broadcast: harmless and documented as a broadcast
+    broadcast: the raw counts that are documented and harmless as a broadcast
     never: why the library never writes it
     place: where the manual says so
     outside: the source, where it is not the family's own document
@@ -109,7 +109,7 @@ class Details(TypedDict):
     ram_address: NotRequired[int]
     default: NotRequired[float]
     while_running: NotRequired[bool]
-    broadcast: NotRequired[bool]
+    broadcast: NotRequired[tuple[int, ...]]
     never: NotRequired[str]
     place: NotRequired[str]
     outside: NotRequired[str]
@@ -132,7 +132,7 @@ class Register(Generic[T]):
     ram_address: int | None = None
     default: float | None = None
     while_running: bool | None = None
-    broadcast: bool = False
+    broadcast: tuple[int, ...] = ()
     never: str = ""
     place: str = ""
     outside: str = ""

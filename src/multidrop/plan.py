@@ -1,0 +1,127 @@
+"""Which registers go into which request, and how long that takes on the wire. Pure."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.core import Completion, Exchange, Message, build_request, reply_length
+from multidrop.drive import Drive
+from multidrop.register import Carrier, Register, Table
+
+
+@dataclass(frozen=True)
+class Block:
+    """Registers of one table that one request fetches."""
+
+    table: Table
+    start: int
+    count: int
+    registers: tuple[Register[Any], ...]
+
+    def request(self, address: int) -> Message:
+        if self.table.read is None:
+            raise ValueError(f"a {self.table.name} cannot be read")
+        if self.table.carrier in (Carrier.LONG, Carrier.NUMBER):
+            return Message(address, self.table.read, self.start, data=bytes(4))
+        return Message(address, self.table.read, self.start, self.count)
+
+    def offset(self, register: Register[Any]) -> int:
+        """Where the register lies in the reply's data, in words (coils: bits)."""
+        return register.address - self.start
+
+
+def duration(drive: Drive, block: Block) -> float:
+    """Seconds of the line that a block takes: silence, request, response delay, reply."""
+    request = block.request(drive.address)
+    characters = len(build_request(drive.framing, request)) + reply_length(drive.framing, request)
+    return characters * drive.settings.character + drive.needed_silence() + drive.response_delay
+
+
+def ideal_ns(exchange: Exchange, completion: Completion) -> int:
+    """What an answered exchange had to take: silence, characters, and the drive's own response delay."""
+    character = exchange.character_ns
+    request_ns = exchange.request_length * character
+    delay_ns = completion.first_ns - completion.sent_ns - request_ns - character
+    return exchange.silence_ns + request_ns + max(0, delay_ns) + exchange.reply_length * character
+
+
+def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:
+    """The requests that read these registers in the least time.
+
+    Registers of a table that follow each other are read together up to the family's limit, also
+    across reserved addresses where the family's document allows that and it is the quicker way.
+    Raises ValueError for a register that cannot be read.
+    """
+    tables: dict[Table, list[Register[Any]]] = {}
+    for register in dict.fromkeys(registers):
+        if not register.readable:
+            raise ValueError(
+                f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}"
+            )
+        tables.setdefault(register.table, []).append(register)
+    return tuple(block for table, wanted in tables.items() for block in _cheapest(drive, table, wanted))
+
+
+def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]]) -> list[Block]:
+    """Least total duration by dynamic programming over where the last block begins."""
+    registers = sorted(registers, key=lambda register: (register.address, register.words))
+    best: list[tuple[float, list[Block]]] = [(0.0, [])]
+    for end in range(1, len(registers) + 1):
+        choices = []
+        for begin in range(end - 1, -1, -1):
+            block = _block(table, registers[begin:end])
+            if not _allowed(drive, block):
+                break
+            cost, before = best[begin]
+            choices.append((cost + duration(drive, block), [*before, block]))
+        best.append(min(choices, key=lambda choice: choice[0]))
+    return best[-1][1]
+
+
+def _block(table: Table, registers: list[Register[Any]]) -> Block:
+    start = registers[0].address
+    end = max(register.address + register.words for register in registers)
+    return Block(table, start, end - start, tuple(registers))
+
+
+def _allowed(drive: Drive, block: Block) -> bool:
+    if len(block.registers) == 1:
+        return True  # a register is read whole, whatever the limit
+    if block.count > drive.most_registers.get(block.table, 1):
+        return False
+    taken = {
+        address
+        for register in block.registers
+        for address in range(register.address, register.address + register.words)
+    }
+    gaps = drive.readable_gaps.get(block.table, range(0))
+    return all(it in taken or it in gaps for it in range(block.start, block.start + block.count))
+
+
+def write_request(drive: Drive, register: Register[Any], raw: int, address: int | None = None) -> Message:
+    """The request that writes a raw count to a register, to its RAM alias where it has one.
+
+    Raises ValueError where the register cannot be written.
+    """
+    table = register.table
+    if not register.writable or table.write is None:
+        raise ValueError(
+            f"{register.name} of {drive.name} cannot be written: it is a {register.access.value}"
+        )
+    to = drive.address if address is None else address
+    at = register.address if register.ram_address is None else register.ram_address
+    if table.carrier is Carrier.NUMBER:
+        return Message(to, table.write, start=raw, data=bytes(4))
+    if table.carrier is Carrier.LONG:
+        return Message(to, table.write, at, data=struct.pack(">I", raw))
+    if table.carrier is Carrier.BIT:
+        return Message(to, table.write, at, data=b"\xff\x00" if raw else b"\x00\x00")
+    if register.words == 1:
+        return Message(to, table.write, at, data=struct.pack(">H", raw & 0xFFFF))
+    words = struct.pack(">I", raw & 0xFFFF_FFFF)
+    if register.wire.name.endswith("_SWAPPED"):
+        words = words[2:] + words[:2]
+    return Message(to, 0x10, at, count=2, data=words)

@@ -1,0 +1,82 @@
+"""The house's walls, kept by reading the imports."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import multidrop
+
+ROOT = Path(multidrop.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+OUTSIDE = {
+    "os",
+    "time",
+    "select",
+    "selectors",
+    "socket",
+    "serial",
+    "termios",
+    "fcntl",
+    "pty",
+    "tty",
+    "signal",
+    "subprocess",
+}
+# from the ground up; a file imports only from its own floor and those below it
+FLOORS = [
+    {"errors"},
+    {"core", "register", "timing"},
+    {"line", "schedule", "plan", "drive", "drives"},
+    {"bus", "batch", "models"},
+    {"recording", "sim", "poller", "plant"},
+    {"cli"},
+]
+
+
+def imports(path: Path) -> set[str]:
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names if node.module == "multidrop"}
+    return found
+
+
+def room(path: Path) -> str:
+    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+
+
+def ours(path: Path) -> set[str]:
+    return {name.split(".")[1] for name in imports(path) if name.startswith("multidrop.")}
+
+
+def floor(name: str) -> int:
+    return next((number for number, names in enumerate(FLOORS) if name in names), len(FLOORS))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_only_core_imports_the_compiled_module(path: Path) -> None:
+    assert ("_core" in ours(path)) == (room(path) == "core")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_only_line_sim_recording_and_cli_touch_the_system(path: Path) -> None:
+    if room(path) not in {"line", "sim", "cli", "recording"}:
+        assert not imports(path) & OUTSIDE
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "drives").glob("*.py")), ids=lambda path: path.stem)
+def test_a_family_imports_drive_and_register_alone(path: Path) -> None:
+    assert ours(path) <= {"drive", "register", "drives"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_downwards(path: Path) -> None:
+    if room(path) == "__init__":
+        return
+    assert floor(room(path)) < len(FLOORS), f"{room(path)} has no floor yet"
+    above = {name for name in ours(path) if name != "_core" and floor(name) > floor(room(path))}
+    assert not above
