@@ -8,6 +8,7 @@ class Device(Drive):
     """Three input registers, two settings, a relay and a door."""
 
     framings = (Framing.RTU, Framing.ASCII)
+    response_timeout = 0.2
     most_registers = {HOLDING: 16, INPUT: 16}
 
     current = reading(10, "A", step=0.1, table=INPUT)

@@ -8,15 +8,24 @@ import asyncio
 import sys
 
 from pymodbus import FramerType
+from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
+
+
+async def silent(*_: object) -> None:
+    """What pymodbus needs to leave requests to other addresses unanswered."""
+    raise NoSuchIdException("not here")
 
 
 async def serve(port: str, address: int, framing: str) -> None:
     bits = [SimData(0, values=[bool(n % 2) for n in range(64)], datatype=DataType.BITS)]
     words = [SimData(0, values=[1000 + n for n in range(256)], datatype=DataType.REGISTERS)]
     device = SimDevice(id=address, simdata=(bits, bits, words, words))
-    server = ModbusSerialServer([device], framer=FramerType(framing), port=port, baudrate=9600, ignore_missing_devices=True)
+    other = SimDevice(id=0, simdata=(bits, bits, words, words), action=silent)
+    server = ModbusSerialServer(
+        [device, other], framer=FramerType(framing), port=port, baudrate=9600, ignore_missing_devices=True
+    )
     await server.serve_forever(background=True)
     print("ready", flush=True)
     await asyncio.Event().wait()
