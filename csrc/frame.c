@@ -152,6 +152,8 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
 {
     if (have >= 1 && (request->address == 0 || body[0] != request->address))
         return MD_BAD_ADDRESS;
+    if (request->function & EXCEPTION_BIT) /* no request has it */
+        return MD_BAD_FUNCTION;
     if (framing == MD_DELIXI) {
         if (have >= 2 && body[1] != request->function && !is_delixi_refusal(body[1]))
             return MD_BAD_FUNCTION;
@@ -344,8 +346,8 @@ static int confirms(int framing, const uint8_t *body, const struct md_message *r
         return get16(body + 2) == request->start && get16(body + 4) == request->count;
     case ECHO:
         return get16(body + 2) == request->start && memcmp(body + 4, request->data, 2) == 0;
-    case LONG:
-        return (request->function == STATE_QUERY || get16(body + 2) == request->start) &&
+    case LONG: /* there is no state 0: that is the query itself */
+        return (request->function == STATE_QUERY ? get16(body + 2) != 0 : get16(body + 2) == request->start) &&
                (request->function == PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     default:
         return 1;

@@ -3,7 +3,8 @@
  *
  * The expected reply may begin anywhere in what was received, because driver turn-on junk, local
  * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
- * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
+ * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
+ * echoes what it sends shows in the replies that are no copies of their requests. */
 #include "multidrop.h"
 
 #include <errno.h>
@@ -35,12 +36,6 @@ static int weight(int reason)
     return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
 }
 
-static void blame(struct md_line *line, int reason)
-{
-    if (weight(reason) > weight(line->reason))
-        line->reason = reason;
-}
-
 static int64_t later(int64_t a, int64_t b)
 {
     return a > b ? a : b;
@@ -62,34 +57,67 @@ static void finish(struct md_line *line, int result, const uint8_t *raw, size_t 
     line->state = IDLE;
 }
 
+static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
+{
+    return md_parse_reply(line->exchange->framing, line->rx + at, line->rx_len - at, &line->exchange->request, reply);
+}
+
+static int is_copy(const struct md_line *line, size_t at)
+{
+    return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
+}
+
 static void time_out(struct md_line *line)
 {
-    if (line->completion->last_ns == 0)
-        line->reason = MD_NO_REPLY;
-    else if (line->rx_from < line->rx_len)
-        blame(line, MD_CUT_SHORT);
-    finish(line, line->reason, line->rx, line->rx_len);
+    struct md_message reply;
+    size_t begin = is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
+    int reason = begin == line->rx_len ? MD_NO_REPLY : MD_INCOMPLETE;
+    for (size_t at = begin; at < line->rx_len; at++) {
+        int why = parse_at(line, at, &reply);
+        if (why == MD_INCOMPLETE)
+            why = MD_CUT_SHORT;
+        if (weight(why) > weight(reason))
+            reason = why;
+    }
+    finish(line, reason, line->rx, line->rx_len);
+}
+
+/* A reply that is no copy of the request tells whether a copy goes before replies on this line. */
+static void learn_echo(struct md_line *line, size_t reply_at)
+{
+    if (is_copy(line, reply_at))
+        return;
+    if (line->completion->skipped == 0)
+        line->echoes = 0;
+    for (size_t at = 0; at + line->tx_len <= reply_at; at++)
+        if (is_copy(line, at))
+            line->echoes = 1;
 }
 
 /* Look for the reply at every place where it may still begin. */
 static void search(struct md_line *line)
 {
-    const struct md_exchange *exchange = line->exchange;
-    struct md_completion *completion = line->completion;
-    uint16_t first_open = line->rx_len;
-    for (uint16_t at = line->rx_from; at < line->rx_len; at++) {
-        int used = md_parse_reply(exchange->framing, line->rx + at, (size_t)(line->rx_len - at),
-                                  &exchange->request, &completion->reply);
+    struct md_message reply;
+    size_t first_open = line->rx_len;
+    for (size_t at = line->rx_from; at < line->rx_len; at++) {
+        int used = parse_at(line, at, &reply);
+        if (used > 0 && line->echo_due && is_copy(line, at)) {
+            line->echo_due = 0; /* the adapter's, not the drive's */
+            used = MD_NO_START;
+            first_open = line->rx_len;
+            at += line->tx_len - 1u;
+        }
         if (used > 0) {
-            completion->skipped -= (uint32_t)used;
+            line->completion->reply = reply;
+            line->completion->skipped -= (uint32_t)used;
+            learn_echo(line, at);
             finish(line, used, line->rx + at, (size_t)used);
             return;
         }
-        blame(line, used);
         if (used == MD_INCOMPLETE && at < first_open)
             first_open = at;
     }
-    line->rx_from = first_open;
+    line->rx_from = (uint16_t)first_open;
 }
 
 /* Make room: the older half goes. No reply can have begun there and not be whole by now. */
@@ -114,7 +142,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = line->rx_len = line->rx_from = 0;
-    line->reason = 0;
+    line->echo_due = line->echoes;
     line->silence_ns = later(line->silence_ns, exchange->silence_ns);
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->timeout_ns;
     line->state = SILENT;

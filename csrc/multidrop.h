@@ -37,7 +37,7 @@ enum md_result {
     MD_BAD_REQUEST = -8,  /* this message cannot be a frame: a field is out of bounds */
     /* of a whole exchange (line.c) */
     MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
-    MD_NO_REPLY = -10,         /* nothing at all came within the time-out */
+    MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
     MD_LINE_LOST = -11,        /* the port failed: completion.error is the errno, 0 at its end */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     /* of a value that was due (only seen in columns) */
@@ -133,7 +133,8 @@ struct md_line {
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
     uint16_t rx_len, rx_from; /* no reply begins before rx_from */
-    int reason;               /* why what came so far is not the reply */
+    int echoes;               /* the adapter echoes what it sends: learnt, never forgotten by failures */
+    int echo_due;             /* a copy of the request is still to come, and is not its reply */
     uint8_t tx[513], rx[1026];
 };
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
+from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
@@ -81,11 +83,16 @@ _REASONS = {
 EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
 
 
+STATUSES = (
+    *(_REASONS[Result(-code)] for code in range(-min(Result) + 1)),
+    *([""] * (EXCEPTION_STATUS + min(Result) - 1)),  # codes that are not used
+    *(f"exception {code:02X}" for code in range(256)),
+)
+
+
 def status_text(status: int) -> str:
     """What a status column says for the core's status code."""
-    if status >= EXCEPTION_STATUS:
-        return f"exception {status - EXCEPTION_STATUS:02X}"
-    return str(Result(-status))
+    return STATUSES[status]
 
 
 @dataclass(frozen=True)
@@ -398,24 +405,21 @@ class Columns:
         return memoryview(ffi.buffer(self._arrays[name], rows * size)).cast(kind)
 
 
-def spell(codes: memoryview[Any], names: Sequence[str]) -> tuple[memoryview[Any], memoryview[Any]]:
-    """Offsets (int32) and text of an Arrow utf8 column that has names[code] for each of `codes`."""
+@lru_cache(maxsize=64)
+def _spelling(names: tuple[str, ...]) -> tuple[bytes, Any, int]:
+    """All names as one text, where each begins and the last ends, and the longest one's length."""
     encoded = [name.encode() for name in names]
-    ends = [0]
-    for text in encoded:
-        ends.append(ends[-1] + len(text))
+    ends = [0, *accumulate(map(len, encoded))]
+    return b"".join(encoded), ffi.new("int32_t[]", ends), max(map(len, encoded), default=0)
+
+
+def spell(codes: memoryview[Any], names: tuple[str, ...]) -> tuple[memoryview[Any], memoryview[Any]]:
+    """Offsets (int32) and text of an Arrow utf8 column that has names[code] for each of `codes`."""
+    known, ends, longest = _spelling(names)
     rows = len(codes)
-    room = rows * max(map(len, encoded), default=0)
+    room = rows * longest
     offsets, text = ffi.new("int32_t[]", rows + 1), ffi.new("uint8_t[]", max(room, 1))
-    used = lib.md_spell(
-        ffi.from_buffer("uint16_t[]", codes),
-        rows,
-        b"".join(encoded),
-        ffi.new("int32_t[]", ends),
-        offsets,
-        text,
-        room,
-    )
+    used = lib.md_spell(ffi.from_buffer("uint16_t[]", codes), rows, known, ends, offsets, text, room)
     if used < 0:
         raise OverflowError("more than 2 GiB of names in one batch")
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))

@@ -14,7 +14,7 @@ from enum import Enum
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from multidrop.core import Framing
-from multidrop.errors import BusError, Refused, Unsupported
+from multidrop.errors import BusError, DriveRefused, Refused, Unconfirmed, Unsupported
 from multidrop.register import Access, Register, Table
 from multidrop.timing import Settings
 
@@ -24,6 +24,7 @@ __all__ = [  # also the names of other modules that a family's file needs
     "Condition",
     "Direction",
     "Drive",
+    "DriveRefused",
     "Framing",
     "Option",
     "Read",
@@ -31,9 +32,11 @@ __all__ = [  # also the names of other modules that a family's file needs
     "Script",
     "State",
     "Step",
+    "Unconfirmed",
     "Unsupported",
     "Wait",
     "Write",
+    "insist",
     "read",
     "until",
     "verb",
@@ -117,12 +120,25 @@ def read(register: Register[T]) -> Script[T]:
     return cast(T, (yield Read(register)))
 
 
-def write(register: Register[T], value: T) -> Script[None]:
-    yield Write(register, value)
+def write(register: Register[T], value: T) -> Script[T]:
+    """Write once; what the drive then holds, where that can be read, else `value`."""
+    return cast(T, (yield Write(register, value)))
 
 
 def wait(seconds: float) -> Script[None]:
     yield Wait(seconds)
+
+
+def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
+    """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
+    for attempt in range(1, attempts + 1):
+        try:
+            yield from write(register, value)
+        except (Unconfirmed, DriveRefused):
+            if attempt == attempts:
+                raise
+        else:
+            return
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
@@ -199,7 +215,8 @@ class Drive:
 
     silence: ClassVar[float] = 0.0  # s, before and after a frame; t3.5 is the least for RTU
     silence_characters: ClassVar[float] = 0.0  # the same, in characters
-    response_delay: ClassVar[float] = 0.005  # s, typical, from the request's end to the reply's begin
+    response_delay: float = 0.005  # s, typical, from the request's end to the reply's begin
+    response_delay_characters: ClassVar[float] = 0.0  # the same, in characters, where that is more
     response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
@@ -242,8 +259,11 @@ class Drive:
         self.framing = self._framing(framing)
         formats = self.formats[self.framing]
         self.settings = Settings(
-            self._checked("baud rate", baudrate or self.baudrates[0], self.baudrates),
-            self._checked("format", format or formats[0], formats),
+            self._checked("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
+            self._checked("format", formats[0] if format is None else format, formats),
+        )
+        self.response_delay = max(
+            self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         self.option = self._options(options)
@@ -312,6 +332,29 @@ class Drive:
 
     def _unsupported(self, what: str) -> Unsupported:
         return Unsupported(f"{self.name}: the document of {self.title or type(self).__name__} has no {what}")
+
+    def _stopped(self, look: Callable[[], Script[bool]], limit: float) -> Script[None]:
+        """Wait until the drive is seen to have stopped; Unconfirmed when it is not after `limit` seconds."""
+        if not (yield from until(look, limit=limit)):
+            raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
+
+    def _hold(self, register: Register[float], value: float) -> Script[None]:
+        """Write a setting; Unconfirmed when the drive then holds another value."""
+        held = yield from write(register, value)
+        if held != register.decode(register.encode(value)):
+            raise Unconfirmed(
+                self.name,
+                f"{register.name} = {register.format(value)}",
+                f"the drive holds {register.format(held)}",
+            )
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Look, without writing, whether this is a drive of the family; Refused when it is another.
+
+        What is not refused is not proven: few families say who they are.
+        """
+        yield from ()
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:

@@ -96,6 +96,7 @@ class Details(TypedDict):
     while_running: may be changed while the motor turns; None where not stated
     broadcast: the raw counts that are documented and harmless as a broadcast
     never: why the library never writes it
+    never_together: masks of bits that are never set in one write
     place: where the manual says so
     outside: the source, where it is not the family's own document
     note: what else a user must know
@@ -111,6 +112,7 @@ class Details(TypedDict):
     while_running: NotRequired[bool]
     broadcast: NotRequired[tuple[int, ...]]
     never: NotRequired[str]
+    never_together: NotRequired[tuple[int, ...]]
     place: NotRequired[str]
     outside: NotRequired[str]
     note: NotRequired[str]
@@ -134,6 +136,7 @@ class Register(Generic[T]):
     while_running: bool | None = None
     broadcast: tuple[int, ...] = ()
     never: str = ""
+    never_together: tuple[int, ...] = ()
     place: str = ""
     outside: str = ""
     note: str = ""
@@ -214,6 +217,10 @@ class Register(Generic[T]):
                 reserved = cast(Any, value).value & ~sum(member.value for member in known)
                 if reserved:
                     raise ValueError(f"{self.name}: bits {reserved:#x} are reserved and must stay 0")
+                for mask in self.never_together:
+                    if cast(Any, value).value & mask == mask:
+                        apart = values(mask).name.replace("|", " and ")
+                        raise ValueError(f"{self.name}: {apart} are never written together")
             return int(cast(Any, value).value)
         choices = ", ".join(member.name for member in values)
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")

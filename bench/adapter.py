@@ -1,0 +1,125 @@
+"""The one place in bench/, besides played.py, that knows multidrop's API."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy
+import pyarrow
+import pyarrow.compute
+from jobs import REGISTERS, Job, expected
+from played import Played, Unpaced
+
+from multidrop.batch import Batch, Row
+from multidrop.bus import exchange
+from multidrop.core import Block, Columns, Completions, Field, Message
+from multidrop.line import Line
+from multidrop.plant import load_plant
+from multidrop.poller import CHUNK_ROWS, Poller
+from multidrop.recording import open_writer
+
+
+def silence(baudrate: int) -> float:
+    """Seconds that multidrop keeps between two exchanges with the played drives."""
+    request = Message(1, 3, 0, REGISTERS)
+    return exchange(Played(1, baudrate=baudrate), request).silence_ns / 1e9
+
+
+def _plant_text(job: Job) -> str:
+    family = "Played" if job.baudrate else "Unpaced"
+    model = f"{Path(__file__).with_name('played.py')}:{family}"
+    drives = (
+        f'[[line.drive]]\nname = "drive-{address}"\nmodel = "{model}"\naddress = {address}\n'
+        + (f"baudrate = {job.baudrate}\n" if job.baudrate else "")
+        for address in range(1, job.drives + 1)
+    )
+    return f'[[line]]\nname = "line"\nport = "{job.port}"\n' + "".join(drives)
+
+
+@contextmanager
+def polling(job: Job) -> Iterator[Poller]:
+    """All registers of all drives, as fast as the line allows."""
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / "plant.toml"
+        path.write_text(_plant_text(job))
+        plant = load_plant(path)
+    with Poller(plant) as poller:
+        yield poller
+
+
+def counts(poller: Poller) -> tuple[int, int]:
+    """Good exchanges and failures so far."""
+    summary = poller.summary()
+    return summary["samples"] // REGISTERS, summary["misses"] // REGISTERS
+
+
+@contextmanager
+def multidrop(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
+    """As a rival: batches of columns are taken ten times a second, and the last one is looked at."""
+
+    def poll() -> tuple[int, int]:
+        for row in last(poller.batches(job.seconds)):
+            address, register = int(row.drive.partition("-")[2]), int(row.register[1:])
+            if row.value is not None and row.value != expected(address)[register]:
+                raise AssertionError(f"{row} is not what the drive holds")
+        return counts(poller)
+
+    def last(batches: Iterable[Batch]) -> Iterable[Row]:
+        return deque(batches, 1).pop()
+
+    with polling(job) as poller:
+        yield poll
+
+
+def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
+    """Good exchanges, and for each value how long after its reply's first byte the consumer had it.
+
+    The consumer sleeps on the poller's descriptor and takes what there is as soon as it wakes.
+    """
+    late = []
+    with polling(job) as poller:
+        end = time.monotonic() + job.seconds
+        while (left := end - time.monotonic()) > 0:
+            select.select([poller], [], [], left)
+            while batch := poller.take():
+                now = time.monotonic_ns()
+                columns = pyarrow.record_batch(batch)
+                replied = pyarrow.compute.add(columns["monotonic_ns"], columns["uncertainty_ns"]).drop_null()
+                late.append(now - replied.to_numpy(zero_copy_only=False))
+        good, _ = counts(poller)
+    return good, numpy.concatenate(late) / 1e6
+
+
+def decoder(job: Job) -> Callable[[], Batch]:
+    """Asks every drive once, and gives what decodes these replies into a new batch, again and again."""
+    drives = [Unpaced(address) for address in range(1, job.drives + 1)]
+    registers = list(Unpaced.registers.values())
+    completions = Completions(len(drives))
+    with closing(Line(job.port)) as line:
+        line.run([exchange(it, Message(it.address, 3, 0, REGISTERS)) for it in drives], completions)
+    wires = [Field(register.address, register.wire, 0, register.address, 1, 1) for register in registers]
+    blocks = [Block([field._replace(drive=at) for field in wires]) for at in range(len(drives))]
+    names = [f"drive-{it.address}" for it in drives], [register.name for register in registers]
+
+    def decode() -> Batch:
+        columns = Columns(CHUNK_ROWS)
+        for turn in range(CHUNK_ROWS // REGISTERS):
+            at = turn % len(blocks)
+            columns.add(blocks[at], completions, at, 0)
+        return Batch(columns, *names)
+
+    return decode
+
+
+def record(path: Path, decode: Callable[[], Batch], values: int) -> int:
+    """Decode and write until so many values are in the recording; how many there are."""
+    with open_writer(path, {}) as writer:
+        while writer.rows < values:
+            writer.write(decode())
+        return writer.rows

@@ -1,0 +1,85 @@
+"""What an exchange costs the host: lines without waits, on a pty and over TCP.
+
+A bare write-poll-read loop in C runs before every slice, and ratios are to that slice. Both ends
+are on one processor, which repeats best.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from statistics import median
+from typing import Any
+
+import rivals
+import tables
+from jobs import Job
+from programs import paced_line
+
+
+@contextmanager
+def on_one_processor() -> Iterator[None]:
+    """Programs that are started meanwhile stay on the first processor (where the system can do that)."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    yield
+    os.sched_setaffinity(0, allowed)
+
+
+def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:
+    with paced_line(baudrate=0, **options) as line:
+        job = Job(line.path, 0, seconds)
+        own = rivals.measure_bare(job, 0) if master == "bare C" else rivals.measure(master, job)
+    good = max(1, own["exchanges"])
+    return own | {"rate": good / own["seconds"], "cpu": own["cpu_seconds"] / good * 1e6}
+
+
+def row(where: str, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
+    pairs = list(zip(slices, bare, strict=True))
+    failed = sum(it["failures"] for it in slices)
+    return [
+        where,
+        master,
+        slices[0]["version"],
+        f"{median(it['rate'] for it in slices):.0f}",
+        f"{median(it['rate'] / yard['rate'] for it, yard in pairs):.3f}",
+        f"{median(it['cpu'] for it in slices):.1f}",
+        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        str(failed),
+    ]
+
+
+def compared(where: str, master: str, arguments: argparse.Namespace, **options: Any) -> list[list[str]]:
+    bare, slices = [], []
+    for _ in range(arguments.slices):
+        bare.append(measured("bare C", arguments.seconds, **options))
+        slices.append(measured(master, arguments.seconds, **options))
+    return [row(where, "bare C", bare, bare), row(where, master, slices, bare)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--masters", nargs="+", choices=rivals.MASTERS, default=rivals.MASTERS)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of a slice")
+    parser.add_argument("--slices", type=int, default=5)
+    arguments = parser.parse_args()
+    rivals.insist_on(arguments.masters)
+    tables.heading(
+        "Lines without waits: 16 drives, 10 registers each, the library's own silence where it has one."
+    )
+
+    rows = []
+    with on_one_processor():
+        for master in arguments.masters:
+            rows += compared("pty", master, arguments)
+        for master in arguments.masters:
+            if master in rivals.OVER_TCP:
+                rows += compared("TCP", master, arguments, tcp=True)
+    columns = ("line", "master", "version", "exchanges/s", "/ bare", "CPU us", "/ bare", "failed")
+    tables.show(columns, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""How much of a real wire each master uses, whether it keeps the silence, and what it costs the host.
+
+A bare master in C that keeps multidrop's silence runs before every slice; differences and ratios
+are to that slice, and all figures are medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+from statistics import median
+from typing import Any
+
+import adapter
+import rivals
+import tables
+from jobs import Job
+from programs import paced_line
+
+COLUMNS = (
+    "baud",
+    "master",
+    "version",
+    "utilisation",
+    "- bare",
+    "too early",
+    "late us",
+    "CPU us",
+    "/ bare",
+    "failed",
+)
+
+
+def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
+    """One slice, as the drives and as the master see it."""
+    with paced_line(baudrate=baudrate) as line:
+        job = Job(line.path, baudrate, seconds)
+        if master == "bare C":
+            own = rivals.measure_bare(job, adapter.silence(baudrate))
+        else:
+            own = rivals.measure(master, job)
+    report = line.report
+    asked = max(1, report["answered"] + report["unanswered"])
+    return {
+        "version": own["version"],
+        "utilisation": report["utilisation"],
+        "early": report["early"] / asked,
+        "late": report["excess_us"]["p50"],
+        "cpu": own["cpu_seconds"] / asked * 1e6,
+        "failed": own["failures"] / max(1, own["exchanges"] + own["failures"]),
+        "pacing": report["lateness_us"],
+    }
+
+
+def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
+    def middle(key: str) -> float:
+        return median(it[key] for it in slices)
+
+    pairs = list(zip(slices, bare, strict=True))
+    return [
+        str(baudrate),
+        master,
+        slices[0]["version"],
+        f"{middle('utilisation'):.4f}",
+        f"{median(it['utilisation'] - yard['utilisation'] for it, yard in pairs):+.4f}",
+        f"{middle('early'):.1%}",
+        f"{middle('late'):.0f}",
+        f"{middle('cpu'):.0f}",
+        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        f"{middle('failed'):.1%}",
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
+    parser.add_argument("--masters", nargs="+", choices=rivals.MASTERS, default=rivals.MASTERS)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
+    parser.add_argument("--slices", type=int, default=5)
+    arguments = parser.parse_args()
+    rivals.insist_on(arguments.masters)
+
+    tables.heading(
+        "A paced line: 16 drives, 10 registers each, 8N1, response delay 2 ms, delivered byte by byte."
+    )
+    for baudrate in arguments.baudrates:
+        pacing = measured("bare C", baudrate, arguments.seconds)["pacing"]
+        late = ", ".join(f"{name} {pacing[name]:.1f}" for name in ("p50", "p99", "max"))
+        print(f"the line's own lateness per byte at {baudrate}: {late} us")
+    print(flush=True)
+
+    rows = []
+    for baudrate in arguments.baudrates:
+        yards: list[dict[str, Any]] = []
+        for master in arguments.masters:
+            bare, slices = [], []
+            for _ in range(arguments.slices):
+                bare.append(measured("bare C", baudrate, arguments.seconds))
+                slices.append(measured(master, baudrate, arguments.seconds))
+            yards += bare
+            rows.append(row(baudrate, master, slices, bare))
+        rows.append(row(baudrate, "bare C", yards, yards))
+    tables.show(COLUMNS, rows)
+    print(
+        "\nutilisation: ideal bus cycle / measured; over 1 where the silence is not kept."
+        "\ntoo early: requests more than 20 us before the silence was over."
+        "\nlate: median time from the end of the silence until a request is seen."
+        "\nCPU: of the master's process, per exchange."
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""Rows of samples and misses: as columns for Arrow's users, and one by one for people.
+
+Any library that speaks the Arrow PyCapsule interface takes a batch as it is, and none of them is
+needed here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.DataFrame.from_arrow(batch)`,
+`duckdb.sql("from batch")`. For NumPy, with NaN for every miss:
+`nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+from multidrop.core import STATUSES, Columns, spell
+
+
+class Row(NamedTuple):
+    """A sample, or a miss: that has no value, and its status says why."""
+
+    time: int  # UTC, ns: the request was sent
+    monotonic_ns: int
+    uncertainty_ns: int | None  # the value was taken between time and time + uncertainty_ns
+    drive: str
+    register: str
+    value: float | None
+    status: str  # "ok", or the reason
+
+
+class Rows(ABC):
+    """What all rows offer, wherever they are kept: their number, each one, and Arrow's capsules."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Row]: ...
+
+    @abstractmethod
+    def arrow(self) -> Any:
+        """The rows as a nanoarrow array."""
+
+    def __arrow_c_schema__(self) -> Any:
+        return schema().__arrow_c_schema__()
+
+    def __arrow_c_array__(self, requested_schema: object = None) -> Any:
+        return self.arrow().__arrow_c_array__()
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        import nanoarrow
+
+        return nanoarrow.c_array_stream(self.arrow()).__arrow_c_stream__()
+
+
+class Batch(Rows):
+    """Rows that the core made, and the names whose codes they hold."""
+
+    def __init__(self, columns: Columns, drives: Sequence[str], registers: Sequence[str]) -> None:
+        self._columns = columns
+        self._drives = tuple(drives)
+        self._registers = tuple(registers)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    def __iter__(self) -> Iterator[Row]:
+        drives, registers = self._drives, self._registers
+        names = ("time", "sent", "uncertainty", "drive", "reg", "value", "status")
+        for time, sent, uncertainty, drive, register, value, status in zip(
+            *map(self._columns.array, names), strict=True
+        ):
+            sample = (uncertainty, value) if status == 0 else (None, None)
+            yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
+
+    def __repr__(self) -> str:
+        return f"<Batch of {len(self)} rows>"
+
+    def arrow(self) -> Any:
+        column = self._columns.array
+        valid = column("valid")
+        return assemble(
+            len(self),
+            (None, column("time")),
+            (None, column("sent")),
+            (valid, column("uncertainty")),
+            (None, *spell(column("drive"), self._drives)),
+            (None, *spell(column("reg"), self._registers)),
+            (valid, column("value")),
+            (None, *spell(column("status"), STATUSES)),
+        )
+
+
+@cache
+def schema() -> Any:
+    """The columns of every batch and of every recording."""
+    import nanoarrow as arrow
+
+    return arrow.c_schema(
+        arrow.struct(
+            {
+                "time": arrow.timestamp("ns", "UTC", nullable=False),
+                "monotonic_ns": arrow.int64(nullable=False),
+                "uncertainty_ns": arrow.int64(),
+                "drive": arrow.string(nullable=False),
+                "register": arrow.string(nullable=False),
+                "value": arrow.float64(),
+                "status": arrow.string(nullable=False),
+            },
+            nullable=False,
+        )
+    )
+
+
+def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
+    """An array of the schema from each column's buffers, in Arrow's layout; nothing is copied.
+
+    ValueError or RuntimeError when the buffers are not those of so many rows.
+    """
+    from nanoarrow import c_array_from_buffers
+
+    children = [
+        c_array_from_buffers(kind, rows, buffers, validation_level="full")
+        for kind, buffers in zip(schema().children, columns, strict=True)
+    ]
+    return c_array_from_buffers(schema(), rows, [None], children=children, move=True)

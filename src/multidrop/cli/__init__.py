@@ -1,0 +1,139 @@
+"""The command line: finds the command, runs it, and turns what goes wrong into a sentence and a status.
+
+A command's module is imported when it is run: `multidrop --help` loads none of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, NoReturn
+
+DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+
+COMMANDS = {  # name: its module here, and what it does
+    "demo": ("demo", "poll simulated drives of every family on one line"),
+    "models": ("models", "list the families, or one family's registers"),
+    "read": ("read", "read values from a drive"),
+    "write": ("write", "write one register of a drive"),
+    "state": ("verbs", "say whether a drive runs, which way, and its fault"),
+    "start": ("verbs", "start a drive's motor"),
+    "stop": ("verbs", "stop it along its deceleration ramp"),
+    "coast": ("verbs", "take the voltage off and let it run out"),
+    "emergency-stop": ("verbs", "stop it as the drive's own emergency stop does"),
+    "jog": ("verbs", "turn it slowly until stopped"),
+    "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
+    "set-frequency": ("verbs", "write a drive's frequency setpoint"),
+    "poll": ("poll", "poll the drives of a plant file, and record them"),
+    "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
+    "convert": ("convert", "turn one recording into another format"),
+}
+
+_LIST = "\n".join(f"  {name:<16}{text}" for name, (_, text) in COMMANDS.items())
+HELP = f"""usage: multidrop COMMAND [arguments]
+
+Poll every drive on an RS-485 line as fast as the wire allows.
+
+{_LIST}
+
+`multidrop COMMAND --help` says what a command takes; --json prints for programs.
+Exit status: 0 done, 1 the line or a drive failed, 2 mistaken call.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; its exit status."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        print(HELP, end="")
+        return DONE if words else MISTAKE
+    if words[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"multidrop {version('multidrop')}")
+        return DONE
+    with _sigterm_as_interrupt():
+        return _guarded(words[0], words[1:])
+
+
+def _guarded(command: str, words: list[str]) -> int:
+    """Run it; every foreseeable failure becomes a sentence on stderr."""
+    try:
+        status = _run(command, words)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        return _say("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # whoever reads our output has seen enough
+        _abandon_output()
+        return DONE
+    except (ValueError, TypeError) as mistake:
+        return _say(str(mistake), MISTAKE)
+    except OSError as failure:
+        if failure.strerror is None:  # one of ours
+            return _say(str(failure), FAILED)
+        _abandon_output()
+        where = f"{failure.filename}: " if failure.filename else ""
+        return _say(f"{where}{failure.strerror}", FAILED)
+    except Exception as failure:
+        from multidrop.errors import BusError, Refused, Unsupported
+
+        if not isinstance(failure, BusError):
+            raise
+        return _say(str(failure), MISTAKE if isinstance(failure, (Refused, Unsupported)) else FAILED)
+    return status
+
+
+def _run(command: str, words: list[str]) -> int:
+    if command not in COMMANDS:
+        near = difflib.get_close_matches(command, COMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else "see `multidrop --help`"
+        raise ValueError(f"there is no command {command!r}; {hint}")
+    name, text = COMMANDS[command]
+    module: Any = importlib.import_module(f"multidrop.cli.{name}")
+    parser = _Parser(prog=f"multidrop {command}", description=text.capitalize() + ".", allow_abbrev=False)
+    parser.set_defaults(command=command)
+    module.add_arguments(parser)
+    try:
+        arguments = parser.parse_intermixed_args(words)  # an option may stand between positionals
+    except SystemExit:  # --help was printed
+        return DONE
+    return int(module.run(arguments))
+
+
+class _Parser(argparse.ArgumentParser):
+    """Mistakes in the arguments are a ValueError, as all mistakes are."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message}; see `{self.prog} --help`")
+
+
+def _say(sentences: str, status: int) -> int:
+    for sentence in sentences.splitlines():
+        print(f"multidrop: {sentence}", file=sys.stderr)
+    return status
+
+
+def _abandon_output() -> None:
+    """Nothing more can be written to stdout: keep the interpreter from trying when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _sigterm_as_interrupt() -> Iterator[None]:
+    """SIGTERM ends a command as Ctrl-C does."""
+    try:
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    except ValueError:  # not the main thread, whose business signals are
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

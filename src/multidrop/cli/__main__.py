@@ -1,0 +1,7 @@
+"""`python -m multidrop.cli`: the same as `multidrop`."""
+
+import sys
+
+from multidrop.cli import main
+
+sys.exit(main())

@@ -1,0 +1,21 @@
+"""`multidrop convert`: a recording anew, in the format of another suffix."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.recording import FORMATS, convert
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="A", type=Path, help="a recording; its end may be torn")
+    parser.add_argument("target", metavar="B", type=Path, help=f"a new file: {', '.join(FORMATS)}")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    refuse_overwriting(arguments.target)
+    rows = convert(arguments.source, arguments.target)
+    print(f"{rows} rows in {arguments.target}")
+    return 0

@@ -1,0 +1,79 @@
+"""`multidrop demo`: a simulated line with every family on it, polled and recorded."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from multidrop.bus import Bus
+from multidrop.cli.poll import add_polling_arguments, follow
+from multidrop.drives import MODELS
+from multidrop.plant import Line, load_plant
+
+DRIVES = (  # name, model, framing
+    ("erman", "erman-er-g-220", "rtu"),
+    ("che", "invt-che", "rtu"),
+    ("ibd", "innovert-ibd", "rtu"),
+    ("ibd-ascii", "innovert-ibd", "ascii"),
+    ("delixi", "delixi-modbus", "rtu"),
+    ("delixi-ascii", "delixi-modbus", "ascii"),
+    ("delixi-native", "delixi-native", "delixi"),
+    ("yd1000", "yd1000", "rtu"),
+)
+POLLED = ("output_frequency", "motor_speed", "output_current", "dc_bus_voltage")
+OPTIONS = {"maximum_frequency": 50}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_polling_arguments(parser, out="demo.arrows", seconds=10.0)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    with TemporaryDirectory(prefix="multidrop-") as directory:
+        path = Path(directory) / "demo.toml"
+        path.write_text(_plant_file(Path(directory) / "mixed"))
+        with _simulator(path, Path(directory)):
+            plant = load_plant(path)
+            _start_motors(plant.lines[0])
+            return follow(plant, arguments)
+
+
+def _plant_file(port: Path) -> str:
+    tables = [f'[[line]]\nname = "mixed"\nport = "{port}"\n']
+    for address, (name, model, framing) in enumerate(DRIVES, 1):
+        family = MODELS[model]
+        options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+        tables.append(
+            f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
+            f"address = {address}\n{options}poll = {[it for it in POLLED if it in family.registers]}\n"
+        )
+    return "\n".join(tables)
+
+
+def _start_motors(line: Line) -> None:
+    """Every simulated motor at another frequency, so that there is something to be seen."""
+    with Bus(line.port) as bus:
+        for number, polled in enumerate(line.drives):
+            drive = bus.attach(polled.drive)
+            drive.set_frequency(20.0 + 3 * number)
+            drive.start()
+
+
+@contextmanager
+def _simulator(plant: Path, ports: Path) -> Iterator[None]:
+    """A process of its own, so that the two sides do not share an interpreter."""
+    words = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", str(ports)]
+    # In a session of its own, Ctrl-C reaches it only when polling has ended.
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        try:
+            if not process.stdout.readline().startswith("ready"):
+                raise OSError("the simulator did not start; see above")
+            yield
+        finally:
+            process.terminate()

@@ -1,0 +1,229 @@
+"""`multidrop models`: the families, or all that one family's document says of its registers."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+from multidrop.cli.target import add_json_argument
+from multidrop.cli.values import aligned
+from multidrop.drive import VERBS, Drive, Option
+from multidrop.drives import MODELS
+from multidrop.models import find_model
+from multidrop.register import Access, Kept, Register, Table
+
+WIDTH = 80
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL", nargs="?", help="one family; or path/to/file.py:Class")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.model is None:
+        families = list(MODELS.values())
+        print(json.dumps([_summary(it) for it in families], indent=2) if arguments.json else _list(families))
+    else:
+        family = find_model(arguments.model)
+        print(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
+    return 0
+
+
+def _list(families: list[type[Drive]]) -> str:
+    rows = [("MODEL", "FAMILY", "FRAMINGS", "ADDRESSES", "REGISTERS")]
+    rows += [
+        (it.model, it.title, " ".join(map(str, it.framings)), _range(it.addresses), str(len(it.registers)))
+        for it in families
+    ]
+    return "\n".join([*aligned(rows, "<<<<>"), "", "`multidrop models MODEL` says all of one family."])
+
+
+def _range(numbers: range) -> str:
+    return f"{numbers[0]}-{numbers[-1]}"
+
+
+# ---- one family, for people ----
+
+
+def _sheet(family: type[Drive]) -> str:
+    lines = [family.title or family.__name__, *_paragraph(family.manual), ""]
+    for name, text in _lines_of(family):
+        lines += textwrap.wrap(text, WIDTH, initial_indent=f"{name:<14}", subsequent_indent=" " * 14)
+    exceptions = {f"{code:02X}H": meaning for code, meaning in family.exceptions.items()}
+    options = {name: _option(option) for name, option in family.options.items()}
+    for heading, entries in (("exceptions", exceptions), ("options", options)):
+        if entries:
+            lines += ["", heading, *_entries(entries)]
+    for table in dict.fromkeys(register.table for register in family.registers.values()):
+        lines += ["", _table_heading(table, family), *_registers(family, table)]
+    if family.__doc__:
+        lines += ["", *_notes(family.__doc__)]
+    return "\n".join(lines)
+
+
+def _paragraph(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent)
+
+
+def _notes(docstring: str) -> Iterator[str]:
+    """The docstring as it stands, but no line wider than the rest."""
+    for line in inspect.cleandoc(docstring).splitlines():
+        yield from _paragraph(line) or [""]
+
+
+def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
+    yield "model", family.model or "(a file of your own)"
+    yield "addresses", _range(family.addresses)
+    yield "baud rates", ", ".join(map(str, family.baudrates)) + " (the first is the default)"
+    for framing, formats in family.formats.items():
+        yield f"{framing} formats", ", ".join(formats)
+    yield "silence", _silence(family)
+    yield "response", f"{_ms(family.response_delay)} typical, none after {_ms(family.response_timeout)}"
+    broadcast = (
+        f"yes; then {_ms(family.turnaround_delay)} of pause" if family.broadcasts else "none documented"
+    )
+    yield "broadcast", broadcast
+    yield "verbs", ", ".join(_verbs(family)) or "none"
+    yield "watchdog", family.watchdog
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:g} ms"
+
+
+def _silence(family: type[Drive]) -> str:
+    own = []
+    if family.silence:
+        own.append(_ms(family.silence))
+    if family.silence_characters:
+        own.append(f"{family.silence_characters:g} characters")
+    return f"{' and '.join(own) or '3.5 characters (RTU)'} before and after a frame"
+
+
+def _verbs(family: type[Drive]) -> list[str]:
+    return [name.replace("_", "-") for name in VERBS if getattr(family, name) is not getattr(Drive, name)]
+
+
+def _entries(entries: dict[str, str]) -> Iterator[str]:
+    for name, meaning in entries.items():
+        yield from textwrap.wrap(meaning, WIDTH, initial_indent=f"  {name}  ", subsequent_indent=" " * 8)
+
+
+def _option(option: Option) -> str:
+    return f"{option.meaning} ({option.span[0]:g} to {option.span[1]:g} {option.unit}".rstrip() + ")"
+
+
+def _table_heading(table: Table, family: type[Drive]) -> str:
+    codes = []
+    if table.read is not None:
+        codes.append(f"read {table.read:02X}H, {family.most_registers.get(table, 1)} at most")
+    if table.write is not None:
+        codes.append(f"write {table.write:02X}H")
+    return f"{table.name}s ({'; '.join(codes)})"
+
+
+def _registers(family: type[Drive], table: Table) -> Iterator[str]:
+    """A row a register, and under it what else is known."""
+    registers = [register for register in family.registers.values() if register.table is table]
+    rows = aligned([_row(register) for register in registers], "<<<<<")
+    for register, row in zip(registers, rows, strict=True):
+        yield f"  {row}"
+        yield from _paragraph("; ".join(_remarks(register)), " " * 8)
+
+
+def _row(register: Register[Any]) -> tuple[str, ...]:
+    what = (
+        f"{register.step:g} {register.unit}"
+        if register.step is not None
+        else f"{register.unit} scale not stated"
+    )
+    if register.values is not None:
+        what = "names"
+    span = f"{register.span[0]:g} to {register.span[1]:g}" if register.span else ""
+    return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
+
+
+def _remarks(register: Register[Any]) -> Iterator[str]:
+    if register.access is Access.SETTING or register.kept is not Kept.UNKNOWN:
+        yield f"kept: {register.kept.value}"
+    if register.ram_address is not None:
+        yield f"written at {register.ram_address:04X}H, in RAM"
+    if register.words > 1:
+        yield f"{register.words} words, {register.wire.name}"
+    if register.default is not None:
+        yield f"from the factory {register.default:g}"
+    if register.while_running is not None:
+        yield "may change while running" if register.while_running else "only while stopped"
+    if register.broadcast:
+        yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
+    if register.never:
+        yield f"never written: {register.never}"
+    if register.values is not None:
+        yield ", ".join(f"{member.value} {member.name}" for member in register.values)
+    yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
+
+
+# ---- for programs ----
+
+
+def _summary(family: type[Drive]) -> dict[str, Any]:
+    return {
+        "model": family.model,
+        "title": family.title,
+        "framings": [str(framing) for framing in family.framings],
+        "addresses": [family.addresses[0], family.addresses[-1]],
+        "register_count": len(family.registers),
+    }
+
+
+def _facts(family: type[Drive]) -> dict[str, Any]:
+    return _summary(family) | {
+        "manual": family.manual,
+        "baudrates": family.baudrates,
+        "formats": {str(framing): formats for framing, formats in family.formats.items()},
+        "silence_s": family.silence,
+        "silence_characters": family.silence_characters,
+        "response_delay_s": family.response_delay,
+        "response_timeout_s": family.response_timeout,
+        "turnaround_delay_s": family.turnaround_delay,
+        "broadcasts": family.broadcasts,
+        "most_registers": {table.name: most for table, most in family.most_registers.items()},
+        "exceptions": family.exceptions,
+        "options": {
+            name: {"unit": it.unit, "span": it.span, "meaning": it.meaning}
+            for name, it in family.options.items()
+        },
+        "verbs": _verbs(family),
+        "watchdog": family.watchdog,
+        "registers": [_register(register) for register in family.registers.values()],
+        "notes": inspect.cleandoc(family.__doc__ or ""),
+    }
+
+
+def _register(register: Register[Any]) -> dict[str, Any]:
+    names = register.values
+    return {
+        "name": register.name,
+        "table": register.table.name,
+        "address": register.address,
+        "access": register.access.value,
+        "unit": register.unit,
+        "step": register.step,
+        "span": register.span,
+        "values": None if names is None else {member.name: member.value for member in names},
+        "wire": register.wire.name,
+        "kept": register.kept.value,
+        "ram_address": register.ram_address,
+        "default": register.default,
+        "while_running": register.while_running,
+        "broadcast": register.broadcast,
+        "never": register.never,
+        "place": register.place,
+        "outside": register.outside,
+        "note": register.note,
+    }

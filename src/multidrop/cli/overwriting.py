@@ -1,0 +1,11 @@
+"""A recording is never put in the place of another file, which may hold months of data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def refuse_overwriting(path: Path) -> None:
+    """Raise ValueError when there is a file at this path."""
+    if path.is_file():
+        raise ValueError(f"{path} is there already: name another file, or remove it first")

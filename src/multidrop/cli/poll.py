@@ -1,0 +1,136 @@
+"""`multidrop poll`: a plant's drives again and again, into a recording and before one's eyes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from multidrop.batch import Rows
+from multidrop.cli.interruption import Interruption
+from multidrop.cli.live import LiveTable
+from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.target import add_json_argument
+from multidrop.cli.values import aligned
+from multidrop.plant import Plant, load_plant
+from multidrop.poller import Poller
+from multidrop.recording import open_writer
+
+_TAKE_S = 0.1  # between looks for new rows
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_polling_arguments(parser, out=None, seconds=None)
+
+
+def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, seconds: float | None) -> None:
+    """How long, into which file, and how it is told."""
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=_seconds,
+        default=seconds,
+        help=f"how long; {seconds or 'until Ctrl-C'}",
+    )
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, default=out, help=f"recording, by suffix; {out or 'none'}"
+    )
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.out:
+        refuse_overwriting(arguments.out)
+    return follow(load_plant(arguments.plant), arguments)
+
+
+def follow(plant: Plant, arguments: argparse.Namespace) -> int:
+    """Poll the plant as `add_polling_arguments` says, and tell what became of it."""
+    show = not arguments.json and sys.stdout.isatty()
+    table = LiveTable(plant, sys.stdout) if show else None
+    with ExitStack() as stack:
+        interruption = stack.enter_context(Interruption())
+        takers: list[Callable[[Rows], None]] = [table.add] if table else []
+        if arguments.out:
+            takers.append(stack.enter_context(open_writer(arguments.out, _metadata(plant))).write)
+        with Poller(plant) as poller:
+            for _ in _ticks(arguments.seconds, interruption):
+                _hand_out(poller, takers)
+                if table:
+                    table.draw_if_due(time.monotonic())
+        _hand_out(poller, takers)  # what came while it closed
+    if table:
+        table.draw()
+    summary = poller.summary() | {"recording": str(arguments.out) if arguments.out else None}
+    print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
+    return 0 if summary["samples"] else 1
+
+
+def _ticks(seconds: float | None, interruption: Interruption) -> Iterator[None]:
+    end = None if seconds is None else time.monotonic() + seconds
+    while not interruption.came and (end is None or time.monotonic() < end):
+        time.sleep(_TAKE_S if end is None else max(0.0, min(_TAKE_S, end - time.monotonic())))
+        yield
+
+
+def _hand_out(poller: Poller, takers: list[Callable[[Rows], None]]) -> None:
+    while batch := poller.take():
+        for take in takers:
+            take(batch)
+
+
+def _metadata(plant: Plant) -> dict[str, Any]:
+    """What a reader of the recording must know that its rows do not say."""
+    return {
+        "plant": str(plant.path),
+        "drives": {
+            polled.drive.name: {
+                "line": line.name,
+                "model": polled.drive.model,
+                "address": polled.drive.address,
+                "settings": str(polled.drive.settings),
+                "framing": str(polled.drive.framing),
+                "registers": {
+                    register.name: {"unit": register.unit, "step": register.step}
+                    for register in (poll.register for poll in polled.polls)
+                },
+            }
+            for line in plant.lines
+            for polled in line.drives
+        },
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    lines: list[str] = []
+    for name, line in summary["lines"].items():
+        lines.append(
+            f"{name}: {line['exchanges']} exchanges in {line['seconds']:.1f} s, "
+            f"utilisation {line['utilisation']:.1%}"
+        )
+        rows = [("DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES")]
+        for drive, told in line["drives"].items():
+            misses = ", ".join(f"{reason} {count}" for reason, count in told["misses"].items())
+            exchanges, samples = told["exchanges_per_second"], told["samples_per_second"]
+            rows.append((drive, f"{exchanges:.1f}", f"{samples:.1f}", misses or "none"))
+        lines += [f"  {row}" for row in aligned(rows, "<>><")]
+    into = f" in {summary['recording']}" if summary["recording"] else ""
+    dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
+    lines.append(f"{summary['samples']} samples and {summary['misses']} misses{into}{dropped}")
+    return "\n".join(lines)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+    return seconds

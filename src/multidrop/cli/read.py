@@ -1,0 +1,75 @@
+"""`multidrop read`: values of one drive, with their units."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import Any
+
+from multidrop.bus import Bus
+from multidrop.cli.target import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.values import aligned, as_json, as_row
+from multidrop.drive import Drive
+from multidrop.errors import DriveRefused
+from multidrop.register import Register
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_target_arguments(parser)
+    parser.add_argument(
+        "registers", metavar="REGISTER", nargs="*", default=[], help="all readings and settings if none"
+    )
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    drive = drive_of(arguments)
+    wanted = [drive.register(name) for name in arguments.registers]
+    for register in wanted:
+        if not register.readable:
+            raise ValueError(f"{register.name} can only be written; see `multidrop models {arguments.model}`")
+    wanted = wanted or [register for register in drive.registers.values() if register.readable]
+    with Bus(arguments.port) as bus:
+        bus.attach(drive)
+        values = _read(bus, drive, wanted)
+    refused = [answer for answer in values.values() if isinstance(answer, DriveRefused)]
+    print(_json(drive, values) if arguments.json else _text(drive, values))
+    return 1 if refused else 0
+
+
+def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
+    """Every register's value, or the drive's refusal to tell it."""
+    try:
+        found = bus.read_many(drive, wanted)
+    except DriveRefused:  # one of them; which one, only asking singly tells
+        return {register: _read_one(bus, drive, register) for register in wanted}
+    return {register: found[register.name] for register in wanted}
+
+
+def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
+    try:
+        return bus.read(drive, register)
+    except DriveRefused as refusal:
+        return refusal
+
+
+def _text(drive: Drive, values: dict[Register[Any], Any]) -> str:
+    rows = [
+        (register.name, "", f"refused: {value.meaning}")
+        if isinstance(value, DriveRefused)
+        else as_row(register, value)
+        for register, value in values.items()
+    ]
+    return "\n".join(aligned(rows, "<><"))
+
+
+def _json(drive: Drive, values: dict[Register[Any], Any]) -> str:
+    told = {
+        register.name: {"value": None, "refused": value.meaning, "code": value.code}
+        if isinstance(value, DriveRefused)
+        else as_json(register, value)
+        for register, value in values.items()
+    }
+    return json.dumps(
+        {"drive": drive.name, "model": drive.model, "address": drive.address, "values": told}, indent=2
+    )

@@ -1,0 +1,45 @@
+"""Registers' values as people read them, in aligned columns, and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from enum import Flag, IntEnum
+from typing import Any
+
+from multidrop.register import Register
+
+Row = Sequence[str]
+
+
+def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
+    """One line a row, its columns as wide as their widest text; `alignment` has < or > for each column."""
+    rows = list(rows)
+    widths = [max((len(text) for text in column), default=0) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            f"{text:{side}{width}}" for text, side, width in zip(row, alignment, widths, strict=True)
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def as_row(register: Register[Any], value: Any) -> Row:
+    """Name, value, and unit or what is to be known about the value."""
+    if isinstance(value, Flag | IntEnum):
+        return register.name, register.format(value), ""
+    number, _, unit = register.format(value).partition(" ")
+    if register.values is not None:
+        unit = "(the document has no name for it)"
+    return register.name, number, unit
+
+
+def as_json(register: Register[Any], value: Any) -> dict[str, Any]:
+    """`value` is null, and the count is in `raw`, where the scale is not stated."""
+    if isinstance(value, Flag):
+        return {"value": [member.name for member in value], "raw": value.value}
+    if isinstance(value, IntEnum):
+        return {"value": value.name, "raw": value.value}
+    if register.values is not None or register.step is None:
+        return {"value": None, "raw": int(value)}
+    return {"value": None if math.isnan(value) else value, "unit": register.unit}

@@ -1,0 +1,120 @@
+"""Delixi 9200 with RTU firmware (RTU, ASCII) and 9100-SC (ASCII): standard Modbus."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Framing,
+    Refused,
+    Script,
+    State,
+    insist,
+    read,
+    verb,
+    write,
+)
+from multidrop.drives.delixi_parameters import DelixiParameters, parameter
+from multidrop.register import HOLDING, Kept, command, setting
+
+
+class Control(IntEnum):
+    """The words that this library sends: run or jog always with a direction, and never the toggle."""
+
+    NOTHING = 0x00
+    STOP = 0x01
+    FORWARD = 0x12
+    REVERSE = 0x22
+    JOG_FORWARD = 0x13
+    JOG_REVERSE = 0x23
+
+
+class DelixiModbus(DelixiParameters, table=HOLDING):
+    """Delixi 9200 (RTU firmware) and 9100-SC; RS-485 communication protocol, part 2, standard Modbus.
+
+    The 9200 speaks RTU or ASCII by P04.29, the 9100-SC ASCII only; all others see `delixi-native`.
+    Where the document errs or is silent, the safest reading is taken:
+
+    - The address of a setpoint that is not stored is printed "xxH". The only one known is 0002H
+      (P00.02), which wears the EEPROM: it is written on change only, so do not ramp with it.
+    - Whether a run command without a direction keeps the old one is not stated: both are always
+      sent together. `start` without a direction goes forward from rest; while the motor turns it is
+      refused, because the direction cannot be read. The toggle of the direction is never sent.
+    - There is no fault reset, and reserved bits are not tried.
+    - There is no state word: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
+    - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
+    - How many registers may be read at once is not stated: one. Nor are exceptions: any is a refusal.
+    - Timing is taken from part 3.
+
+    P00.00 = 2 takes commands from the line, P00.01 = 1 the setpoint from P00.02. Functions 03 and 06
+    only. Broadcasts may only be run commands.
+    """
+
+    model = "delixi-modbus"
+    title = "Delixi 9200/9100-SC (Modbus)"
+    manual = "Delixi inverters, RS-485 communication protocol, part 2, standard Modbus"
+
+    framings = (Framing.RTU, Framing.ASCII)
+    formats = {  # P04.29
+        Framing.RTU: ("8N2", "8E1", "8O1"),
+        Framing.ASCII: ("7N2", "7E1", "7O1"),
+    }
+    exceptions = {}
+    broadcasts = True
+
+    control = command(0x2000, Control, broadcast=(Control.STOP,), place="part 2, section 3: 2000H")
+    frequency = setting(
+        parameter(0, 2),
+        "Hz",
+        step=0.01,
+        kept=Kept.EEPROM,
+        place="P00.02",
+        note="Every write wears the EEPROM. Used if P00.01 = 1.",
+    )
+
+    @verb
+    def identify(self) -> Script[None]:
+        """P05.31 can be read, and is a fault code."""
+        fault = yield from read(self.fault)
+        if not isinstance(fault, type(self.fault.decode(0))):
+            raise Refused(f"{self.name} has {int(fault):04X}H as its present fault: it is not a Delixi")
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start at the setpoint in force; without a direction forward, and only from rest."""
+        forward = yield from self._forward(direction)
+        yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly until stopped; without a direction forward, and only from rest."""
+        forward = yield from self._forward(direction)
+        yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+
+    def _forward(self, direction: Direction | None) -> Script[bool]:
+        if direction is None and not (yield from self._stands()):
+            raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
+        return direction is not Direction.REVERSE
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop, which has happened when the output frequency is 0."""
+        yield from insist(self.control, Control.STOP)
+        yield from self._stopped(self._stands, self._limit())
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the stored setpoint, on change only."""
+        yield from self._hold(self.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """The fault by name, or that the motor turns; at rest, unknown."""
+        fault = yield from read(self.fault)
+        if fault:
+            return State(Condition.FAULT, fault=self.fault.format(fault))
+        if (yield from self._stands()):
+            return State(Condition.UNKNOWN, note="output frequency 0: stopped, or running at a setpoint of 0")
+        return State(Condition.RUNNING)

@@ -1,0 +1,141 @@
+"""Delixi's other inverters: the maker's own ASCII protocol."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from multidrop.drive import Condition, Direction, Framing, Script, State, insist, read, verb, write
+from multidrop.drives.delixi_parameters import DelixiParameters, parameter
+from multidrop.register import Carrier, Kept, Table, command, reading, setting
+
+COMMAND = Table("run command", None, 0x02, Carrier.NUMBER)
+STATE = Table("run state", 0x03, None, Carrier.NUMBER)
+SETPOINT = Table("run setpoint", None, 0x04, Carrier.LONG)
+PARAMETER_RAM = Table("parameter, not stored", 0x07, 0x05, Carrier.LONG)
+PARAMETER = Table("parameter", 0x07, 0x06, Carrier.LONG)
+
+
+class Control(IntEnum):
+    STOP = 1
+    FORWARD = 2
+    REVERSE = 3
+    RESET_FAULT = 4
+
+
+class Status(IntEnum):
+    STOPPED = 1
+    FORWARD = 2  # printed "FWD (stopped)", and 3 "REV (stopped)"
+    REVERSE = 3
+    FAULT = 4
+    UNDERVOLTAGE = 5
+
+
+class DelixiNative(DelixiParameters, table=PARAMETER):
+    """Delixi inverters; RS-485 communication protocol, part 3, Modbus-like ASCII format.
+
+    A function code K has a table each: 02 run command, 03 run state, 04 run setpoint (not stored),
+    05 and 06 parameters not stored and stored, 07 parameters read. A user's own parameters are
+    declared in a subclass, `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`.
+
+    Where the document errs or is silent, the safest reading is taken:
+
+    - The replies 0002 and 0003 to K = 03 are printed as "forward (stopped)" and "reverse (stopped)":
+      they are running, and never reported as stopped.
+    - The faults 10 to 14 are printed as hex digits: 0AH-0EH and 10H-14H both mean them, and any
+      other code that is not 0 is a fault.
+    - "K = FOH" is F0H, "3800" bit/s is 4800, and "<80m" is 80 ms.
+    - What P00.01 must be for K = 04 to be used is not stated.
+    - The sum cannot see swapped bytes: a reply is compared field by field.
+    - A drive does not take another master's K = F0 to FF, and none is sent.
+
+    Less than 10 ms may pass between two characters. Only run commands (K = 02) may be broadcast.
+    """
+
+    model = "delixi-native"
+    title = "Delixi (own protocol)"
+    manual = "Delixi inverters, RS-485 communication protocol, part 3, Modbus-like ASCII format"
+
+    framings = (Framing.DELIXI,)
+    formats = {Framing.DELIXI: ("8N1", "8E1", "8O1")}  # P04.29
+    exceptions = {
+        0xF0: "command cannot be executed",
+        0xFC: "invalid parameter number",
+        0xFD: "value out of limits",
+        0xFE: "parameter locked",
+        0xFF: "checksum error",
+    }
+    broadcasts = True
+
+    control = command(
+        0, Control, table=COMMAND, kept=Kept.RAM, broadcast=(Control.STOP,), place="part 3, section 5: K = 02"
+    )
+    status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
+    frequency = command(
+        0x0001, "Hz", step=0.01, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0001"
+    )
+    pi_setpoint = command(
+        0x0007, step=0.1, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0007"
+    )
+    stored_frequency = setting(
+        parameter(0, 2),
+        "Hz",
+        step=0.01,
+        table=PARAMETER,
+        kept=Kept.EEPROM,
+        place="P00.02",
+        note="Used if P00.01 = 1.",
+    )
+
+    @verb
+    def identify(self) -> Script[None]:
+        """P05.00 can be read: a drive of another protocol does not answer."""
+        yield from read(self.output_frequency)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        if direction is None and (yield from read(self.status)) == Status.REVERSE:
+            direction = Direction.REVERSE
+        word = Control.REVERSE if direction is Direction.REVERSE else Control.FORWARD
+        yield from write(self.control, word)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop, which has happened when neither the state nor the output frequency says otherwise."""
+        yield from insist(self.control, Control.STOP)
+        yield from self._stopped(self._stands, self._limit())
+
+    def _stands(self) -> Script[bool]:
+        if (yield from read(self.status)) not in (Status.STOPPED, Status.FAULT, Status.UNDERVOLTAGE):
+            return False
+        return (yield from read(self.output_frequency)) == 0
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault; never starts the motor."""
+        yield from write(self.control, Control.RESET_FAULT)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint that is not stored, which cannot be read back."""
+        yield from write(self.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Its run state, with the direction; the fault by name."""
+        status = yield from read(self.status)
+        if status in CONDITIONS:
+            condition, direction = CONDITIONS[status]
+            still = condition is Condition.RUNNING and (yield from read(self.output_frequency)) == 0
+            return State(condition, direction, note="output frequency 0" if still else "")
+        if status in (Status.FAULT, Status.UNDERVOLTAGE):
+            fault = yield from read(self.fault)
+            return State(Condition.FAULT, fault=self.fault.format(fault) if fault else status.name)
+        return State(Condition.UNKNOWN, note=f"K = 03 says {int(status):04X}H, which is not explained")
+
+
+CONDITIONS = {
+    Status.STOPPED: (Condition.STOPPED, None),
+    Status.FORWARD: (Condition.RUNNING, Direction.FORWARD),
+    Status.REVERSE: (Condition.RUNNING, Direction.REVERSE),
+}

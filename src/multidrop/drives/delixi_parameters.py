@@ -1,0 +1,136 @@
+"""What Delixi's two protocols share: the numbered parameters, and the codes of faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import IntEnum
+
+from multidrop.drive import Drive, Option, Script, read
+from multidrop.register import Register, Table, reading, setting
+
+STOP_TIME = 60.0  # s; the deceleration time's number is not known
+
+KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
+
+
+def parameter(group: int, index: int) -> int:
+    """The number of a parameter: 500 for P05.00."""
+    return group * 100 + index
+
+
+class Fault(IntEnum):
+    """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are read."""
+
+    NONE = 0
+    OC_OVERCURRENT = 1
+    OC_1_OVERCURRENT_ACCELERATING = 2
+    OC_2_OVERCURRENT_DECELERATING = 3
+    OU_OVERVOLTAGE = 4
+    OU_1_OVERVOLTAGE_ACCELERATING = 5
+    OU_2_OVERVOLTAGE_DECELERATING = 6
+    POFF_UNDERVOLTAGE = 7
+    OH_OVERHEAT = 8
+    OL_OVERLOAD = 9
+    EF_EXTERNAL = 10
+    PARAMETER_WRITE = 11
+    VFOP_VF1_CHANNEL_BROKEN = 12
+    IFOP_VF2_CHANNEL_BROKEN = 13
+    FLT_MODULE = 14
+
+    @classmethod
+    def _missing_(cls, value: object) -> Fault | None:
+        return cls(value - 6) if isinstance(value, int) and 0x10 <= value <= 0x14 else None
+
+
+class RunSource(IntEnum):
+    KEYPAD = 0
+    TERMINALS = 1
+    LINE = 2
+    BY_TERMINAL = 3
+
+
+class Baudrate(IntEnum):
+    B1200 = 0
+    B2400 = 1
+    B4800 = 2  # printed "3800"
+    B9600 = 3
+    B19200 = 4
+    B38400 = 5
+
+
+class DelixiParameters(Drive):
+    """The parameters of Delixi's inverters; a subclass says which table of its protocol carries them.
+
+    Values come without their decimal point, and the list that says where it belongs is lost: only the
+    scale of the output frequency is known, from an example.
+    """
+
+    baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
+    addresses = range(1, 32)  # P04.30
+    response_timeout = 0.15  # the drive needs less than 80 ms
+    options = {
+        "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
+    }
+
+    run_source = setting(parameter(0, 0), RunSource, never=KEYPAD, place="P00.00")
+    frequency_source = setting(
+        parameter(0, 1), never=KEYPAD, place="P00.01", note="1, the digital setting, for P00.02 to be used."
+    )
+    baudrate_setting = setting(parameter(4, 28), Baudrate, never=KEYPAD, place="P04.28")
+    format_setting = setting(
+        parameter(4, 29), never=KEYPAD, place="P04.29", note="Its codes depend on the firmware's protocol."
+    )
+    address_setting = setting(parameter(4, 30), never=KEYPAD, place="P04.30")
+
+    output_frequency = reading(parameter(5, 0), "Hz", step=0.01, place="P05.00")
+    reference_frequency = reading(parameter(5, 1), "Hz", step=None, place="P05.01")
+    output_current = reading(parameter(5, 2), "A", step=None, place="P05.02")
+    output_voltage = reading(parameter(5, 3), "V", step=None, place="P05.03")
+    dc_bus_voltage = reading(parameter(5, 4), "V", step=None, place="P05.04")
+    io_signals = reading(parameter(5, 5), place="P05.05", note="Its bits are not described.")
+    closed_loop_setpoint = reading(parameter(5, 6), step=None, place="P05.06")
+    closed_loop_feedback = reading(parameter(5, 7), step=None, place="P05.07")
+    heatsink_temperature = reading(
+        parameter(5, 8), "°C", step=None, place="P05.08", note="Of the power module."
+    )
+    synchronous_speed = reading(parameter(5, 9), "rpm", step=None, place="P05.09")
+    motor_speed = reading(parameter(5, 10), "rpm", step=None, place="P05.10")
+    counter = reading(parameter(5, 11), place="P05.11")
+    length = reading(parameter(5, 12), step=None, place="P05.12")
+    set_length = reading(parameter(5, 13), step=None, place="P05.13")
+    overload = reading(parameter(5, 14), step=None, place="P05.14", note="Accumulated.")
+    stage = reading(parameter(5, 15), place="P05.15", note="Of the program.")
+    stage_time = reading(parameter(5, 16), step=None, place="P05.16")
+    stage_time_left = reading(parameter(5, 17), step=None, place="P05.17")
+    work_time = reading(parameter(5, 18), step=None, place="P05.18", note="Accumulated.")
+    energy_high = reading(
+        parameter(5, 19), step=None, place="P05.19", note="Accumulated output power, high part."
+    )
+    energy_low = reading(
+        parameter(5, 20), step=None, place="P05.20", note="Accumulated output power, low part."
+    )
+    vf1_input = reading(parameter(5, 21), step=None, place="P05.21")
+    vf2_input = reading(parameter(5, 22), step=None, place="P05.22")
+    vf1_transformed = reading(parameter(5, 23), step=None, place="P05.23")
+    vf2_transformed = reading(parameter(5, 24), step=None, place="P05.24")
+    fault_record_1 = reading(parameter(5, 25), place="P05.25", note="A code; its names are not stated.")
+    fault_record_2 = reading(parameter(5, 26), place="P05.26", note="A code; its names are not stated.")
+    fault_record_3 = reading(parameter(5, 27), place="P05.27", note="A code; its names are not stated.")
+    fault_record_4 = reading(parameter(5, 28), place="P05.28", note="A code; its names are not stated.")
+    overcurrent_record = reading(parameter(5, 29), step=None, place="P05.29")
+    overvoltage_record = reading(parameter(5, 30), step=None, place="P05.30")
+    fault = reading(parameter(5, 31), Fault, place="P05.31")
+
+    def __init_subclass__(cls, *, table: Table | None = None) -> None:
+        if table is not None:
+            for name, register in DelixiParameters.registers.items():
+                moved: Register[float] = replace(register, table=table)
+                moved.__set_name__(cls, name)
+                setattr(cls, name, moved)
+        super().__init_subclass__()
+
+    def _limit(self) -> float:
+        return self.option.get("stop_time", STOP_TIME)
+
+    def _stands(self) -> Script[bool]:
+        return (yield from read(self.output_frequency)) == 0

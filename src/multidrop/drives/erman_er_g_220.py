@@ -1,0 +1,259 @@
+"""ERMAN ER-G-220-01(02): its registers, coils and verbs."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+
+from multidrop.drive import (
+    BusError,
+    Condition,
+    Direction,
+    Drive,
+    DriveRefused,
+    Option,
+    Refused,
+    Script,
+    State,
+    Unconfirmed,
+    insist,
+    read,
+    verb,
+    write,
+)
+from multidrop.register import COIL, HOLDING, INPUT, Wire, command, reading, setting
+
+STOP_MARGIN = 5.0  # s, on top of the deceleration time
+
+
+class Coil(IntEnum):
+    OFF = 0
+    ON = 1
+
+
+class Status(IntEnum):
+    """Bits 0 and 1 are one number; bit 5 says that the motor is overloaded."""
+
+    STOPPED = 0
+    RUNNING = 1
+    ACCELERATING = 2
+    DECELERATING = 3
+    STOPPED_OVERLOADED = 0x20
+    RUNNING_OVERLOADED = 0x21
+    ACCELERATING_OVERLOADED = 0x22
+    DECELERATING_OVERLOADED = 0x23
+
+
+PHASE = 0x03
+OVERLOAD = 0x20
+
+CONDITIONS = (Condition.STOPPED, Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
+
+
+class Fault(IntFlag):
+    EMERGENCY_STOP = 1 << 0
+    LOW_DC_VOLTAGE = 1 << 1
+    HIGH_DC_VOLTAGE = 1 << 2
+    LOW_MOTOR_CURRENT = 1 << 3
+    MOTOR_CURRENT_ABOVE_THRESHOLD = 1 << 4  # 120 or 150 %
+    INVERTER_SHORT_CIRCUIT = 1 << 5
+    OVERHEAT = 1 << 6
+    PWM_MODULATOR = 1 << 7
+    SYSTEM_ERROR = 1 << 10
+    SYSTEM_RESET = 1 << 11
+
+
+class Modes(IntFlag):
+    """What 0 and 1 mean is not stated."""
+
+    MODULATION_TYPE = 1 << 0
+    CONTROL_TYPE = 1 << 4
+    AUTOMATIC_VOLTAGE_REGULATOR = 1 << 8
+
+
+class ErmanERG220(Drive):
+    """ERMAN ER-G-220-01(02); MODBUS communication protocol, document 1.4 of 30.03.2021.
+
+    Where the document errs or is silent, the safest reading is taken:
+
+    - The example of function 04 has the checksum of function 03's, and its reply a byte count of
+      10H for 5 registers: a reply must have the byte count that was asked for.
+    - The example of function 06 writes the setpoint to 0001H. That is a misprint, the setpoint is
+      0002H; 0001H is never written.
+    - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
+      Coils are written one at a time (05), and reset and start are two calls.
+    - The order of coils in a reply to function 01 is doubtful: coils are not read. Whether the
+      motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
+    - The order of the two words at 0400H and 0402H is not stated; one of them is always 0.
+    - 0402H is the last fault, and nothing says that a reset clears it, or that it is still in
+      force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
+      declared as dealt with by the option `acknowledged_fault`.
+    - Whether START and STOP are levels or pulses is not stated. `stop` writes STOP on and START off,
+      and EMERGENCY STOP when the motor still runs after the deceleration time. Both stay on until
+      `start` writes them off: taking them off at another time could let a kept START through.
+    - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
+    - The models -03 and -04 of the same make have another map: see `identify`.
+
+    No ranges, defaults, timing, nor what is kept in EEPROM are stated. Nor is it stated that
+    broadcasts stay without an answer, so there are none. b.001 and b.002 must select RS-485.
+    """
+
+    model = "erman-er-g-220"
+    title = "ERMAN ER-G-220-01(02)"
+    manual = "ER-G-220-01(02) frequency converter, MODBUS communication protocol, document 1.4 of 30.03.2021"
+
+    formats = dict.fromkeys(Drive.framings, ("8N1",))
+    baudrates = (38400,)
+    addresses = range(1, 32)
+    most_registers = {HOLDING: 88, INPUT: 17}
+    readable_gaps = {HOLDING: range(0x0000, 0x0059), INPUT: range(0x0000, 0x1000)}
+    exceptions = {
+        1: "unknown command",
+        2: "bad register address",
+        3: "bad addresses on read",
+        4: "bad addresses on write",
+    }
+    options = {
+        "acknowledged_fault": Option(
+            "", (0, 0xFFFF_FFFF), "the drive's last fault, as its number, once it has been dealt with"
+        ),
+    }
+
+    # Commands (section 10)
+    start_coil = command(0x0000, Coil, table=COIL, place="section 10, commands: 0")
+    stop_coil = command(0x0001, Coil, table=COIL, place="section 10, commands: 1")
+    emergency_stop_coil = command(0x0002, Coil, table=COIL, place="section 10, commands: 2")
+    fault_reset_coil = command(0x0009, Coil, table=COIL, place="section 10, commands: 9")
+
+    # State registers (section 10)
+    output_frequency = reading(0x0001, "Hz", step=0.1, table=INPUT, place="section 10, state: 1")
+    output_current = reading(0x0003, "A", step=0.1, table=INPUT, place="section 10, state: 3")
+    dc_bus_voltage = reading(0x0005, "V", table=INPUT, place="section 10, state: 5")
+    heatsink_temperature = reading(
+        0x0006,
+        "°C",
+        wire=Wire.I16,
+        table=INPUT,
+        place="section 10, state: 6",
+        note="Whether it is signed is not stated.",
+    )
+    output_voltage = reading(0x000C, "V", table=INPUT, place="section 10, state: 12")
+    status = reading(
+        0x0400,
+        Status,
+        wire=Wire.U32_EITHER,
+        table=INPUT,
+        place="section 10, state: 1024-1025",
+        note="The word order is not stated; all that is defined fits one word.",
+    )
+    last_fault = reading(
+        0x0402,
+        Fault,
+        wire=Wire.U32_EITHER,
+        table=INPUT,
+        place="section 10, state: 1026-1027",
+        note="The last fault, which may be past. The word order is not stated.",
+    )
+
+    # Control registers (section 10)
+    control_register = setting(
+        0x0001,
+        Modes,
+        never="it changes the kind of modulation and control, and what its bits mean is not stated",
+        place="section 10, control: 1",
+    )
+    frequency = setting(0x0002, "Hz", step=0.1, place="b.007; section 10, control: 2")
+    maximum_frequency = setting(0x0003, "Hz", step=0.1, place="b.006; section 10, control: 3")
+    minimum_frequency = setting(0x0004, "Hz", step=0.1, place="b.005; section 10, control: 4")
+    carrier_frequency = setting(0x000B, "kHz", step=0.1, place="d.006; section 10, control: 11")
+    acceleration_time = setting(0x000C, "s", step=0.1, place="b.003; section 10, control: 12")
+    deceleration_time = setting(0x000D, "s", step=0.1, place="b.004; section 10, control: 13")
+    braking_threshold = setting(
+        0x0015, "V", place="E.06; section 10, control: 21", note="Of dynamic braking."
+    )
+
+    _reset_fault = Fault(0)  # the last fault when this object reset it
+
+    @verb
+    def identify(self) -> Script[None]:
+        """0400H can be read; on the models -03 and -04 function 04 does not exist."""
+        try:
+            yield from read(self.status)
+        except DriveRefused as refusal:
+            raise Refused(
+                f"{self.name} has no state register at 0400H: it is not an ER-G-220-01(02)"
+            ) from refusal
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor; the drive has no reverse."""
+        if direction is Direction.REVERSE:
+            raise self._unsupported("reverse")
+        fault = yield from read(self.last_fault)
+        dealt_with = self.option.get("acknowledged_fault", 0)
+        if fault and fault not in (self._reset_fault, dealt_with):
+            raise Refused(
+                f"{self.name} may have a fault, {self.last_fault.format(fault)}: see to it, then call "
+                f"reset_fault(), or declare acknowledged_fault={int(fault)}"
+            )
+        yield from write(self.stop_coil, Coil.OFF)
+        yield from write(self.emergency_stop_coil, Coil.OFF)
+        yield from write(self.start_coil, Coil.ON)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop along the ramp; when the motor still runs after it, emergency stop."""
+        yield from insist(self.stop_coil, Coil.ON)
+        yield from insist(self.start_coil, Coil.OFF)
+        limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
+        try:
+            yield from self._stopped(self._stands, limit)
+        except Unconfirmed:
+            yield from insist(self.emergency_stop_coil, Coil.ON)
+            yield from self._stopped(self._stands, limit)
+
+    @verb
+    def emergency_stop(self) -> Script[None]:
+        """Stop the motor as the drive's own emergency stop does."""
+        yield from insist(self.emergency_stop_coil, Coil.ON)
+        yield from insist(self.start_coil, Coil.OFF)
+        limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
+        yield from self._stopped(self._stands, limit)
+
+    def _stands(self) -> Script[bool]:
+        status = yield from read(self.status)
+        return not status & PHASE and (yield from read(self.output_frequency)) == 0
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault; START is written off before, so that it cannot start the motor again."""
+        if (yield from read(self.status)) & PHASE:
+            raise Refused(f"{self.name} runs: it has no fault to reset")
+        fault = yield from read(self.last_fault)
+        yield from insist(self.start_coil, Coil.OFF)
+        try:
+            yield from write(self.fault_reset_coil, Coil.ON)
+        except BusError:
+            yield from insist(self.fault_reset_coil, Coil.OFF)
+            raise
+        yield from insist(self.fault_reset_coil, Coil.OFF)
+        self._reset_fault = fault
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint; ValueError above the drive's maximum, which it has no refusal for."""
+        self.frequency.encode(hz)  # a mistake is told before anything is sent
+        most = yield from read(self.maximum_frequency)
+        if hz > most:
+            raise ValueError(f"{hz:g} Hz is above the maximum frequency of {self.name}, {most:g} Hz")
+        yield from self._hold(self.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """The phase of its ramp; its last fault is a note, because it may be past."""
+        status = yield from read(self.status)
+        fault = yield from read(self.last_fault)
+        notes = ["motor overloaded"] if status & OVERLOAD else []
+        condition = CONDITIONS[status & PHASE]
+        if condition is Condition.STOPPED and fault:
+            notes.append(f"last fault {self.last_fault.format(fault)}, which may still be in force")
+        return State(condition, note="; ".join(notes))

@@ -1,0 +1,273 @@
+"""INNOVERT IBD: its registers and verbs."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+
+from multidrop.drive import (
+    BusError,
+    Condition,
+    Direction,
+    Drive,
+    Framing,
+    Option,
+    Refused,
+    Script,
+    State,
+    insist,
+    read,
+    verb,
+    write,
+)
+from multidrop.register import HOLDING, command, reading, setting
+
+STOP_MARGIN = 5.0  # s, on top of the deceleration time
+
+INFERRED = "the address is inferred: the table of letters is lost"
+OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 = 9600 bit/s"
+
+
+def parameter(name: str) -> int:
+    """The address of a parameter: 3 for PrA.03, 107 for Prb.07 (appendix 2, table 2).
+
+    The digits of A and b are known from examples; the table is lost, and C to H are inferred to go on.
+    """
+    letter, _, number = name.removeprefix("Pr").partition(".")
+    return "ABCDEFGH".index(letter.upper()) * 100 + int(number)
+
+
+class Control(IntEnum):
+    """The words that this library sends: the bits for the direction are left 0 in all of them."""
+
+    NOTHING = 0x00
+    STOP = 0x01
+    RUN = 0x02
+    JOG = 0x03
+    RESET_FAULT = 0x10
+
+
+class Terminals(IntFlag):
+    FWD = 1 << 0
+    REV = 1 << 1
+    S1 = 1 << 2
+    S2 = 1 << 3
+    S3 = 1 << 4
+    S4 = 1 << 5
+    S5 = 1 << 6
+    S6 = 1 << 7
+    M01 = 1 << 8
+    M02 = 1 << 9
+    YABC = 1 << 10
+    VIRTUAL = 1 << 13
+
+
+class Output(IntEnum):
+    """What an output says; only these codes are named."""
+
+    RUNNING = 1
+    FAULT = 3
+    ACCELERATING = 7
+    DECELERATING = 8
+
+
+class FrequencySource(IntEnum):
+    PARAMETER = 0  # Prb.00
+    LINE = 5
+
+
+class RunSource(IntEnum):
+    LINE = 2
+
+
+class Baudrate(IntEnum):
+    B4800 = 0
+    B9600 = 1
+    B19200 = 2
+    B38400 = 3
+
+
+class Format(IntEnum):
+    ASCII_8N1 = 0
+    ASCII_8E1 = 1
+    ASCII_8O1 = 2
+    RTU_8N1 = 3
+    RTU_8E1 = 4
+    RTU_8O1 = 5
+
+
+class InnovertIBD(Drive):
+    """INNOVERT IBD series; operating manual, appendix 2, pp. 128-134.
+
+    Where the document errs or is silent, the safest reading is taken:
+
+    - What Prb.01 means is contradictory (5 is the line in the text, the potentiometer in an
+      example): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
+    - The bits for the direction are ambiguous (their order is printed the other way round than that
+      of the bits before): they are always 0, and a direction is refused. `start` turns the motor in
+      whatever direction is in force. The toggle of the direction is never sent.
+    - There is no state word. The state is unknown unless the outputs are programmed as in the
+      example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
+      Otherwise `stop` goes by current and speed.
+    - 2000H and 2001H are marked "write": they are not read.
+    - A value above a parameter's maximum is silently stored as the maximum: settings are read back.
+      The setpoint's range, 0 to 400 Hz, knows nothing of the drive's maximum frequency: declare it
+      as the option `maximum_frequency`.
+    - The table of letters is lost: of A and b the digit is known from examples, of C to H it is
+      inferred, and these are read but never written.
+    - The "ordinal of the register" in a reply is the byte count. At most 4 registers are read.
+
+    Functions 03 and 06 only. Exceptions, fault codes, what is kept in EEPROM and what may be changed
+    while the motor turns are not stated.
+    """
+
+    model = "innovert-ibd"
+    title = "INNOVERT IBD"
+    manual = "INNOVERT IBD series, operating manual, appendix 2, data exchange, pp. 128-134"
+
+    framings = (Framing.RTU, Framing.ASCII)
+    formats = dict.fromkeys(framings, ("8N1", "8E1", "8O1"))
+    baudrates = (9600, 4800, 19200, 38400)
+    addresses = range(1, 241)
+    silence = 10e-3  # before and after an RTU frame (table "message in RTU mode")
+    most_registers = {HOLDING: 4}
+    exceptions = {}
+    broadcasts = True
+    options = {
+        "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that set_frequency may write"),
+    }
+
+    output_current = reading(parameter("PrA.03"), "A", step=0.1, place="PrA.03")
+    motor_speed = reading(parameter("PrA.04"), step=None, place="PrA.04", note="Its unit is not stated.")
+    terminals = reading(
+        parameter("PrA.22"),
+        Terminals,
+        place="PrA.22, table 4",
+        note="Bits 11 and 12 are reserved, and were seen as 1.",
+    )
+
+    stored_frequency = setting(
+        parameter("Prb.00"),
+        "Hz",
+        step=None,
+        never="its scale is not stated",
+        place="Prb.00",
+        note="The setpoint when Prb.01 = 0.",
+    )
+    frequency_source = setting(
+        parameter("Prb.01"), FrequencySource, never="what its values mean is contradictory", place="Prb.01"
+    )
+    run_source = setting(
+        parameter("Prb.02"),
+        RunSource,
+        never="it gives the command over the motor away; set it on the keypad",
+        place="Prb.02",
+    )
+    acceleration_time = setting(parameter("Prb.07"), "s", step=0.1, place="Prb.07")
+    deceleration_time = setting(parameter("Prb.08"), "s", step=0.1, place="Prb.08")
+
+    output_m01 = setting(parameter("Prd.23"), Output, never=INFERRED, place="Prd.23")
+    output_m02 = setting(parameter("Prd.24"), Output, never=INFERRED, place="Prd.24")
+    output_yabc = setting(parameter("Prd.25"), Output, never=INFERRED, place="Prd.25")
+    output_virtual = setting(parameter("Prd.28"), Output, never=INFERRED, place="Prd.28")
+    jog_frequency = setting(parameter("PrE.00"), "Hz", step=None, never=INFERRED, place="PrE.00")
+    baudrate_setting = setting(
+        parameter("PrH.00"), Baudrate, never=INFERRED, place="PrH.00", outside=OTHER_MAKE
+    )
+    format_setting = setting(parameter("PrH.01"), Format, never=INFERRED, place="PrH.01")
+    address_setting = setting(parameter("PrH.02"), never=INFERRED, place="PrH.02")
+
+    control = command(0x2000, Control, broadcast=(Control.STOP,), place="2000H, table 3")
+    frequency = command(
+        0x2001,
+        "Hz",
+        step=0.01,
+        span=(0, 400),
+        broadcast=(0,),
+        place="2001H, table 3",
+        note="Used if Prb.01 = 5.",
+    )
+
+    def needed_silence(self) -> float:
+        return super().needed_silence() if self.framing is Framing.RTU else 0.0
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start in the direction in force; a direction is refused, because its bits are ambiguous."""
+        yield from self._command(Control.RUN, direction)
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn at PrE.00 until stopped; a direction is refused, because its bits are ambiguous."""
+        yield from self._command(Control.JOG, direction)
+
+    def _command(self, word: Control, direction: Direction | None) -> Script[None]:
+        if direction is not None:
+            raise Refused(
+                f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
+                "set the direction on the drive, and start without one"
+            )
+        yield from write(self.control, word)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop along the ramp: by the outputs, or else when neither current nor speed is shown."""
+        yield from insist(self.control, Control.STOP)
+        limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
+        look = self._is_off if (yield from self._programmed()) else self._stands
+        yield from self._stopped(look, limit)
+
+    def _is_off(self) -> Script[bool]:
+        return not (yield from read(self.terminals)) & Terminals.M01
+
+    def _stands(self) -> Script[bool]:
+        return (yield from read(self.motor_speed)) == 0 and (yield from read(self.output_current)) == 0
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault; never starts the motor."""
+        yield from write(self.control, Control.RESET_FAULT)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint, which cannot be read back."""
+        most = self.option.get("maximum_frequency", 400.0)
+        if not 0 <= hz <= most:
+            raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
+        yield from write(self.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """From the outputs, where they are programmed for it; unknown otherwise."""
+        terminals = yield from read(self.terminals)
+        if not (yield from self._programmed()):
+            return State(
+                Condition.UNKNOWN,
+                note="the outputs are not programmed as Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3",
+            )
+        for bit, condition in OUTPUTS.items():
+            if terminals & bit:
+                return State(condition)
+        return State(Condition.STOPPED)
+
+    def _programmed(self) -> Script[bool]:
+        """The outputs have the functions of the example; their addresses are inferred, but four match."""
+        try:
+            for register, function in (
+                (self.output_m01, Output.RUNNING),
+                (self.output_m02, Output.ACCELERATING),
+                (self.output_yabc, Output.DECELERATING),
+                (self.output_virtual, Output.FAULT),
+            ):
+                if (yield from read(register)) != function:
+                    return False
+        except BusError:
+            return False
+        return True
+
+
+OUTPUTS = {  # what the outputs then say, the gravest first
+    Terminals.VIRTUAL: Condition.FAULT,
+    Terminals.YABC: Condition.DECELERATING,
+    Terminals.M02: Condition.ACCELERATING,
+    Terminals.M01: Condition.RUNNING,
+}

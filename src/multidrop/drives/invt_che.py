@@ -1,0 +1,301 @@
+"""INVT CHE: its registers and verbs, and how to declare function codes of one's own model."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, TypeVar, Unpack, overload
+
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Drive,
+    DriveRefused,
+    Option,
+    Refused,
+    Script,
+    State,
+    Unconfirmed,
+    insist,
+    read,
+    verb,
+    write,
+)
+from multidrop.register import HOLDING, Details, Kept, Register, Wire, command, reading, setting
+
+E = TypeVar("E", bound=IntEnum)
+
+CHE100 = "CHE100 manual v1.4, p. 117"
+CHE100_NEXT = "CHE100 manual v1.4, p. 118"
+CHE100_CODES = "CHE100 manual v1.4, p. 119"
+SCALE = f"{CHE100}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
+SCALE_NEXT = f"{CHE100_NEXT}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
+
+STOP_TIME = 60.0  # s; the deceleration time's address is not known
+
+
+class Control(IntEnum):
+    FORWARD = 1
+    REVERSE = 2
+    JOG_FORWARD = 3
+    JOG_REVERSE = 4
+    STOP = 5  # along the ramp; other makes have 5 and 6 the other way round
+    COAST = 6
+    RESET_FAULT = 7
+    STOP_JOG = 8
+
+
+class Status(IntEnum):
+    FORWARD = 1
+    REVERSE = 2
+    STANDBY = 3
+    FAULT = 4
+
+
+class Device(IntEnum):
+    CHE_UNIVERSAL = 0x0101
+    CHE_1500_HZ = 0x0102
+
+
+class Fault(IntEnum):
+    NONE = 0
+    OUT1_PHASE_U = 1
+    OUT2_PHASE_V = 2
+    OUT3_PHASE_W = 3
+    OC1_OVERCURRENT_ACCELERATING = 4
+    OC2_OVERCURRENT_DECELERATING = 5
+    OC3_OVERCURRENT_CONSTANT = 6
+    OV1_OVERVOLTAGE_ACCELERATING = 7
+    OV2_OVERVOLTAGE_DECELERATING = 8
+    OV3_OVERVOLTAGE_CONSTANT = 9
+    UV_UNDERVOLTAGE = 10
+    OL1_MOTOR_OVERLOAD = 11
+    OL2_INVERTER_OVERLOAD = 12
+    SPI_INPUT_PHASE = 13
+    SPO_OUTPUT_PHASE = 14
+    OH1_RECTIFIER_OVERHEAT = 15
+    OH2_INVERTER_OVERHEAT = 16
+    EF_EXTERNAL = 17
+    CE_COMMUNICATION = 18
+    ITE_CURRENT_DETECTION = 19
+    TE_AUTOTUNING = 20
+    EEP_EEPROM = 21
+    PIDE_FEEDBACK = 22
+    BCE_BRAKE_UNIT = 23
+
+
+class CommunicationFault(IntEnum):
+    NONE = 0
+    WRONG_PASSWORD = 1
+    BAD_COMMAND_CODE = 2
+    BAD_CHECKSUM = 3
+    BAD_ADDRESS = 4
+    BAD_DATA = 5
+    PARAMETER_CHANGE_INVALID = 6
+    SYSTEM_LOCKED = 7
+    BUSY_STORING = 8
+
+
+@overload
+def parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+@overload
+def parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """A function code by its ordinal number in the table of one's own model's manual (section 11.6.4).
+
+    It is kept in EEPROM, and written to its alias in RAM: bit 15 of the address set. Compare what is
+    read with the keypad before anything is written: a wrong ordinal may restore the factory settings.
+
+        class MyCHE(InvtCHE):
+            acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
+    """
+    if not 0 <= ordinal <= 0x01FF:
+        raise ValueError(f"ordinal {ordinal} is outside 0 to 511: the address's high byte is 00 or 01")
+    details["kept"] = Kept.EEPROM
+    details["ram_address"] = ordinal | 0x8000
+    details.setdefault("place", f"section 11.6.4, ordinal {ordinal}")
+    return setting(ordinal, what, **details)
+
+
+class InvtCHE(Drive):
+    """INVT CHE series; manual, chapter 11 "communication protocol".
+
+    The chapter's register table is lost. All registers here, the meaning of exceptions and the PC
+    group are from outside it: the CHE100 manual v1.4; scales, where given, from the Goodrive300L
+    manual; names of faults from the CHE100's relatives, for display only.
+
+    The safest readings taken:
+
+    - A function code's address is its ordinal number, but the two examples contradict each other
+      (P5.05 is 003AH by counting, P0.07 is said to be 000CH): no ordinal is computed. A model's own
+      codes are declared in a subclass, with `parameter`.
+    - Addresses with bit 15 set write to RAM only and cannot be read.
+    - 2000H is a percentage of the maximum frequency (P0.04), so `set_frequency` needs that as the
+      option `maximum_frequency`. It may be negative, which likely reverses: 0 to 100 % is written.
+    - Newer INVT families have the control word at 2000H: see `identify`.
+    - GD200L and GD300L print the DC bus voltage with and without a decimal: its scale is left open.
+    - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
+    - STOP may not end a jog: when the drive has not stopped after it, STOP_JOG follows.
+    - Exception 03 is a malformed frame; a value out of range is 12H.
+
+    The drive may also speak ASCII (CHE100 manual); the chapter has RTU only. P0.01 = 2 takes
+    commands from the line. The PE group is the maker's, and is neither read nor written.
+    """
+
+    model = "invt-che"
+    title = "INVT CHE"
+    manual = "CHE series manual, chapter 11, communication protocol; registers: CHE100 manual v1.4"
+
+    formats = dict.fromkeys(Drive.framings, ("8N1", "8E1", "8O1", "8N2", "8E2", "8O2"))  # PC.02
+    baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # PC.01
+    addresses = range(1, 248)
+    response_timeout = 0.4  # PC.03 delays the reply by up to 200 ms, 5 ms from the factory
+    most_registers = {HOLDING: 16}
+    readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # the reserved ones are listed as readable
+    exceptions = {
+        0x01: "illegal command, or the drive has a fault",
+        0x02: "illegal address",
+        0x03: "malformed frame",
+        0x06: "busy storing in EEPROM",
+        0x10: "wrong password",
+        0x11: "checksum error",
+        0x12: "write not allowed: out of range, not changeable now, or terminal function already used",
+        0x13: "locked by a password",
+    }
+    broadcasts = True
+    options = {
+        "maximum_frequency": Option("Hz", (1, 3000), "P0.04, of which the setpoint is a percentage"),
+        "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
+    }
+    watchdog = (
+        "PC.04 (0.1 to 100.0 s) is off from the factory; PC.05 = 0 coasts with alarm CE, 1 (factory) runs "
+        "on, 2 stops if P0.01 = 2, 3 always stops (CHE100 manual v1.4). Both are set on the keypad."
+    )
+
+    control = command(
+        0x1000, Control, kept=Kept.RAM, while_running=True, broadcast=(Control.STOP,), outside=CHE100
+    )
+    status = reading(0x1001, Status, outside=CHE100)
+    setpoint = setting(
+        0x2000,
+        "%",
+        step=0.01,
+        span=(0, 100),
+        wire=Wire.I16,
+        kept=Kept.RAM,
+        while_running=True,
+        broadcast=(0,),
+        outside=CHE100,
+        note="Of P0.04, or of the PID's range; only if P0.03 takes the frequency from the line.",
+    )
+    output_frequency = reading(0x3000, "Hz", step=0.01, outside=SCALE)
+    reference_frequency = reading(0x3001, "Hz", step=0.01, outside=SCALE)
+    dc_bus_voltage = reading(
+        0x3002, "V", step=None, outside=CHE100, note="0.1 V or 1 V: 1.41 times the mains tells which."
+    )
+    output_voltage = reading(0x3003, "V", step=1, outside=SCALE)
+    output_current = reading(0x3004, "A", step=0.1, outside=SCALE)
+    motor_speed = reading(0x3005, "rpm", step=1, outside=SCALE)
+    output_power = reading(0x3006, "%", step=0.1, wire=Wire.I16, outside=SCALE)
+    output_torque = reading(0x3007, "%", step=0.1, wire=Wire.I16, outside=SCALE)
+    pid_setpoint = reading(0x3008, "%", step=0.1, outside=SCALE)
+    pid_feedback = reading(0x3009, "%", step=0.1, outside=SCALE)
+    inputs = reading(0x300A, outside=CHE100, note="Its bits are not described.")
+    outputs = reading(0x300B, outside=CHE100, note="Its bits are not described.")
+    analog_input_1 = reading(0x300C, "V", step=0.01, outside=SCALE)
+    analog_input_2 = reading(0x300D, "V", step=0.01, outside=SCALE)
+    pulse_frequency = reading(
+        0x3010, "kHz", step=None, outside=CHE100, note='Printed as "0.00-50.00 kHz (unit 0.01 Hz)".'
+    )
+    stage = reading(0x3012, outside=CHE100, note="Of the PLC or the multi-step speeds.")
+    length = reading(0x3013, step=None, outside=CHE100_NEXT)
+    counter = reading(0x3014, outside=CHE100_NEXT)
+    device = reading(0x3016, Device, outside=CHE100_CODES)
+    fault = reading(
+        0x5000,
+        Fault,
+        outside=f"{CHE100_NEXT}; names: Powtran PI130 manual, p. 123, Goodrive350 manual, p. 193",
+        note="The same as P7.15.",
+    )
+    communication_fault = reading(0x5001, CommunicationFault, outside=CHE100_NEXT)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """3016H is 0101H or 0102H."""
+        device = yield from read(self.device)
+        if not isinstance(device, Device):
+            raise Refused(f"{self.name} says that it is device {int(device):04X}H; a CHE is 0101H or 0102H")
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        forward = yield from self._forward(direction)
+        yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+
+    @verb
+    def jog(self, direction: Direction | None = None) -> Script[None]:
+        """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
+        forward = yield from self._forward(direction)
+        yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+
+    def _forward(self, direction: Direction | None) -> Script[bool]:
+        if direction is None:
+            return (yield from read(self.status)) != Status.REVERSE
+        return direction is Direction.FORWARD
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop along the ramp; a jog that goes on after it is stopped on its own."""
+        limit = self.option.get("stop_time", STOP_TIME)
+        try:
+            yield from insist(self.control, Control.STOP)
+        except DriveRefused:  # as it may in a fault, in which it stands already
+            if not (yield from self._stands()):
+                raise
+        try:
+            yield from self._stopped(self._stands, limit)
+        except Unconfirmed:
+            yield from insist(self.control, Control.STOP_JOG)
+            yield from self._stopped(self._stands, limit)
+
+    @verb
+    def coast(self) -> Script[None]:
+        """Take the voltage off and let the motor run out."""
+        yield from insist(self.control, Control.COAST)
+        yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
+
+    def _stands(self) -> Script[bool]:
+        """The drive gives no voltage: in a fault, neither."""
+        return (yield from read(self.status)) in (Status.STANDBY, Status.FAULT)
+
+    @verb
+    def reset_fault(self) -> Script[None]:
+        """Reset a fault; never starts the motor."""
+        yield from write(self.control, Control.RESET_FAULT)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint as the percentage of the maximum frequency that it is."""
+        most = self.option.get("maximum_frequency")
+        if most is None:
+            raise Refused(
+                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency=..., in Hz"
+            )
+        if not 0 <= hz <= most:
+            raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
+        yield from self._hold(self.setpoint, round(hz / most * 100, 2))
+
+    @verb
+    def state(self) -> Script[State]:
+        """Its state word, and its fault by name."""
+        status = yield from read(self.status)
+        if status == Status.FAULT:
+            fault = yield from read(self.fault)
+            return State(Condition.FAULT, fault=self.fault.format(fault))
+        return STATES.get(status, State(Condition.UNKNOWN, note=f"1001H = {int(status)} is not explained"))
+
+
+STATES = {
+    Status.FORWARD: State(Condition.RUNNING, Direction.FORWARD),
+    Status.REVERSE: State(Condition.RUNNING, Direction.REVERSE),
+    Status.STANDBY: State(Condition.STOPPED),
+}

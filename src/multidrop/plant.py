@@ -1,0 +1,219 @@
+"""Reads a plant file: which drives are on which lines, and what is polled. Opens no port.
+
+Every mistake in the file is found before anything is done with it, and all are reported at once.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from multidrop.drive import Drive
+from multidrop.drives import MODELS
+from multidrop.mistakes import Key, Place
+from multidrop.models import find_model
+from multidrop.register import Register
+from multidrop.timing import Settings
+
+
+@dataclass(frozen=True)
+class Polled:
+    """A register that is read every so many seconds; None: as fast as the line allows."""
+
+    register: Register[Any]
+    every: float | None
+
+
+@dataclass(frozen=True)
+class PolledDrive:
+    """A drive and what is read from it, again and again."""
+
+    drive: Drive
+    polls: tuple[Polled, ...]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A port with its drives; its baud rate and format are already in the drives' settings."""
+
+    name: str
+    port: str
+    baudrate: int | None
+    format: str | None
+    drives: tuple[PolledDrive, ...]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """All lines of a plant file."""
+
+    lines: tuple[Line, ...]
+    path: Path
+
+
+class PlantError(ValueError):
+    """All mistakes of a plant file: each a sentence that says where it is and what would be right."""
+
+    def __init__(self, mistakes: tuple[str, ...]) -> None:
+        super().__init__("\n".join(mistakes))
+        self.mistakes = mistakes
+
+
+def load_plant(path: Path | str) -> Plant:
+    """The plant that the file describes; PlantError when anything in it is wrong."""
+    path = Path(path)
+    place = Place(path)
+    tables = place.check(_document(path), _PLANT).get("line", [])
+    lines = tuple(_line(table, at) for table, at in place.inside("line", tables))
+    if place.mistakes:
+        raise PlantError(tuple(place.mistakes))
+    return Plant(lines, path)
+
+
+def parse_duration(text: str) -> float:
+    """Seconds in a duration that a person wrote, such as "50 ms"; ValueError if it is none."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip())
+    if match is None or float(match[1]) == 0:
+        raise ValueError(f'{text!r} is not a duration above 0, such as "50 ms", "2 s" or "1 min"')
+    return float(match[1]) * {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}[match[2]]
+
+
+_PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
+_LINE = {
+    "name": Key(str, 'name = "hall-1"', needed=True),
+    "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
+    "baudrate": Key(int, "baudrate = 9600"),
+    "format": Key(str, 'format = "8N1"'),
+    "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
+}
+_DRIVE = {
+    "name": Key(str, 'name = "pump-1"', needed=True),
+    "model": Key(str, 'model = "innovert-ibd"', needed=True),
+    "address": Key(int, "address = 1", needed=True),
+    "framing": Key(str, 'framing = "rtu"'),
+    "baudrate": Key(int, "baudrate = 9600"),
+    "format": Key(str, 'format = "8N1"'),
+    "every": Key(str, 'every = "50 ms"'),
+    "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
+}
+_POLL = {
+    "register": Key(str, 'register = "output_current"', needed=True),
+    "every": Key(str, 'every = "50 ms"'),
+}
+_NOT_ARGUMENTS = ("name", "model", "every", "poll")  # of a drive's class
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as failure:
+        raise PlantError((f"{path}: the plant file cannot be read: {failure.strerror}",)) from failure
+    except UnicodeDecodeError as failure:
+        raise PlantError((f"{path}: is not text in UTF-8, from byte {failure.start} on",)) from failure
+    except tomllib.TOMLDecodeError as failure:
+        raise PlantError((f"{path}: is not TOML: {failure}",)) from failure
+
+
+def _line(table: Any, place: Place) -> Line:
+    given = place.check(table, _LINE)
+    name, port = given.get("name", ""), given.get("port", "")
+    if name:
+        place.once("line", name, sentence="another line has this name too; every line needs its own")
+    if port:
+        place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
+    settings: dict[str, Any] = {
+        "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
+        "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
+    }
+    drives = [_drive(drive, settings, at) for drive, at in place.inside("drive", given.get("drive", []))]
+    return Line(name, port, **settings, drives=tuple(drive for drive in drives if drive is not None))
+
+
+def _drive(table: Any, line: Mapping[str, Any], place: Place) -> PolledDrive | None:
+    before = len(place.mistakes)
+    model = _model(table, place)
+    given = place.check(table, _DRIVE | _option_keys(model))
+    if "name" in given:
+        place.once("drive", given["name"], sentence="{first} has this name too; every drive needs its own")
+    if "address" in given:
+        sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
+        place.once("address", place.labels[0], given["address"], sentence=sentence)
+    every = place.attempt(parse_duration, given["every"]) if "every" in given else None
+    if model is None:
+        return None
+    arguments = {key: value for key, value in given.items() if key not in _NOT_ARGUMENTS}
+    inherited = {key: value for key, value in line.items() if value is not None and key not in given}
+    _try_each(model, arguments, inherited, place)
+    polls = _polls(given.get("poll"), model, every, place)
+    if len(place.mistakes) > before:
+        return None
+    drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
+    return PolledDrive(drive, polls) if drive else None
+
+
+def _model(table: Any, place: Place) -> type[Drive] | None:
+    text = table.get("model") if isinstance(table, dict) else None
+    if not text or not isinstance(text, str):
+        return None
+    return place.attempt(find_model, text, place.path.parent)
+
+
+def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
+    """The options of the family; of all families, as long as it is not known which one it is."""
+    families = [model] if model else list(MODELS.values())
+    return {
+        name: Key((int, float), f"{name} = {option.span[1]:g}")
+        for family in families
+        for name, option in family.options.items()
+    }
+
+
+def _try_each(
+    model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: Place
+) -> None:
+    """Try one argument at a time, so that every one that the family refuses is reported."""
+    least: dict[str, Any] = {"address": model.addresses[0]}
+    if "framing" in arguments:
+        framing = {"framing": arguments["framing"]}
+        if place.attempt(partial(model, **least, **framing)):
+            least |= framing  # on which the formats depend
+    for key, value in arguments.items():
+        if key != "framing":
+            place.attempt(partial(model, **(least | {key: value})))
+    settings = model(**least).settings
+    right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
+    for key, value in inherited.items():
+        hint = f" (the line's); add {key} = {right[key]} to this drive"
+        place.attempt(partial(model, **(least | {key: value})), hint=hint)
+
+
+def _polls(
+    entries: list[Any] | None, model: type[Drive], every: float | None, place: Place
+) -> tuple[Polled, ...]:
+    if entries is None:
+        if not model.readings():
+            place.wrong(f"{model.title or model.__name__} has no readings; say what to poll")
+        return tuple(Polled(register, every) for register in model.readings())
+    found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
+    return tuple(polled for polled in found if polled is not None)
+
+
+def _polled(entry: Any, model: type[Drive], every: float | None, place: Place) -> Polled | None:
+    if not isinstance(entry, (str, dict)):
+        place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
+        return None
+    given = place.check({"register": entry} if isinstance(entry, str) else entry, _POLL)
+    own = place.attempt(parse_duration, given["every"]) if "every" in given else every
+    register = place.attempt(model.register, given["register"]) if "register" in given else None
+    if register is None:
+        return None
+    place.once(place.labels[:-1], register.name, sentence=f"{register} is polled twice; keep it once")
+    if not register.readable:
+        place.wrong(f"{register} can only be written, not polled; see `multidrop models {model.model}`")
+        return None
+    return Polled(register, own)

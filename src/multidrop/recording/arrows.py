@@ -1,0 +1,142 @@
+"""Recordings as an Arrow IPC stream (.arrows), in which every whole batch outlives a crash.
+
+The stream has no end marker, which Arrow allows: it is complete after every batch, and a recording
+under way can be read as a finished one.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from multidrop.batch import Rows, assemble, schema
+from multidrop.recording import interface
+from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
+from multidrop.recording.messages import RECORD_BATCH, SCHEMA, Message, Table, messages
+from multidrop.recording.recorded import Recorded
+from multidrop.recording.whole import WholeFile
+
+KEY = "multidrop"  # of the schema's metadata
+
+INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
+COLUMNS = [  # name, type, and the first field of the type: bits, precision (double) or unit (ns)
+    (b"time", TIMESTAMP, 3),
+    (b"monotonic_ns", INT, 64),
+    (b"uncertainty_ns", INT, 64),
+    (b"drive", UTF8, 0),
+    (b"register", UTF8, 0),
+    (b"value", FLOAT, 2),
+    (b"status", UTF8, 0),
+]
+BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
+
+
+class Writer(interface.Writer):
+    """Writes each batch as one message, in one call of the system."""
+
+    def __init__(self, path: Path, metadata: Metadata) -> None:
+        super().__init__(path)
+        from nanoarrow.c_array_stream import CArrayStream
+        from nanoarrow.ipc import StreamWriter
+
+        described = schema().modify(metadata={KEY: interface.dump(metadata)})
+        self._message = BytesIO()
+        self._encoder = StreamWriter.from_writable(self._message)
+        try:
+            self._file = WholeFile(path)
+        except OSError as failure:
+            raise RecordingError.of(failure, path) from failure
+        try:
+            self._append(CArrayStream.from_c_arrays([], described))
+        except RecordingError:
+            self.close()
+            raise
+
+    def write(self, batch: Rows) -> None:
+        self._append(batch.arrow())
+        self.rows += len(batch)
+
+    def _append(self, source: Any) -> None:
+        self._message.seek(0)
+        self._encoder.write_stream(source)
+        try:
+            self._file.append(self._message.getbuffer()[: self._message.tell()])
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path, self.rows) from failure
+
+    def close(self) -> None:
+        self._encoder.release()
+        try:
+            self._file.close()
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path, self.rows) from failure
+
+
+class Reader(interface.Reader):
+    """Reads every whole message; a torn one at the end is left out."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            self._whole = 0
+            for message in messages(file, size):
+                if not self._whole:
+                    self.metadata = self._read_schema(message)
+                self._whole = message.end
+        if not self._whole:
+            raise not_a_recording(path, "it does not begin like an Arrow stream")
+        self.torn = size - self._whole
+
+    def __iter__(self) -> Iterator[Rows]:
+        rows = 0
+        with self.path.open("rb") as file:
+            for message in islice(messages(file, self._whole), 1, None):
+                if not message.header:
+                    return
+                file.seek(message.body)
+                body = memoryview(file.read(message.end - message.body))
+                try:
+                    batch = _decode(message, message.header, body)
+                except (struct.error, RuntimeError, ValueError) as mistake:
+                    raise ValueError(f"{self.path} is damaged after row {rows}: {mistake}") from mistake
+                yield batch
+                rows += len(batch)
+
+    def _read_schema(self, message: Message) -> Metadata:
+        try:
+            head = message.header if message.kind == SCHEMA else None
+            if not head or [_column(field) for field in head.tables(1)] != COLUMNS:
+                raise not_a_recording(self.path, "it is an Arrow stream with other columns")
+            entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
+        except struct.error as mistake:
+            raise not_a_recording(self.path, "it does not begin like an Arrow stream") from mistake
+        return interface.load(entries.get(KEY.encode(), b"{}"), self.path)
+
+
+def _column(field: Table) -> tuple[bytes, int, int]:
+    detail = field.table(3)
+    return field.text(0), field.number(2, "<B"), detail.number(0, "<h") if detail else 0
+
+
+def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
+    if message.kind != RECORD_BATCH:
+        raise ValueError("there is a message that is not a batch of rows")
+    if batch.table(3):
+        raise ValueError("its batches are compressed, which only pyarrow and polars read")
+    places = batch.pairs(2)
+    if len(places) != sum(BUFFERS[kind] for _, kind, _ in COLUMNS):
+        raise ValueError(f"there is a batch of {len(places)} buffers")
+    buffers = iter([body[at : at + length] for at, length in places])
+    columns: list[tuple[memoryview | None, ...]] = []
+    for _, kind, _ in COLUMNS:
+        valid, *data = islice(buffers, BUFFERS[kind])
+        if kind == UTF8:
+            str(data[-1], "utf-8")  # raises: libraries that take the batch rely on it
+        columns.append((valid or None, *data))
+    return Recorded(assemble(batch.number(0, "<q"), *columns))

@@ -1,0 +1,159 @@
+"""Recordings as text (.csv), one row a sample, with the metadata beside it (.csv.json)."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+from multidrop.batch import Row, Rows
+from multidrop.recording import interface
+from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
+from multidrop.recording.recorded import from_rows
+from multidrop.recording.whole import WholeFile
+
+HEADER = ",".join(Row._fields) + "\n"
+BATCH_ROWS = 1 << 14
+SECOND = 1_000_000_000
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def beside(path: Path) -> Path:
+    """Where the metadata of a .csv lies."""
+    return path.with_name(path.name + ".json")
+
+
+class Writer(interface.Writer):
+    """Writes each batch's lines in one call of the system."""
+
+    def __init__(self, path: Path, metadata: Metadata) -> None:
+        super().__init__(path)
+        described = interface.dump(metadata)
+        try:
+            self._file = WholeFile(path)
+        except OSError as failure:
+            raise RecordingError.of(failure, path) from failure
+        try:
+            self._append(HEADER)
+            beside(path).write_text(described + "\n", encoding="utf-8")
+        except OSError as failure:
+            self.close()
+            raise RecordingError.of(failure, path) from failure
+
+    def write(self, batch: Rows) -> None:
+        try:
+            self._append("".join(map(_line, batch)))
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path, self.rows) from failure
+        self.rows += len(batch)
+
+    def _append(self, text: str) -> None:
+        self._file.append(memoryview(text.encode()))
+
+    def close(self) -> None:
+        try:
+            self._file.close()
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path, self.rows) from failure
+
+
+class Reader(interface.Reader):
+    """Reads every whole line; without the .csv.json beside it the metadata is empty."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with path.open("rb") as file:
+            if file.read(len(HEADER)) != HEADER.encode():
+                raise not_a_recording(path, f"its first line is not {HEADER.strip()}")
+            size = file.seek(0, os.SEEK_END)
+            self._whole = _whole_lines(file, size)
+        self.torn = size - self._whole
+        try:
+            described = beside(path).read_bytes()
+        except FileNotFoundError:
+            described = b"{}"
+        self.metadata = interface.load(described, beside(path))
+
+    def __iter__(self) -> Iterator[Rows]:
+        with self.path.open("rb") as file:
+            lines = csv.reader(_lines(file, self._whole), strict=True)
+            rows = map(_parse, islice(lines, 1, None))
+            try:
+                while some := list(islice(rows, BATCH_ROWS)):
+                    yield from_rows(some)
+            except (csv.Error, ValueError, OverflowError) as mistake:
+                place = f"{self.path}, line {lines.line_num}"
+                raise ValueError(f"{place}: not a row of a recording: {mistake}") from mistake
+
+
+def _whole_lines(file: BinaryIO, size: int) -> int:
+    """The length of the file up to the end of its last whole line."""
+    end = size
+    while True:
+        start = max(0, end - (1 << 16))
+        file.seek(start)
+        at = file.read(end - start).rfind(b"\n")
+        if at >= 0 or start == 0:
+            return start + at + 1
+        end = start
+
+
+def _lines(file: BinaryIO, size: int) -> Iterator[str]:
+    while file.tell() < size:
+        yield file.readline().decode()
+
+
+def _parse(cells: list[str]) -> Row:
+    if len(cells) != len(Row._fields):
+        raise ValueError(f"{len(cells)} columns instead of {len(Row._fields)}")
+    time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells
+    return Row(
+        _read(time),
+        int(monotonic_ns),
+        int(uncertainty_ns) if uncertainty_ns else None,
+        drive,
+        register,
+        float(value) if value else None,
+        status,
+    )
+
+
+def _line(row: Row) -> str:
+    time, monotonic_ns, uncertainty_ns, drive, register, value, status = row
+    uncertainty = "" if uncertainty_ns is None else uncertainty_ns
+    number = "" if value is None else repr(value)
+    names = f"{_quote(drive)},{_quote(register)}"
+    return f"{_spell(time)},{monotonic_ns},{uncertainty},{names},{number},{_quote(status)}\n"
+
+
+@lru_cache(maxsize=4096)
+def _quote(text: str) -> str:
+    """As RFC 4180 has it: what holds a comma, a quote or the end of a line stands between quotes."""
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
+
+
+def _spell(time_ns: int) -> str:
+    second, rest = divmod(time_ns, SECOND)
+    return f"{_spell_second(second)}.{rest:09d}Z"
+
+
+def _read(time: str) -> int:
+    second, dot, rest = time.partition(".")
+    if not dot or len(rest) != 10 or rest[-1] != "Z":
+        raise ValueError(f"{time!r} is not a time like {_spell(0)}")
+    return _read_second(second) * SECOND + int(rest[:-1])
+
+
+@lru_cache(maxsize=1024)
+def _spell_second(second: int) -> str:
+    return (EPOCH + timedelta(seconds=second)).replace(tzinfo=None).isoformat()
+
+
+@lru_cache(maxsize=1024)
+def _read_second(text: str) -> int:
+    return (datetime.fromisoformat(text).replace(tzinfo=UTC) - EPOCH) // timedelta(seconds=1)

@@ -1,0 +1,95 @@
+"""What the writer and the reader of every format offer, and how they fail."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from multidrop.batch import Rows
+
+Metadata = Mapping[str, Any]
+
+
+class RecordingError(OSError):
+    """A recording cannot be written: the disk is full or read-only, or a library is missing.
+
+    `rows` is how many rows were written before that and can be read.
+    """
+
+    def __init__(self, path: Path, reason: str, rows: int = 0) -> None:
+        saved = f"; the {rows} rows before that can be read" if rows else ""
+        super().__init__(f"{path}: {reason}{saved}")
+        self.path = path
+        self.reason = reason
+        self.rows = rows
+
+    @classmethod
+    def of(cls, failure: OSError, path: Path, rows: int = 0) -> RecordingError:
+        return cls(path, f"cannot be written: {failure.strerror or failure}", rows)
+
+
+class Writer(ABC):
+    """A recording that is being written; leaving the `with` block closes it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows = 0
+
+    @abstractmethod
+    def write(self, batch: Rows) -> None:
+        """Append the batch's rows. Raises RecordingError."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Nothing can be written any more. Raises RecordingError."""
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Reader(ABC):
+    """A recording as it was when it was opened; may be iterated over more than once.
+
+    `torn` is how many bytes at its end are left out: their writer was killed, or the disk was full,
+    before they were whole.
+    """
+
+    path: Path
+    metadata: Metadata
+    torn: int
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Rows]:
+        """The rows, some thousands at a time. Raises ValueError where the file is damaged."""
+
+
+def dump(metadata: Metadata) -> str:
+    """The metadata as it stands in a recording."""
+    return json.dumps(metadata, ensure_ascii=False)
+
+
+def load(text: str | bytes, path: Path) -> Metadata:
+    """Metadata out of a recording; ValueError when it is not what `dump` makes."""
+    try:
+        metadata = json.loads(text)
+    except ValueError as mistake:
+        raise not_a_recording(path, f"its metadata is not JSON: {mistake}") from mistake
+    if not isinstance(metadata, dict):
+        raise not_a_recording(path, "its metadata is not a JSON object")
+    return metadata
+
+
+def not_a_recording(path: Path, why: str) -> ValueError:
+    return ValueError(f"{path} is not a recording: {why}")

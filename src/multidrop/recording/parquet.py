@@ -1,0 +1,123 @@
+"""Recordings as Parquet (.parquet), the smallest for keeping; needs pyarrow.
+
+A Parquet file is readable only once it is closed: after a crash nothing of it is. Record into
+.arrows, and convert.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from multidrop.batch import Rows, schema
+from multidrop.recording import interface
+from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
+from multidrop.recording.recorded import Recorded
+
+KEY = b"multidrop"  # of the schema's metadata
+GROUP_ROWS = 1 << 17  # rows wait in memory until there are so many
+UNREADABLE = "nothing of it can be read, because a Parquet file is readable only once it is closed"
+ENCODING = {
+    "compression": "zstd",
+    "use_dictionary": ["drive", "register", "status", "value"],
+    "column_encoding": dict.fromkeys(("time", "monotonic_ns", "uncertainty_ns"), "DELTA_BINARY_PACKED"),
+}
+
+
+def _pyarrow(path: Path) -> Any:
+    try:
+        import pyarrow as arrow
+        import pyarrow.parquet
+    except ImportError as failure:
+        raise RecordingError(path, "Parquet needs pyarrow: pip install 'multidrop[parquet]'") from failure
+    return arrow
+
+
+class Writer(interface.Writer):
+    """Gathers rows, and writes them in large groups."""
+
+    def __init__(self, path: Path, metadata: Metadata) -> None:
+        super().__init__(path)
+        self._arrow = _pyarrow(path)
+        described = self._arrow.schema(schema()).with_metadata({KEY: interface.dump(metadata)})
+        self._waiting: list[Any] = []
+        try:
+            self._file = path.open("wb")
+        except OSError as failure:
+            raise RecordingError.of(failure, path) from failure
+        self._encoder = self._arrow.parquet.ParquetWriter(self._file, described, **ENCODING)
+
+    def write(self, batch: Rows) -> None:
+        if self._file.closed:
+            raise ValueError(f"{self.path} is closed: nothing can be written to it")
+        self._waiting.append(self._arrow.record_batch(batch))
+        self.rows += len(batch)
+        if sum(map(len, self._waiting)) >= GROUP_ROWS:
+            self._guarded(self._write_group)
+
+    def close(self) -> None:
+        if not self._file.closed:
+            self._guarded(self._finish)
+
+    def _write_group(self) -> None:
+        self._encoder.write_table(self._arrow.Table.from_batches(self._waiting), GROUP_ROWS)
+        self._waiting.clear()
+
+    def _finish(self) -> None:
+        if self._waiting:
+            self._write_group()
+        self._encoder.close()
+        self._file.close()
+
+    def _guarded(self, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except OSError as failure:
+            with suppress(OSError):
+                self._file.close()
+            reason = f"cannot be written: {failure.strerror or failure}; {UNREADABLE}"
+            raise RecordingError(self.path, reason) from failure
+
+
+class Reader(interface.Reader):
+    """Reads one group of rows at a time."""
+
+    torn = 0
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._arrow = _pyarrow(path)
+        with self._open() as file:
+            found = file.schema_arrow
+        wanted = self._arrow.schema(schema())
+        if (found.names, found.types) != (wanted.names, wanted.types):
+            raise not_a_recording(path, "it is a Parquet file with other columns")
+        self.metadata = interface.load((found.metadata or {}).get(KEY, b"{}"), path)
+
+    def __iter__(self) -> Iterator[Rows]:
+        from nanoarrow import c_array
+
+        with self._open() as file:
+            for group in range(file.num_row_groups):
+                for batch in self._read_group(file, group):
+                    yield Recorded(c_array(batch))
+
+    @contextmanager
+    def _open(self) -> Iterator[Any]:
+        with self.path.open("rb") as file:
+            try:
+                opened = self._arrow.parquet.ParquetFile(file)
+            except (OSError, ValueError, self._arrow.ArrowException) as failure:
+                raise not_a_recording(self.path, f"it is no whole Parquet file; {UNREADABLE}") from failure
+            yield opened
+
+    def _read_group(self, file: Any, group: int) -> Any:
+        try:
+            table = file.read_row_group(group).combine_chunks()
+            table.validate(full=True)
+        except (OSError, ValueError, self._arrow.ArrowException) as failure:
+            why = str(failure).splitlines()[0]
+            raise ValueError(f"{self.path} is damaged in its group of rows {group}: {why}") from failure
+        return table.replace_schema_metadata().to_batches()

@@ -1,0 +1,25 @@
+"""Drives that behave as their documents say, on ptys and TCP ports, at the pace of a real wire."""
+
+from multidrop.sim.drive import Counters, SimulatedDrive, Written
+from multidrop.sim.encoded import EncodedDrive, encoded
+from multidrop.sim.families import simulated
+from multidrop.sim.motor import Motor, Phase, Rating
+from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.simulator import Simulator, serve
+from multidrop.sim.wire import Wire
+
+__all__ = [
+    "Counters",
+    "EncodedDrive",
+    "Motor",
+    "Phase",
+    "PoweredDrive",
+    "Rating",
+    "SimulatedDrive",
+    "Simulator",
+    "Wire",
+    "Written",
+    "encoded",
+    "serve",
+    "simulated",
+]

@@ -1,0 +1,105 @@
+"""INVT CHE, simulated (manual, chapter 11; registers and exceptions from the CHE100 manual)."""
+
+from __future__ import annotations
+
+from multidrop.core import Message
+from multidrop.register import HOLDING
+from multidrop.sim.drive import Reason, Refusal
+from multidrop.sim.memory import Cell
+from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.receiver import Frame
+
+CONTROL, SETPOINT = 0x1000, 0x2000
+STARTS = range(1, 5)
+FULL = 10_000  # the setpoint that is 100 %
+DEVICE_CODE = 0x0101  # CHE, universal
+CHECK_ERROR = 0x11
+_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # 5001H by exception code
+
+
+def _signed(raw: int) -> int:
+    return raw - 0x10000 if raw & 0x8000 else raw
+
+
+class SimulatedCHE(PoweredDrive):
+    """The setpoint is a percentage of P0.04, which is the drive's option `maximum_frequency`.
+
+    `storing` s after a write to the EEPROM the drive is busy.
+    """
+
+    functions = (0x03, 0x06)
+    codes = {
+        Reason.FUNCTION: 1,
+        Reason.READ_ADDRESS: 2,
+        Reason.WRITE_ADDRESS: 2,
+        Reason.COUNT: 3,
+        Reason.VALUE: 0x12,
+        Reason.LOCKED: 0x12,
+        Reason.CANNOT: 1,  # "or drive in fault"
+        Reason.BUSY: 6,
+    }
+
+    def prepare(self) -> None:
+        self.storing = 0.0
+        self._busy_until = 0.0
+        self._modbus_fault = 0
+        self.memory.make_readable(HOLDING, [CONTROL])
+
+    @property
+    def most_gap(self) -> float:
+        return 1.5 * self.drive.settings.character  # 11.5
+
+    def setpoint(self) -> float:
+        return _signed(self.word(SETPOINT)) / FULL * self.motor.maximum_frequency
+
+    def accept(self, cell: Cell, raw: int) -> int:
+        if self.now < self._busy_until:
+            raise Refusal(Reason.BUSY)
+        if cell.address == SETPOINT:  # the library writes no negative one; the drive takes it
+            if not -FULL <= _signed(raw) <= FULL:
+                raise Refusal(Reason.VALUE)
+            return raw
+        if cell.address == CONTROL and raw in STARTS and self.motor.fault:
+            raise Refusal(Reason.CANNOT)
+        return super().accept(cell, raw)
+
+    def wore(self) -> None:
+        self._busy_until = self.now + self.storing
+
+    def refused(self, request: Message, code: int) -> Message:
+        self._modbus_fault = _MODBUS_FAULTS.get(code, 0)
+        return super().refused(request, code)
+
+    def answer_damaged(self, frame: Frame) -> Message | None:
+        """A receive error is answered with a fault frame (11.1)."""
+        if frame.function not in self.functions:
+            return None
+        return self.refused(Message(frame.address, frame.function), CHECK_ERROR)
+
+    def _control(self, command: int) -> None:
+        actions = {
+            1: lambda: self.motor.run(1),
+            2: lambda: self.motor.run(-1),
+            3: lambda: self.motor.jog(1),
+            4: lambda: self.motor.jog(-1),
+            5: self.motor.stop,
+            6: self.motor.coast,
+            7: self.motor.reset,
+            8: self.motor.stop,
+        }
+        actions[command]()
+
+    def _state(self) -> int:
+        if self.motor.fault:
+            return 4
+        if not self.motor.energised:
+            return 3
+        return 2 if self.motor.frequency < 0 else 1
+
+    obeys = {(0x03, CONTROL): _control}
+    shows = {
+        (0x03, 0x1001): _state,
+        (0x03, 0x3016): lambda self: DEVICE_CODE,
+        (0x03, 0x5000): lambda self: self.motor.fault,
+        (0x03, 0x5001): lambda self: self._modbus_fault,
+    }

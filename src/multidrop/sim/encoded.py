@@ -1,0 +1,29 @@
+"""EncodedDrive: a drive whose values say where they come from, to prove that none is misattributed."""
+
+from __future__ import annotations
+
+from multidrop.drive import Drive
+from multidrop.register import Carrier, Table
+from multidrop.sim.drive import SimulatedDrive
+from multidrop.sim.memory import Cell
+
+
+def encoded(address: int, table: Table, register_address: int) -> int:
+    """What an EncodedDrive holds there: it names drive, table and register (a coil has its lowest bit)."""
+    return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
+
+
+class EncodedDrive(SimulatedDrive):
+    """A drive whose every register holds what names drive, table and register: see `encoded`.
+
+    What is written to it is confirmed and forgotten. No value of it can be taken for another's.
+    """
+
+    def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
+        super().__init__(drive, response_delay=response_delay)
+        for cell in self.memory.cells():
+            bits = 1 if cell.table.carrier is Carrier.BIT else 0x7FFF
+            cell.raw = encoded(drive.address, cell.table, cell.address) & bits
+
+    def accept(self, cell: Cell, raw: int) -> int:
+        return cell.raw

@@ -1,0 +1,76 @@
+"""ERMAN ER-G-220-01(02), simulated (Modbus manual v1.4, sections 5 to 8)."""
+
+from __future__ import annotations
+
+from multidrop.core import Message
+from multidrop.register import COIL
+from multidrop.sim.drive import Reason
+from multidrop.sim.motor import Phase
+from multidrop.sim.powered import PoweredDrive
+
+COILS = range(13)  # 3 to 8 and 10 to 12 are reserved; a library keeps away from them, the drive does not
+START, STOP, EMERGENCY_STOP, FAULT_RESET = 0, 1, 2, 9
+EMERGENCY_STOPPED = 1 << 0  # in the last fault
+OVERLOADED = 1 << 5  # in the state
+_STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
+
+
+class SimulatedERMAN(PoweredDrive):
+    """Coils keep what is written; START acts when it is written while neither stop is on.
+
+    The manual does not say whether a coil is a level or a pulse. Here clearing START stops as
+    well, and neither clearing a stop nor a reset starts anything.
+    """
+
+    functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
+    codes = {  # every example prints 03 for a wrong address, against the table of section 5
+        Reason.FUNCTION: 1,
+        Reason.READ_ADDRESS: 3,
+        Reason.WRITE_ADDRESS: 3,
+        Reason.COUNT: 3,
+    }
+
+    def prepare(self) -> None:
+        self.most[0x01] = 12
+        self.memory.make_readable(COIL, COILS)
+        self.memory.make_writable(COIL, COILS)
+
+    def takes_broadcast(self, request: Message) -> bool:
+        return True  # section 6 calls address 0 the broadcast, and says no more
+
+    def _start(self, on: int) -> None:
+        if not on:
+            self.motor.stop()
+        elif not (self._coil(STOP) or self._coil(EMERGENCY_STOP)):
+            self.motor.run()
+
+    def _stop(self, on: int) -> None:
+        if on:
+            self.motor.stop()
+
+    def _emergency_stop(self, on: int) -> None:
+        if on:
+            self.motor.trip(EMERGENCY_STOPPED)
+
+    def _reset(self, on: int) -> None:
+        if on:
+            self.motor.reset()
+
+    def _coil(self, address: int) -> int:
+        cell = self.memory.writable(0x05, address)
+        return cell.raw if cell else 0
+
+    def _state(self) -> int:
+        overloaded = self.motor.current > 1.2 * self.motor.rating.current
+        return _STATES[self.motor.phase] | (OVERLOADED if overloaded else 0)
+
+    obeys = {
+        (0x01, START): _start,
+        (0x01, STOP): _stop,
+        (0x01, EMERGENCY_STOP): _emergency_stop,
+        (0x01, FAULT_RESET): _reset,
+    }
+    shows = {
+        (0x04, 0x0400): _state,
+        (0x04, 0x0402): lambda self: self.motor.fault_record(1),  # kept after a reset
+    }

@@ -1,0 +1,34 @@
+"""Which family a drive's class belongs to, and how that family is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from multidrop.drive import Drive
+from multidrop.drives.delixi_modbus import DelixiModbus
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.erman_er_g_220 import ErmanERG220
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.drives.yd1000 import YD1000
+from multidrop.sim.che import SimulatedCHE
+from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
+from multidrop.sim.drive import SimulatedDrive
+from multidrop.sim.erman import SimulatedERMAN
+from multidrop.sim.ibd import SimulatedIBD
+from multidrop.sim.yd1000 import SimulatedYD1000
+
+FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
+    ErmanERG220: SimulatedERMAN,
+    InvtCHE: SimulatedCHE,
+    InnovertIBD: SimulatedIBD,
+    DelixiModbus: SimulatedDelixi,
+    DelixiNative: SimulatedDelixiNative,
+    YD1000: SimulatedYD1000,
+}
+
+
+def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
+    """The drive, simulated as its family's document says; a class of one's own, as it declares."""
+    kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
+    return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

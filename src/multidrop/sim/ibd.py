@@ -1,0 +1,66 @@
+"""INNOVERT IBD, simulated (manual, part 9, appendix 2)."""
+
+from __future__ import annotations
+
+from multidrop.core import Framing
+from multidrop.sim.memory import Cell
+from multidrop.sim.motor import Phase
+from multidrop.sim.powered import PoweredDrive
+
+CONTROL = 0x2000
+ALWAYS_SEEN = 1 << 11 | 1 << 12  # in PrA.22, by the manual's example
+LARGEST = {107: 36000, 108: 36000}  # of Prb.07 and Prb.08; the manual has maxima and does not give them
+OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # bits of PrA.22 by Prd.23, .24, .25, .28
+RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # what an output may say
+BAUDRATES = (4800, 9600, 19200, 38400)
+FORMATS = ("8N1", "8E1", "8O1")
+
+
+class SimulatedIBD(PoweredDrive):
+    """Set up for RS-485 (Prb.01 = 5, Prb.02 = 2), its outputs programmed as the manual's example.
+
+    The manual has no exceptions: what cannot be done is not answered. A value above the largest
+    is stored as the largest, and the echo shows the value that was asked for.
+    """
+
+    functions = (0x03, 0x06)
+    codes = {}
+    begins = {101: 5, 102: 2, 323: RUNNING, 324: ACCELERATING, 325: DECELERATING, 328: FAULT}
+
+    @property
+    def most_gap(self) -> float:
+        return 10e-3 if self.drive.framing is Framing.RTU else super().most_gap
+
+    def accept(self, cell: Cell, raw: int) -> int:
+        register = cell.register
+        if register is not None and register.span is not None:
+            return min(raw, register.encode(register.span[1]))
+        return min(raw, LARGEST.get(cell.address, raw))
+
+    def _control(self, bits: int) -> None:
+        """Direction bits as the number that BIT3, BIT2 make; the manual can be read both ways."""
+        if bits & 0x10:
+            self.motor.reset()
+        self.run_or_stop(bits & 0x03, {0x04: -1, 0x08: 1, 0x0C: -self.motor.direction}.get(bits & 0x0C))
+
+    def _terminals(self) -> int:
+        says = {
+            RUNNING: self.motor.energised,
+            FAULT: bool(self.motor.fault),
+            ACCELERATING: self.motor.phase is Phase.ACCELERATING,
+            DECELERATING: self.motor.phase is Phase.DECELERATING,
+        }
+        bits = (bit for address, bit in OUTPUTS.items() if says.get(self.word(address)))
+        return sum(bits, ALWAYS_SEEN)
+
+    def _format(self) -> int:
+        first_rtu = len(FORMATS) if self.drive.framing is Framing.RTU else 0
+        return first_rtu + FORMATS.index(self.drive.settings.format)
+
+    obeys = {(0x03, CONTROL): _control}
+    shows = {
+        (0x03, 22): _terminals,
+        (0x03, 700): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
+        (0x03, 701): _format,
+        (0x03, 702): lambda self: self.drive.address,
+    }

@@ -1,0 +1,128 @@
+"""A drive's memory: what every address of its tables holds, as the drive's class declares it.
+
+An address is reached by a function code; tables that several codes reach (03, 06 and 10) are one
+space. Cells hold what one address holds: a bit, a word, or Delixi's four bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.core import Framing, Wire, raw_value
+from multidrop.drive import Drive
+from multidrop.register import Access, Carrier, Register, Table
+
+_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
+_DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
+_LOW_WORD_FIRST = (Wire.U32_SWAPPED, Wire.I32_SWAPPED, Wire.F32_SWAPPED)
+_MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
+_BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
+
+
+@dataclass(eq=False)
+class Cell:
+    """One address of one table, and the register that it belongs to, if it is not a reserved one."""
+
+    table: Table
+    address: int
+    register: Register[Any] | None = None
+    raw: int = 0
+
+    @property
+    def name(self) -> str:
+        return self.register.name if self.register else f"{self.table.name} {self.address:04X}H"
+
+
+class Memory:
+    """The cells of one drive, found by function code and address."""
+
+    def __init__(self, drive: type[Drive], framing: Framing) -> None:
+        self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
+        self._cells: dict[tuple[Table, int], Cell] = {}
+        self._read: dict[tuple[int, int], Cell] = {}
+        self._written: dict[tuple[int, int], Cell] = {}
+        self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
+        for table, addresses in drive.readable_gaps.items():
+            self.make_readable(table, addresses)
+        for register in drive.registers.values():
+            self._declare(register)
+
+    def _cell(self, table: Table, address: int) -> Cell:
+        return self._cells.setdefault((table, address), Cell(table, address))
+
+    def _declare(self, register: Register[Any]) -> None:
+        table = register.table
+        for at in range(register.words):
+            cell = self._cell(table, register.address + at)
+            cell.register = register
+            if table.read is not None and register.access is not Access.COMMAND:
+                self._read[table.read, cell.address] = cell
+            else:
+                self._read.pop((table.read or 0, cell.address), None)
+            if register.access is Access.READING:
+                continue
+            self.make_writable(table, [cell.address])
+            if register.ram_address is not None:
+                for code in self._codes(table):
+                    self._written[code, register.ram_address + at] = cell
+                    self.aliases.add((code, register.ram_address + at))
+        if register.default is not None:
+            self.set(register, register.default)
+
+    def make_readable(self, table: Table, addresses: Iterable[int]) -> None:
+        for address in addresses:
+            self._read[table.read or 0, address] = self._cell(table, address)
+
+    def make_writable(self, table: Table, addresses: Iterable[int]) -> None:
+        for address in addresses:
+            for code in self._codes(table):
+                self._written[code, address] = self._cell(table, address)
+
+    def _codes(self, table: Table) -> set[int]:
+        """The function codes that write this table."""
+        return set() if table.write is None else {table.write, self._also.get(table.write, table.write)}
+
+    def readable(self, function: int, address: int) -> Cell | None:
+        return self._read.get((function, address))
+
+    def writable(self, function: int, address: int) -> Cell | None:
+        """The cell that a write there changes, whatever the library itself would write."""
+        return self._written.get((function, address))
+
+    def cells(self) -> Iterator[Cell]:
+        yield from self._cells.values()
+
+    # ---- registers as a whole ----
+
+    def get(self, register: Register[Any]) -> Any:
+        """The register's value in its own unit."""
+        data = b"".join(pack(cell) for cell in self.of(register))
+        return register.decode(raw_value(data, 0, register.wire))
+
+    def set(self, register: Register[Any], value: float) -> None:
+        """Hold this value: rounded to the register's step, cut off where it does not fit."""
+        if register.wire in (Wire.F32, Wire.F32_SWAPPED):
+            raw = int.from_bytes(struct.pack(">f", value))
+        elif register.values is not None:
+            raw = int(value)
+        else:
+            raw = round(value / register.scale)
+        self.set_raw(register, raw)
+
+    def set_raw(self, register: Register[Any], raw: int) -> None:
+        cells = self.of(register)
+        for cell in cells if register.wire in _LOW_WORD_FIRST else reversed(cells):
+            cell.raw = raw & _MASKS[register.table.carrier]
+            raw >>= 16
+
+    def of(self, register: Register[Any]) -> list[Cell]:
+        """The register's cells, in the order of their addresses."""
+        return [self._cells[register.table, register.address + at] for at in range(register.words)]
+
+
+def pack(cell: Cell) -> bytes:
+    """What the cell holds, as a reply carries it."""
+    return cell.raw.to_bytes(_BYTES[cell.table.carrier])

@@ -1,0 +1,135 @@
+"""The simulator's end of a line: a pty, or a TCP port that takes one client at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from multidrop.core import get_settings, set_settings
+from multidrop.timing import Settings
+
+MOST_READ = 4096
+
+
+class Port(Protocol):
+    path: str  # where a client opens it
+
+    def fileno(self) -> int:
+        """What to wait for; may be another after each read."""
+
+    def read(self) -> bytes:
+        """What came, never blocking."""
+
+    def write(self, heard: bytes) -> None:
+        """Hand over to the client, if there is one that listens; never blocking."""
+
+    def baudrate(self) -> int | None:
+        """The client's baud rate, where it can be seen."""
+
+    def close(self) -> None: ...
+
+
+def open_port(where: str, settings: Settings) -> Port:
+    """A port of the kind that `where` names: see Wire."""
+    if where.startswith("socket://"):
+        return TCPPort(where)
+    return PtyPort(settings, None if where == "pty" else Path(where))
+
+
+class PtyPort:
+    """A pty whose other side a client opens by its path.
+
+    One descriptor of the client's side stays open here, so that the line survives a client that
+    closes. Of the client's settings only the baud rate counts: a pty keeps no parity.
+    """
+
+    def __init__(self, settings: Settings, link: Path | None) -> None:
+        self._master, self._slave = os.openpty()
+        self._link = link
+        try:
+            os.set_blocking(self._master, False)
+            set_settings(self._slave, settings.baudrate, settings.format)
+            self.path = os.ttyname(self._slave)
+            if link is not None:
+                link.symlink_to(self.path)
+                self.path = str(link)
+        except OSError:
+            self._link = None
+            self.close()
+            raise
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self._master, MOST_READ)
+        except BlockingIOError:
+            return b""
+
+    def write(self, heard: bytes) -> None:
+        with contextlib.suppress(BlockingIOError):  # nobody reads: it is lost, as on a wire
+            os.write(self._master, heard)
+
+    def baudrate(self) -> int | None:
+        return get_settings(self._slave)[0]
+
+    def close(self) -> None:
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class TCPPort:
+    """A listening socket; the next client may come when the present one has gone."""
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        if parts.hostname is None or parts.port is None:
+            raise ValueError(f"{url!r} is not socket://host:port, such as socket://127.0.0.1:5020")
+        self._listener = socket.create_server((parts.hostname, parts.port))
+        self._listener.setblocking(False)
+        self._client: socket.socket | None = None
+        self.path = f"socket://{parts.hostname}:{self._listener.getsockname()[1]}"
+
+    def fileno(self) -> int:
+        return (self._client or self._listener).fileno()
+
+    def read(self) -> bytes:
+        if self._client is None:
+            with contextlib.suppress(BlockingIOError, ConnectionError):  # it has gone again
+                self._client, _ = self._listener.accept()
+                self._client.setblocking(False)
+                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return b""
+        try:
+            chunk = self._client.recv(MOST_READ)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            chunk = b""
+        if not chunk:
+            self._hang_up()
+        return chunk
+
+    def _hang_up(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def write(self, heard: bytes) -> None:
+        if self._client is not None:
+            with contextlib.suppress(OSError):  # a client that has gone is noticed when reading
+                self._client.send(heard)
+
+    def baudrate(self) -> int | None:
+        return None
+
+    def close(self) -> None:
+        self._hang_up()
+        self._listener.close()

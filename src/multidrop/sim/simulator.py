@@ -1,0 +1,132 @@
+"""Simulator: runs any number of wires in one thread; the only file here that reads a clock."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import os
+import select
+import selectors
+import threading
+from collections.abc import Callable, Sequence
+from time import monotonic
+from types import TracebackType
+
+from multidrop.sim.wire import Wire
+
+
+class Simulator:
+    """Wires that run while the context lasts: `with Simulator([wire]) as sim: sim.wires[0].path`."""
+
+    def __init__(self, wires: Sequence[Wire]) -> None:
+        self.wires = tuple(wires)
+        self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
+        self._failure: BaseException | None = None
+        self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
+        self._planned: dict[int, float] = {}  # of each wire, the wake that counts
+
+    def __enter__(self) -> Simulator:
+        self.open()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.interrupt()
+        self._thread.join()
+        self.close()
+        if self._failure is not None:
+            raise self._failure
+
+    def _run_in_thread(self) -> None:
+        try:
+            self.run()
+        except BaseException as failure:
+            self._failure = failure
+
+    def open(self) -> None:
+        """Open every wire's port, or none; the paths are known then."""
+        self._selector = selectors.DefaultSelector()
+        self._ears, self._bell = os.pipe()
+        self._selector.register(self._ears, selectors.EVENT_READ, None)
+        try:
+            for number, wire in enumerate(self.wires):
+                self._selector.register(wire.open().fileno(), selectors.EVENT_READ, number)
+        except (OSError, ValueError):
+            self.close()
+            raise
+
+    def close(self) -> None:
+        for wire in self.wires:
+            wire.close()
+        self._selector.close()
+        os.close(self._ears)
+        os.close(self._bell)
+
+    def interrupt(self) -> None:
+        """Make `run` return; from any thread or signal handler."""
+        os.write(self._bell, b"!")
+
+    def run(self) -> None:
+        """Run the wires until interrupted. Blocks."""
+        while True:
+            self._sleep()
+            for key, _ in self._selector.select(0):
+                if key.data is None:
+                    return
+                self._listen(key.data, key.fd)
+            now = monotonic()
+            while self._wakes and self._wakes[0][0] <= now:
+                at, number = heapq.heappop(self._wakes)
+                if self._planned.get(number) == at:
+                    del self._planned[number]
+                    self._speak(number)
+
+    def _sleep(self) -> None:
+        """Wait for bytes or the next wake.
+
+        The selector itself is waited for, because select() keeps time to the microsecond and
+        epoll_wait() only to the millisecond.
+        """
+        limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
+        select.select([self._selector], [], [], limit)
+
+    def _listen(self, number: int, fd: int) -> None:
+        wire = self.wires[number]
+        port = wire.opened
+        now = monotonic()
+        chunk = port.read()
+        if port.fileno() != fd:
+            self._selector.unregister(fd)
+            self._selector.register(port.fileno(), selectors.EVENT_READ, number)
+        if chunk:
+            wire.receive(chunk, now, port.baudrate())
+            self._speak(number)
+
+    def _speak(self, number: int) -> None:
+        """Hand over what the client hears by now, and plan the wire's next wake."""
+        wire = self.wires[number]
+        heard = wire.advance(monotonic())
+        if heard:
+            wire.opened.write(heard)
+        wake = wire.wake
+        if wake is not None and wake < self._planned.get(number, math.inf):
+            self._planned[number] = wake
+            heapq.heappush(self._wakes, (wake, number))
+
+
+def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda simulator: None) -> None:
+    """Run wires in this process until Ctrl-C; `announce` is called once their paths are known."""
+    simulator = Simulator(wires)
+    simulator.open()
+    try:
+        announce(simulator)
+        simulator.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        simulator.close()

@@ -1,0 +1,363 @@
+/* The C core against the documents' frames and against hostile lengths, without any framework.
+ *
+ *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
+ *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/line.c csrc/columns.c -o test_core
+ *   ./test_core tests/data/frames.csv
+ *
+ * Without -fsanitize it also runs under valgrind: --error-exitcode=99 --leak-check=full. All bytes
+ * that are parsed end at a page that cannot be read, so that even without tools an over-read kills. */
+#include "multidrop.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <unistd.h>
+
+#define COUNT(table) (sizeof(table) / sizeof *(table))
+#define CHECK(truth) (checks++, (truth) ? 1 : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
+
+static int checks, failures;
+static const char *row = ""; /* what is being checked, for the report */
+
+/* ---- bytes that end where memory ends ---- */
+
+static uint8_t *page_end(void)
+{
+    static uint8_t *end;
+    if (!end) {
+        size_t page = (size_t)sysconf(_SC_PAGESIZE);
+        uint8_t *pages = mmap(NULL, 2 * page, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+        if (pages == MAP_FAILED || mprotect(pages + page, page, PROT_NONE))
+            exit(2);
+        end = pages + page;
+    }
+    return end;
+}
+
+static const uint8_t *at_the_edge(const uint8_t *bytes, size_t len)
+{
+    return len ? memcpy(page_end() - len, bytes, len) : page_end();
+}
+
+/* ---- the documents' frames ---- */
+
+struct frame {
+    int framing, is_reply, result; /* what parsing the whole must return */
+    uint8_t bytes[MD_MOST_FRAME];
+    size_t len;
+};
+
+static int parse(const struct frame *frame, const uint8_t *bytes, size_t len, const struct md_message *request)
+{
+    struct md_message found;
+    const uint8_t *edge = at_the_edge(bytes, len);
+    return frame->is_reply ? md_parse_reply(frame->framing, edge, len, request, &found)
+                           : md_parse_request(frame->framing, edge, len, &found);
+}
+
+/* Whole, byte by byte, with bytes after it, and with each of its bits wrong. */
+static void check_parse(const struct frame *frame, const struct md_message *request)
+{
+    uint8_t bytes[MD_MOST_FRAME + 3];
+    memcpy(bytes, frame->bytes, frame->len);
+    memset(bytes + frame->len, frame->bytes[0], 3);
+    int refused = 0;
+    for (size_t len = 0; len < frame->len; len++) {
+        int used = parse(frame, bytes, len, request);
+        CHECK(used == MD_INCOMPLETE || (used < 0 && used == frame->result));
+        CHECK(used || !refused); /* a refusal is final */
+        refused = used;
+    }
+    for (size_t more = 0; more <= 3; more++)
+        CHECK(parse(frame, bytes, frame->len + more, request) == frame->result);
+    for (size_t bit = 0; bit < 8 * frame->len && frame->result > 0; bit++) {
+        bytes[bit / 8] ^= (uint8_t)(1 << bit % 8);
+        CHECK(parse(frame, bytes, frame->len, request) <= 0);
+        bytes[bit / 8] ^= (uint8_t)(1 << bit % 8);
+    }
+}
+
+static void send(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion)
+{
+    md_line_init(line, 0);
+    md_line_begin(line, exchange, completion, 0);
+    CHECK(md_line_want(line, exchange->silence_ns - 1) == MD_READ);
+    CHECK(md_line_want(line, exchange->silence_ns) == MD_READ);
+    CHECK(md_line_want(line, exchange->silence_ns) == MD_WRITE);
+    md_line_sent(line, line->tx_len, exchange->silence_ns);
+}
+
+/* Through the line, in pieces of `step` bytes, behind junk: found, and the junk counted. */
+static void check_line(const struct frame *frame, const struct md_message *request, const uint8_t *junk,
+                       size_t junk_len, size_t step)
+{
+    static struct md_line line;
+    static struct md_completion completion;
+    struct md_exchange exchange = {.framing = frame->framing, .request = *request, .character_ns = 1000,
+                                   .silence_ns = 4000, .timeout_ns = 1000000};
+    uint8_t bytes[MD_MOST_FRAME + 8];
+    size_t len = junk_len + frame->len;
+    memcpy(bytes, junk, junk_len);
+    memcpy(bytes + junk_len, frame->bytes, frame->len);
+    send(&line, &exchange, &completion);
+    for (size_t at = 0; at < len; at += step) {
+        size_t piece = len - at < step ? len - at : step;
+        CHECK(md_line_want(&line, 10000) == MD_READ);
+        md_line_received(&line, at_the_edge(bytes + at, piece), piece, 10000);
+    }
+    CHECK(md_line_want(&line, 10000) == MD_DONE);
+    CHECK(completion.result == frame->result && completion.skipped == junk_len);
+    CHECK(completion.raw_len == frame->len && memcmp(completion.raw, frame->bytes, frame->len) == 0);
+}
+
+static void check_behind_junk(const struct frame *frame, const struct md_message *request)
+{
+    static const uint8_t junk[] = {0x00, 0xFF, ':', 0x01, 0x55, ':', '0'};
+    for (size_t junk_len = 0; junk_len <= sizeof junk; junk_len++)
+        for (size_t step = 1; step <= 64; step *= 4)
+            check_line(frame, request, junk, junk_len, step);
+    check_line(frame, request, frame->bytes, 2, 1); /* the beginning of a reply, then the reply */
+}
+
+/* "01 03 ..." or ":0103...\r\n" (spelt out) to bytes. */
+static size_t read_bytes(const char *text, uint8_t *bytes)
+{
+    size_t len = 0;
+    if (*text != ':') {
+        for (char *end; *text; text = end)
+            bytes[len++] = (uint8_t)strtoul(text, &end, 16);
+        return len;
+    }
+    for (; *text; text++)
+        bytes[len++] = *text != '\\' ? (uint8_t)*text : *++text == 'r' ? '\r' : '\n';
+    return len;
+}
+
+/* A reply belongs to the nearest well-formed request above it. */
+static void check_documents(const char *path)
+{
+    char text[512], model[32], framing[16], direction[16], bytes[256], verdict[32];
+    struct md_message request = {0};
+    FILE *file = fopen(path, "r");
+    int rows = 0;
+    if (!file || !fgets(text, sizeof text, file))
+        exit(2);
+    for (; fgets(text, sizeof text, file); rows++) {
+        row = text;
+        if (sscanf(text, "%31[^,],%15[^,],%15[^,],%255[^,],%31[^,]", model, framing, direction, bytes, verdict) != 5)
+            exit(2);
+        struct frame frame = {.is_reply = strcmp(direction, "reply") == 0};
+        frame.framing = strcmp(framing, "rtu") == 0 ? MD_RTU : strcmp(framing, "ascii") == 0 ? MD_ASCII : MD_DELIXI;
+        frame.len = read_bytes(bytes, frame.bytes);
+        frame.result = strcmp(verdict, "bad checksum") == 0 ? MD_BAD_CHECKSUM : (int)frame.len;
+        if (strcmp(verdict, "bad content") == 0 && frame.is_reply && frame.bytes[1] == 0x04)
+            frame.result = MD_BAD_LENGTH; /* its byte count is for other registers than were asked for */
+        check_parse(&frame, &request);
+        if (frame.is_reply && frame.result > 0)
+            check_behind_junk(&frame, &request);
+        if (frame.is_reply || frame.result < 0)
+            continue;
+        uint8_t built[MD_MOST_FRAME];
+        CHECK(md_parse_request(frame.framing, frame.bytes, frame.len, &request) == (int)frame.len);
+        CHECK(md_build_request(frame.framing, &request, built, sizeof built) == (int)frame.len);
+        CHECK(memcmp(built, frame.bytes, frame.len) == 0);
+        CHECK(md_build_request(frame.framing, &request, built, frame.len - 1) == MD_BAD_REQUEST);
+        if (request.data_len && request.count == 0) { /* a write of one value is answered with its copy */
+            frame.is_reply = frame.framing != MD_DELIXI || request.function != 0x07;
+            check_parse(&frame, &request);
+        }
+    }
+    fclose(file);
+    CHECK(rows == 49);
+}
+
+/* ---- what can be said at all ---- */
+
+static const struct {
+    const char *name;
+    int framing, length; /* 0: MD_BAD_REQUEST */
+    struct md_message message;
+} requests[] = {
+    {"125 registers", MD_RTU, 8, {.address = 1, .function = 3, .count = 125}},
+    {"126 registers", MD_RTU, 0, {.address = 1, .function = 3, .count = 126}},
+    {"no register", MD_RTU, 0, {.address = 1, .function = 4}},
+    {"2000 bits", MD_ASCII, 17, {.address = 1, .function = 1, .count = 2000}},
+    {"2001 bits", MD_RTU, 0, {.address = 1, .function = 2, .count = 2001}},
+    {"to the last register", MD_RTU, 8, {.address = 1, .function = 3, .start = 0xFFFF, .count = 1}},
+    {"past the last register", MD_RTU, 0, {.address = 1, .function = 3, .start = 0xFFFF, .count = 2}},
+    {"a count that wraps around", MD_RTU, 0, {.address = 1, .function = 3, .start = 1, .count = 0xFFFF}},
+    {"a read with data", MD_RTU, 0, {.address = 1, .function = 3, .count = 1, .data_len = 2}},
+    {"a broadcast read", MD_RTU, 0, {.function = 3, .count = 1}},
+    {"a broadcast write", MD_RTU, 8, {.function = 6, .data_len = 2}},
+    {"a broadcast loopback", MD_RTU, 0, {.function = 8, .data_len = 2}},
+    {"the last address", MD_RTU, 8, {.address = 247, .function = 6, .data_len = 2}},
+    {"a reserved address", MD_RTU, 0, {.address = 248, .function = 6, .data_len = 2}},
+    {"123 words", MD_RTU, 255, {.address = 1, .function = 0x10, .count = 123, .data_len = 246}},
+    {"123 words as text", MD_ASCII, 511, {.address = 1, .function = 0x10, .count = 123, .data_len = 246}},
+    {"124 words", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 124, .data_len = 248}},
+    {"a byte too few", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 2, .data_len = 3}},
+    {"1968 coils", MD_RTU, 255, {.address = 1, .function = 0x0F, .count = 1968, .data_len = 246}},
+    {"1969 coils", MD_RTU, 0, {.address = 1, .function = 0x0F, .count = 1969, .data_len = 247}},
+    {"a coil that is on", MD_RTU, 8, {.address = 1, .function = 5, .data_len = 2, .data = {0xFF}}},
+    {"a coil between on and off", MD_RTU, 0, {.address = 1, .function = 5, .data_len = 2, .data = {0x01}}},
+    {"a coil more than on", MD_RTU, 0, {.address = 1, .function = 5, .data_len = 2, .data = {0xFF, 0x01}}},
+    {"more data than there is room for", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 0xFFFF}},
+    {"no function", MD_RTU, 0, {.address = 1, .count = 1}},
+    {"a function that nobody here knows", MD_RTU, 0, {.address = 1, .function = 0x17, .count = 1}},
+    {"an exception's function", MD_RTU, 0, {.address = 1, .function = 0x83, .count = 1}},
+    {"a run command", MD_DELIXI, 21, {.address = 1, .function = 2, .start = 1, .data_len = 4}},
+    {"a broadcast run command", MD_DELIXI, 21, {.function = 2, .start = 1, .data_len = 4}},
+    {"a broadcast parameter", MD_DELIXI, 0, {.function = 5, .start = 1, .data_len = 4}},
+    {"a value of two bytes", MD_DELIXI, 0, {.address = 1, .function = 5, .start = 1, .data_len = 2}},
+    {"what only the drive may say", MD_DELIXI, 0, {.address = 1, .function = 0xFF, .data_len = 4}},
+}, replies[] = {
+    {"125 registers", MD_RTU, 255, {.address = 1, .function = 3, .data_len = 250}},
+    {"125 registers as text", MD_ASCII, 511, {.address = 1, .function = 3, .data_len = 250}},
+    {"a byte more", MD_RTU, 0, {.address = 1, .function = 3, .data_len = 251}},
+    {"half a register", MD_RTU, 0, {.address = 1, .function = 4, .data_len = 3}},
+    {"nothing", MD_RTU, 0, {.address = 1, .function = 3}},
+    {"a byte of bits", MD_RTU, 6, {.address = 1, .function = 1, .data_len = 1}},
+    {"an exception", MD_RTU, 5, {.address = 1, .function = 3, .exception = 2}},
+    {"words written", MD_RTU, 8, {.address = 1, .function = 0x10, .count = 123}},
+    {"too many words written", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 124}},
+    {"an answer to a broadcast", MD_RTU, 0, {.function = 6, .data_len = 2}},
+    {"a value", MD_DELIXI, 21, {.address = 1, .function = 7, .data_len = 4}},
+    {"a refusal of an unknown command", MD_DELIXI, 21, {.address = 1, .function = 9, .exception = 0xF0}},
+    {"a refusal that is none", MD_DELIXI, 0, {.address = 1, .function = 2, .exception = 0x02}},
+};
+
+static void check_builders(void)
+{
+    for (size_t i = 0; i < COUNT(requests) + COUNT(replies); i++) {
+        int is_reply = i >= COUNT(requests);
+        size_t at = is_reply ? i - COUNT(requests) : i;
+        int framing = is_reply ? replies[at].framing : requests[at].framing;
+        int length = is_reply ? replies[at].length : requests[at].length;
+        const struct md_message *message = is_reply ? &replies[at].message : &requests[at].message;
+        int (*build)(int, const struct md_message *, uint8_t *, size_t) = is_reply ? md_build_reply : md_build_request;
+        row = is_reply ? replies[at].name : requests[at].name;
+        for (size_t room = 0; room <= MD_MOST_FRAME; room++)
+            CHECK(build(framing, message, page_end() - room, room) ==
+                  (length && room >= (size_t)length ? length : MD_BAD_REQUEST));
+    }
+}
+
+/* A request that was never built: its count may be anything, but no reply may overrun the message. */
+static void check_impossible_counts(void)
+{
+    static const uint8_t functions[] = {1, 2, 3, 4, 5, 6, 8, 0x0F, 0x10, 0x17, 0x83};
+    uint8_t reply[257] = {1};
+    struct md_message found;
+    row = "impossible count";
+    for (size_t i = 0; i < sizeof functions; i++)
+        for (unsigned count = 0; count < 2100; count++)
+            for (unsigned bytes = 248; bytes < 256; bytes++) {
+                struct md_message request = {.address = 1, .function = functions[i], .count = (uint16_t)count};
+                size_t len = 3 + bytes < 255 ? 3 + bytes : 255;
+                reply[1] = functions[i];
+                reply[2] = (uint8_t)bytes;
+                uint16_t crc = md_crc16(reply, len);
+                reply[len] = (uint8_t)crc;
+                reply[len + 1] = (uint8_t)(crc >> 8);
+                int used = md_parse_reply(MD_RTU, at_the_edge(reply, len + 2), len + 2, &request, &found);
+                CHECK(used <= 0 || (used <= 255 && found.data_len <= MD_MOST_DATA));
+            }
+}
+
+/* ---- columns ---- */
+
+static const struct {
+    const char *name;
+    uint8_t data[4];
+    size_t len, at;
+    int wire;
+    double value;
+} values[] = {
+    {"unsigned", {0xFF, 0xFE}, 2, 0, MD_U16, 65534},
+    {"signed", {0xFF, 0xFE}, 2, 0, MD_I16, -2},
+    {"second word", {0, 0, 0x13, 0x88}, 4, 1, MD_U16, 5000},
+    {"unsigned long", {0xFF, 0xFF, 0xFF, 0xFE}, 4, 0, MD_U32, 4294967294.0},
+    {"signed long", {0xFF, 0xFF, 0xFF, 0xFE}, 4, 0, MD_I32, -2},
+    {"low word first", {0x00, 0x01, 0x00, 0x02}, 4, 0, MD_U32_SWAPPED, 131073},
+    {"signed, low word first", {0xFF, 0xFE, 0xFF, 0xFF}, 4, 0, MD_I32_SWAPPED, -2},
+    {"either word", {0x00, 0x00, 0x00, 0x02}, 4, 0, MD_U32_EITHER, 2},
+    {"the other word", {0x00, 0x02, 0x00, 0x00}, 4, 0, MD_U32_EITHER, 2},
+    {"float", {0x42, 0x48, 0x00, 0x00}, 4, 0, MD_F32, 50},
+    {"float, low word first", {0x00, 0x00, 0x42, 0x48}, 4, 0, MD_F32_SWAPPED, 50},
+    {"first bit", {0x01}, 1, 0, MD_BIT, 1},
+    {"last bit", {0x00, 0x80}, 2, 15, MD_BIT, 1},
+    {"a bit too far", {0xFF}, 1, 8, MD_BIT, NAN},
+    {"half a word", {0xFF}, 1, 0, MD_U16, NAN},
+    {"a word too far", {0xFF, 0xFF}, 2, 1, MD_U16, NAN},
+    {"half a long", {0xFF, 0xFF}, 2, 0, MD_U32, NAN},
+    {"so far that it wraps around", {0xFF, 0xFF}, 2, SIZE_MAX / 2 + 1, MD_U16, NAN},
+    {"the last bit there is", {0xFF}, 1, SIZE_MAX, MD_BIT, NAN},
+    {"no such wire", {0xFF, 0xFF}, 2, 0, MD_BIT + 1, NAN},
+    {"less than no wire", {0xFF, 0xFF}, 2, 0, -1, NAN},
+};
+
+static void check_values(void)
+{
+    for (size_t i = 0; i < COUNT(values); i++) {
+        row = values[i].name;
+        double value = md_value(at_the_edge(values[i].data, values[i].len), values[i].len, values[i].at, values[i].wire);
+        CHECK(isnan(values[i].value) ? isnan(value) : value == values[i].value);
+    }
+}
+
+static void check_columns(void)
+{
+    enum { ROOM = 3 };
+    int64_t time[ROOM], sent[ROOM], uncertainty[ROOM];
+    uint16_t drive[ROOM], reg[ROOM], status[ROOM];
+    double value[ROOM];
+    uint8_t *valid = page_end() - 1;
+    struct md_columns columns = {time, sent, uncertainty, drive, reg, status, value, valid, 0, ROOM};
+    const struct md_field fields[] = {{0, MD_U16, 7, 8, 1, 10}, {1, MD_U16, 7, 9, 1, 1}};
+    struct md_completion completion = {
+        .result = 7, .sent_ns = 100, .first_ns = 130, .reply = {.data_len = 2, .data = {0, 3}}};
+    row = "columns";
+    *valid = 0xFF;
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2}, &completion, 1000) == 2);
+    CHECK(time[0] == 1100 && sent[0] == 100 && uncertainty[0] == 30 && drive[0] == 7 && reg[1] == 9);
+    CHECK(status[0] == 0 && value[0] == 0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
+    CHECK((*valid & 3) == 1);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2}, &completion, 1000) == 0 && columns.rows == 2);
+    completion = (struct md_completion){.result = MD_LINE_LOST, .begun_ns = 90};
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1}, &completion, 1000) == 1);
+    CHECK(sent[2] == 90 && status[2] == -MD_LINE_LOST && (*valid & 7) == 1);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1}, &completion, 1000) == 0 && columns.rows == ROOM);
+}
+
+static void check_spelling(void)
+{
+    static const uint16_t codes[] = {1, 0, 2, 1};
+    static const uint8_t names[] = "pumpfan"; /* "pump", "fan", "" */
+    static const int32_t offsets[] = {0, 4, 7, 7};
+    int32_t ends[5] = {9, 9, 9, 9, 9};
+    row = "spelling";
+    CHECK(md_spell(codes, 4, names, offsets, ends, page_end() - 10, 10) == 10);
+    CHECK(memcmp(page_end() - 10, "fanpumpfan", 10) == 0);
+    CHECK(ends[0] == 0 && ends[1] == 3 && ends[2] == 7 && ends[3] == 7 && ends[4] == 10);
+    for (size_t room = 0; room < 10; room++)
+        CHECK(md_spell(codes, 4, names, offsets, ends, page_end() - room, room) == -1);
+    CHECK(md_spell(codes, 0, names, offsets, ends, page_end(), 0) == 0 && ends[0] == 0);
+}
+
+int main(int argc, char **argv)
+{
+    if (argc != 2) {
+        fprintf(stderr, "usage: %s frames.csv\n", argv[0]);
+        return 2;
+    }
+    check_documents(argv[1]);
+    check_builders();
+    check_impossible_counts();
+    check_values();
+    check_columns();
+    check_spelling();
+    printf("%d checks, %d failures\n", checks, failures);
+    return failures != 0;
+}

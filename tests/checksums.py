@@ -1,0 +1,24 @@
+"""The three checksums, digit by digit as the documents describe them: not the library's own."""
+
+from __future__ import annotations
+
+
+def rtu(body: str | bytes) -> bytes:
+    """The frame with its CRC, bit by bit (INVT CHE manual, 11.6.3)."""
+    octets = bytes.fromhex(body) if isinstance(body, str) else body
+    crc = 0xFFFF
+    for octet in octets:
+        crc ^= octet
+        for _ in range(8):
+            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
+    return octets + crc.to_bytes(2, "little")
+
+
+def ascii(body: str) -> bytes:
+    """The frame with its LRC: what makes the sum of all octets 0 (INNOVERT IBD manual, appendix 2)."""
+    return f":{body}{-sum(bytes.fromhex(body)) & 0xFF:02X}\r\n".encode()
+
+
+def delixi(body: str) -> bytes:
+    """The frame with its sum (Delixi, part 3)."""
+    return f":{body}{sum(bytes.fromhex(body)) & 0xFF:02X}\r\n".encode()

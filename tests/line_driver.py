@@ -1,0 +1,71 @@
+"""One line's state machine on a clock that the test sets: times in, wishes out. No descriptor, no waiting."""
+
+from __future__ import annotations
+
+from multidrop._core import ffi, lib
+
+from multidrop.core import Completion, Completions, Exchange
+
+MS = 1_000_000
+
+
+class LineDriver:
+    """Carries exchanges out on a struct md_line; `now` is in ns and moves only when told."""
+
+    def __init__(self) -> None:
+        self.now = 1000 * MS
+        self._line = ffi.new("struct md_line *")
+        lib.md_line_init(self._line, self.now)
+        self.completions = Completions(1)
+        self.completions.count = 1
+
+    @property
+    def want(self) -> str:
+        return {lib.MD_DONE: "done", lib.MD_WRITE: "write", lib.MD_READ: "read"}[
+            lib.md_line_want(self._line, self.now)
+        ]
+
+    @property
+    def wake(self) -> int:
+        return int(self._line.wake_ns)
+
+    @property
+    def completion(self) -> Completion:
+        return self.completions[0]
+
+    @property
+    def still_open(self) -> int:
+        """Bytes that may yet turn out to be the beginning of the reply."""
+        return int(self._line.rx_len - self._line.rx_from)
+
+    def begin(self, exchange: Exchange) -> None:
+        self._exchange = exchange  # the line holds on to it
+        lib.md_line_begin(self._line, exchange.c, self.completions.c, self.now)
+
+    def take(self, most: int = 513) -> bytes:
+        """The port takes up to `most` bytes of what the line wants written."""
+        tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
+        lib.md_line_sent(self._line, len(tx), self.now)
+        return tx
+
+    def receive(self, data: bytes, piece: int = 4096) -> None:
+        for at in range(0, len(data), piece):
+            lib.md_line_received(self._line, data[at : at + piece], len(data[at : at + piece]), self.now)
+
+    def lose(self, error: int) -> None:
+        lib.md_line_lost(self._line, lib.MD_LINE_LOST, error)
+
+    def wait_until_write(self) -> bytes:
+        """Let the silence pass, as the engine does, and send the request."""
+        for _ in range(8):
+            if self.want == "write":
+                return self.take()
+            self.now = max(self.now, self.wake)
+        raise AssertionError("the line never wants to write")
+
+    def wait_until_done(self) -> None:
+        for _ in range(8):
+            if self.want == "done":
+                return
+            self.now = max(self.now, self.wake)
+        raise AssertionError("the exchange never ends")

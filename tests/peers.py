@@ -1,0 +1,33 @@
+"""Programs and modules that others wrote, to check ours against: missing, a test skips; in CI it fails."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+from types import ModuleType
+from typing import NoReturn
+
+import pytest
+
+
+def require_program(name: str) -> str:
+    """The program's path."""
+    path = shutil.which(name)
+    if path is None:
+        _missing(f"the program {name} is not installed")
+    return path
+
+
+def require_module(name: str) -> ModuleType:
+    """The module, imported; a dotted name is a module of a package."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError:
+        _missing(f"the Python module {name} is not installed")
+
+
+def _missing(reason: str) -> NoReturn:
+    if os.environ.get("CI"):
+        pytest.fail(f"{reason}, and CI must have it")
+    pytest.skip(reason)

@@ -1,0 +1,209 @@
+"""The command line as a whole: help, statuses, sentences; and `models`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from multidrop.cli import COMMANDS, main
+from multidrop.drives import MODELS
+
+TOY = f"{Path(__file__).parent}/toy.py:Toy"
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Status, output and errors of a command."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        status = main([str(word) for word in words])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def test_help_lists_every_command(run: Run) -> None:
+    status, out, err = run("--help")
+    assert (status, err) == (0, "")
+    assert all(f"\n  {name} " in out for name in COMMANDS)
+
+
+def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
+    assert run()[0] == 2
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_within_80_columns(
+    run: Run, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    status, out, err = run(name, "--help")
+    assert (status, err) == (0, "")
+    assert out.startswith(f"usage: multidrop {name} ")
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_help_imports_no_command_and_nothing_heavy() -> None:
+    code = "import sys; from multidrop.cli import main; main(['--help']); print('\\n'.join(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {
+        "multidrop.core",
+        "multidrop.drive",
+        "serial",
+        "nanoarrow",
+        "numpy",
+        "pyarrow",
+        "tomllib",
+    }
+    assert not {name for name in loaded if name.startswith("multidrop.cli.")}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["raed"], "there is no command 'raed'; did you mean read?"),
+        (["zzz"], "there is no command 'zzz'; see `multidrop --help`"),
+        (
+            ["read", "/dev/ttyX"],
+            "the following arguments are required: MODEL, ADDRESS; see `multidrop read --help`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "one"],
+            "argument ADDRESS: 'one' is not a number such as 1; see `multidrop read --help`",
+        ),
+        (["read", "/dev/ttyX", TOY, "99"], "address 99 is not one of TOY T1: 1 to 31"),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "output_curent"],
+            "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "control"],
+            f"control can only be written; see `multidrop models {TOY}`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--baudrate", "38400"],
+            "baud rate 38400 is not one of TOY T1: 9600, 19200",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--option", "rated"],
+            "argument --option: 'rated' is not NAME=VALUE with a number as its value; "
+            "see `multidrop read --help`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--option", "rated-frequency=5"],
+            "rated_frequency = 5.0 is outside 10 to 400 Hz",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "frequency", "60"],
+            "frequency = 60 is outside 0 to 50 Hz",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "frequency", "fast"],
+            "frequency takes a number in Hz, not 'fast'",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "output_current", "1"],
+            "output_current is not written: it is a reading",
+        ),
+        (["write", "/dev/ttyX", TOY, "1", "sealed", "1"], "sealed is not written: it is the maker's"),
+        (["write", "/dev/ttyX", TOY, "1", "frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
+        (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
+        (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
+        (
+            ["models", "innovert-ibt"],
+            "there is no model 'innovert-ibt'; did you mean innovert-ibd? (or write path/to/file.py:Class)",
+        ),
+    ],
+)
+def test_a_mistake_is_a_sentence_and_status_2(run: Run, words: list[str], sentence: str) -> None:
+    assert run(*words) == (2, "", f"multidrop: {sentence}\n")
+
+
+@pytest.mark.parametrize(
+    ("port", "sentence"),
+    [
+        ("/dev/no-such-port", "/dev/no-such-port: there is no such port"),
+        ("/dev/null", "/dev/null: it is not a serial port"),
+    ],
+)
+def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sentence: str) -> None:
+    assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
+
+
+# ---- models ----
+
+
+def test_models_lists_the_families(run: Run) -> None:
+    status, out, _ = run("models")
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()[1:-2]] == list(MODELS)
+    _, out, _ = run("models", "--json")
+    assert [family["model"] for family in json.loads(out)] == list(MODELS)
+
+
+def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
+    _, out, _ = run("models", TOY)
+    for line in (
+        "addresses     1-31",
+        "baud rates    9600, 19200 (the first is the default)",
+        "rtu formats   8N1, 8E1, 8O1, 8N2",
+        "verbs         start, stop, set-frequency, state",
+        "  02H  illegal address",
+        "  rated_frequency  rated frequency of the motor (10 to 400 Hz)",
+        "holding registers (read 03H, 10 at most; write 06H)",
+        "  0003H  mystery            reading  scale not stated",
+        "        the manual gives no scale",
+        "  000AH  acceleration_time  setting  0.1 s             0.1 to 600",
+        "        kept: EEPROM; only while stopped",
+        "        kept: not stated; never written: it is the maker's",
+        "        0 NONE, 1 OVERCURRENT",
+        "- the scale of `mystery`.",
+    ):
+        assert any(shown.startswith(line) for shown in out.splitlines()), f"{line!r} is not in\n{out}"
+
+
+def test_a_family_s_json_has_every_register(run: Run) -> None:
+    _, out, _ = run("models", TOY, "--json")
+    sheet = json.loads(out)
+    by_name = {register["name"]: register for register in sheet["registers"]}
+    assert len(by_name) == sheet["register_count"] == 9
+    assert by_name["acceleration_time"]["span"] == [0.1, 600]
+    assert by_name["fault"]["values"] == {"NONE": 0, "OVERCURRENT": 1}
+    assert by_name["mystery"]["step"] is None
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
+    _, out, _ = run("models", name)
+    too_wide = [line for line in out.splitlines() if len(line) > 80]
+    assert not too_wide
+    assert all(register in out for register in MODELS[name].registers)
+
+
+# ---- output that cannot be written ----
+
+
+def test_a_full_disk_under_the_output_is_a_sentence() -> None:
+    code = f"import sys; from multidrop.cli import main; sys.exit(main(['models', {TOY!r}]))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
+
+
+def test_a_reader_who_has_seen_enough_is_no_failure() -> None:
+    code = f"import sys; from multidrop.cli import main; sys.exit(main(['models', {TOY!r}]))"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert command.stdout is not None
+        command.stdout.close()
+        command.stdout = None
+        assert command.communicate()[1] == b""
+    assert command.returncode == 0

@@ -1,0 +1,166 @@
+"""Commands for one drive, carried out on a simulated one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+from test_cli import TOY, Run, run
+from toy import Status, Toy
+
+from multidrop.core import Message
+from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
+from multidrop.sim.memory import Cell
+from multidrop.sim.simulator import Simulator
+from multidrop.sim.wire import Wire
+
+__all__ = ["run"]  # a fixture
+
+
+class Stubborn(SimulatedDrive):
+    """Never takes more than 20 s of acceleration, and does not tell its fault."""
+
+    def accept(self, cell: Cell, raw: int) -> int:
+        return min(raw, 200) if cell.name == "acceleration_time" else super().accept(cell, raw)
+
+    def carry_out(self, request: Message) -> Message:
+        if request.function == 3 and request.start <= 4 < request.start + request.count:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().carry_out(request)
+
+
+@pytest.fixture
+def toy() -> SimulatedDrive:
+    return SimulatedDrive(Toy(1))
+
+
+@pytest.fixture
+def port(toy: SimulatedDrive) -> Iterator[str]:
+    """A line with two drives, at 1 and 2."""
+    toy["output_frequency"] = 49.9
+    toy["output_current"] = 3.25
+    toy["mystery"] = 777
+    toy["status"] = Status.RUNNING
+    toy["acceleration_time"] = 10.0
+    with Simulator([Wire([toy, Stubborn(Toy(2))], unpaced=True)]) as simulator:
+        yield simulator.wires[0].path
+
+
+def test_read_prints_all_readings_and_settings_with_units(run: Run, port: str) -> None:
+    assert run("read", port, TOY, 1) == (
+        0,
+        "output_frequency      49.9  Hz\n"
+        "output_current        3.25  A\n"
+        "mystery                777  (scale not stated)\n"
+        "fault                 NONE\n"
+        "status             RUNNING\n"
+        "acceleration_time     10.0  s\n"
+        "sealed                   0\n",
+        "",
+    )
+
+
+def test_read_prints_what_was_named_in_that_order(run: Run, port: str) -> None:
+    status, out, _ = run("read", port, TOY, 1, "output_current", "output_frequency")
+    assert (status, out) == (0, "output_current    3.25  A\noutput_frequency  49.9  Hz\n")
+
+
+def test_read_as_json(run: Run, port: str) -> None:
+    _, out, _ = run("read", port, TOY, 1, "output_current", "mystery", "fault", "status", "--json")
+    assert json.loads(out) == {
+        "drive": "toy@1",
+        "model": "toy",
+        "address": 1,
+        "values": {
+            "output_current": {"value": 3.25, "unit": "A"},
+            "mystery": {"value": None, "raw": 777},
+            "fault": {"value": "NONE", "raw": 0},
+            "status": {"value": ["RUNNING"], "raw": 1},
+        },
+    }
+
+
+def test_a_number_that_the_document_does_not_name_is_shown_as_such(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
+    for cell in toy.memory.of(Toy.fault):
+        cell.raw = 99
+    assert run("read", port, TOY, 1, "fault")[1] == "fault  99  (the document has no name for it)\n"
+    assert json.loads(run("read", port, TOY, 1, "fault", "--json")[1])["values"] == {
+        "fault": {"value": None, "raw": 99}
+    }
+
+
+def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str) -> None:
+    status, out, err = run("read", port, TOY, 2, "status", "fault")
+    assert (status, out) == (1, "status  none\nfault         refused: illegal address\n")
+    assert err == ""
+
+
+def test_write_prints_what_the_drive_then_holds(run: Run, port: str, toy: SimulatedDrive) -> None:
+    assert run("write", port, TOY, 1, "acceleration_time", "12.5") == (0, "acceleration_time = 12.5 s\n", "")
+    assert toy["acceleration_time"] == 12.5
+    assert run("write", port, TOY, 1, "control", "running|reverse") == (0, "control = RUNNING|REVERSE\n", "")
+    assert toy["control"] == 3
+
+
+def test_write_as_json(run: Run, port: str) -> None:
+    _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json")
+    assert json.loads(out) == {"drive": "toy@1", "register": "frequency", "value": 25.0, "unit": "Hz"}
+
+
+def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
+    assert run("write", port, TOY, 2, "acceleration_time", "30") == (
+        1,
+        "acceleration_time = 20.0 s\n",
+        "multidrop: toy@2 holds 20.0 s, not 30.0 s as it was told\n",
+    )
+
+
+def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None:
+    assert run("start", port, TOY, 1, "--direction", "reverse") == (
+        0,
+        "toy@1: start done; state: running\n",
+        "",
+    )
+    assert toy["control"] == 3
+    assert run("set-frequency", port, TOY, 1, "33.5")[0] == 0
+    assert toy["frequency"] == 33.5
+    assert run("stop", port, TOY, 1)[0] == 0
+    assert toy["control"] == 0
+
+
+def test_nothing_but_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+    run("state", port, TOY, 1)
+    run("read", port, TOY, 1)
+    assert not toy.counters.writes
+
+
+def test_state_in_words_and_as_json(run: Run, port: str) -> None:
+    assert run("state", port, TOY, 1) == (0, "running\n", "")
+    _, out, _ = run("state", port, TOY, 1, "--json")
+    assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}
+
+
+@pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
+def test_silence_is_a_sentence_that_says_what_to_check(
+    run: Run, port: str, words: tuple[object, ...]
+) -> None:
+    sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
+    assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
+
+
+def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
+    holder = (
+        "import serial, sys; port = serial.Serial(sys.argv[1], exclusive=True);"
+        "print('held', flush=True); sys.stdin.read()"
+    )
+    words = [sys.executable, "-c", holder, port]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        assert run("read", port, TOY, 1) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+        other.communicate()

@@ -1,0 +1,182 @@
+"""Every family: declarations that hold together, and no verb that does what its document forbids."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable
+from enum import Flag, IntFlag
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import multidrop.drives
+from multidrop.drive import VERBS, Drive
+from multidrop.drives import MODELS
+from multidrop.register import Carrier, Register, Wire
+
+FAMILIES = list(MODELS.values())
+
+family = pytest.mark.parametrize("family", FAMILIES, ids=lambda it: it.model)
+
+
+def registers(wanted: Callable[[Register[Any]], object] = lambda it: True) -> pytest.MarkDecorator:
+    """Runs a test for each register of each family that is wanted."""
+    found = [(family, it) for family in FAMILIES for it in family.registers.values() if wanted(it)]
+    ids = [f"{family.model}-{it.name}" for family, it in found]
+    return pytest.mark.parametrize(("family", "register"), found, ids=ids)
+
+
+def test_the_models_by_name() -> None:
+    assert list(MODELS) == [
+        "erman-er-g-220",
+        "invt-che",
+        "innovert-ibd",
+        "delixi-modbus",
+        "delixi-native",
+        "yd1000",
+    ]
+    assert all(name == it.model for name, it in MODELS.items())
+    assert len({it.title for it in FAMILIES}) == len(FAMILIES)
+
+
+@family
+def test_a_family_says_what_it_is(family: type[Drive]) -> None:
+    assert family.__doc__
+    assert len(family.__doc__) > 500
+    assert family.manual
+    assert family.title
+    assert family.watchdog
+    assert family(family.addresses[0]).name == f"{family.model}@{family.addresses[0]}"
+
+
+@family
+def test_a_register_is_not_called_as_a_verb_is(family: type[Drive]) -> None:
+    assert not set(family.registers) & set(VERBS)
+    assert not [name for name in family.registers if name in vars(Drive)]
+
+
+@family
+def test_verbs_have_docstrings(family: type[Drive]) -> None:
+    assert all(getattr(family, name).__doc__ for name in (*VERBS, "identify"))
+
+
+@family
+def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
+    places = [(it.table, it.address + at) for it in family.registers.values() for at in range(it.words)]
+    assert len(places) == len(set(places))
+
+
+@family
+def test_every_framing_has_its_formats(family: type[Drive]) -> None:
+    assert set(family.formats) == set(family.framings)
+    for framing in family.framings:
+        for format in family.formats[framing]:
+            for baudrate in family.baudrates:
+                drive = family(1, framing=framing, format=format, baudrate=baudrate)
+                assert drive.response_timeout > drive.response_delay
+
+
+@family
+def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None:
+    tables = {it.table for it in family.registers.values()}
+    assert {*family.most_registers, *family.readable_gaps} <= tables
+
+
+@registers()
+def test_a_register_says_where_it_comes_from(family: type[Drive], register: Register[Any]) -> None:
+    assert register.place or register.outside
+    assert family.registers[register.name] is register
+    assert getattr(family, register.name) is register
+
+
+@registers(lambda it: it.span)
+def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
+    family: type[Drive], register: Register[Any]
+) -> None:
+    assert register.span
+    low, high = register.span
+    step = float(register.scale)
+    assert register.decode(register.encode(low)) == low
+    assert register.decode(register.encode(high)) == high
+    for beyond in (low - step, high + step, math.nan, math.inf):
+        with pytest.raises(ValueError, match=register.name):
+            register.encode(beyond)
+
+
+@registers(lambda it: it.span and it.default is not None)
+def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
+    assert register.decode(register.encode(register.default)) == register.default
+
+
+@registers(lambda it: it.values)
+def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
+    assert register.values
+    for member in register.values:
+        assert register.decode(register.encode(member)) is member
+        assert register.parse(register.format(member)) == member
+    if issubclass(register.values, IntFlag):
+        known = sum(member.value for member in register.values)
+        bits = 16 if register.words == 1 else 32
+        for at in range(bits):
+            if not known >> at & 1:
+                with pytest.raises(ValueError, match="reserved"):
+                    register.encode(register.values(1 << at))
+    else:
+        with pytest.raises(TypeError, match=register.name):
+            register.encode(max(it.value for it in register.values) + 1)
+
+
+@registers(lambda it: it.never)
+def test_what_is_never_written_is_not_writable(family: type[Drive], register: Register[Any]) -> None:
+    assert not register.writable
+
+
+@registers(lambda it: it.broadcast)
+def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
+    for raw in register.broadcast:
+        assert family.broadcasts
+        value = register.decode(raw)
+        if isinstance(value, Flag):
+            assert {bit.name for bit in value} <= {"COMMAND_VALID", "FREQUENCY_VALID"}
+        else:
+            assert raw == 0 or value.name == "STOP"
+
+
+@registers(lambda it: it.step is None)
+def test_an_unknown_scale_is_not_written(family: type[Drive], register: Register[Any]) -> None:
+    assert not register.writable
+
+
+@registers(lambda it: not it.values)
+@settings(max_examples=20)
+@given(data=st.data())
+def test_a_raw_count_survives_its_value(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
+    low, high = (0, 1) if register.wire is Wire.BIT else (0, 0xFFFF)
+    if register.wire is Wire.I16:
+        low, high = -0x8000, 0x7FFF
+    if register.table.carrier is Carrier.LONG:
+        high = 0xFFFF_FFFF
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    raw = data.draw(st.integers(low, high))
+    value = register.decode(raw)
+    assert register.encode(value) == raw
+    assert register.format(value).startswith(f"{value:.{register.decimals}f}")
+
+
+def test_drives_import_what_they_may() -> None:
+    for path in Path(multidrop.drives.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            assert not isinstance(node, ast.Import) or all(
+                not it.name.startswith("multidrop") for it in node.names
+            )
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
+                room = node.module.split(".")[1]
+                assert room in {"drive", "register", "drives"}, f"{path.name} imports {node.module}"

@@ -1,0 +1,197 @@
+"""INVT CHE: its table (CHE100 manual v1.4), and what its verbs send."""
+
+from __future__ import annotations
+
+import pytest
+from scripts import Wire, rows, typed
+
+from multidrop.drive import Condition, Direction, DriveRefused, Refused, State, Unconfirmed, Unsupported
+from multidrop.drives.invt_che import CommunicationFault, Control, Fault, InvtCHE, Status, parameter
+from multidrop.register import HOLDING, Kept
+from multidrop.register import Wire as Lie
+
+FORWARD = "01 06 10 00 00 01 4C CA"
+STOP = "01 06 10 00 00 05 4D 09"
+COAST = "01 06 10 00 00 06 0D 08"
+RESET = "01 06 10 00 00 07 CC C8"
+HALF = "01 06 20 00 13 88 8F 5C"
+ZERO = "01 06 20 00 00 00 82 0A"
+
+STANDBY = {"status": Status.STANDBY, "fault": Fault.NONE}
+
+TABLE = """
+03/06 1000 control                - Control
+03/06 1001 status                 - Status
+03/06 2000 setpoint            0.01 %
+03/06 3000 output_frequency    0.01 Hz
+03/06 3001 reference_frequency 0.01 Hz
+03/06 3002 dc_bus_voltage         ? V
+03/06 3003 output_voltage         1 V
+03/06 3004 output_current       0.1 A
+03/06 3005 motor_speed            1 rpm
+03/06 3006 output_power         0.1 %
+03/06 3007 output_torque        0.1 %
+03/06 3008 pid_setpoint         0.1 %
+03/06 3009 pid_feedback         0.1 %
+03/06 300A inputs                 1
+03/06 300B outputs                1
+03/06 300C analog_input_1      0.01 V
+03/06 300D analog_input_2      0.01 V
+03/06 3010 pulse_frequency        ? kHz
+03/06 3012 stage                  1
+03/06 3013 length                 ?
+03/06 3014 counter                1
+03/06 3016 device                 - Device
+03/06 5000 fault                  - Fault
+03/06 5001 communication_fault    - CommunicationFault
+"""
+
+
+def test_the_registers_are_those_of_the_che100() -> None:
+    assert rows(InvtCHE) == typed(TABLE)
+    assert all(it.outside for it in InvtCHE.registers.values())
+    signed = {name for name, it in InvtCHE.registers.items() if it.wire is Lie.I16}
+    assert signed == {"setpoint", "output_power", "output_torque"}
+
+
+def test_numbers() -> None:
+    assert [(it.value, it.name) for it in Control] == [
+        (1, "FORWARD"),
+        (2, "REVERSE"),
+        (3, "JOG_FORWARD"),
+        (4, "JOG_REVERSE"),
+        (5, "STOP"),
+        (6, "COAST"),
+        (7, "RESET_FAULT"),
+        (8, "STOP_JOG"),
+    ]
+    assert [it.value for it in Fault] == list(range(24))
+    assert [it.value for it in CommunicationFault] == list(range(9))
+    assert Fault(18) is Fault.CE_COMMUNICATION
+    assert Fault(10) is Fault.UV_UNDERVOLTAGE
+
+
+def test_the_line_and_its_limits() -> None:
+    assert str(InvtCHE(247).settings) == "9600 8N1"
+    assert InvtCHE.most_registers == {HOLDING: 16}
+    assert set(InvtCHE.exceptions) == {1, 2, 3, 6, 0x10, 0x11, 0x12, 0x13}
+    assert "PC.04" in InvtCHE.watchdog
+    assert "PC.05" in InvtCHE.watchdog
+
+
+def test_start() -> None:
+    wire = Wire(InvtCHE(1), STANDBY)
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start()
+    assert wire.sent == [FORWARD, FORWARD]
+    wire.drive.start(Direction.REVERSE)
+    assert wire.sent[2].startswith("01 06 10 00 00 02")
+
+
+def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+    wire = Wire(InvtCHE(1), {"status": Status.REVERSE})
+    wire.drive.start()
+    wire.drive.jog()
+    assert [it[:17] for it in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
+
+
+def test_stop_waits_for_standby() -> None:
+    wire = Wire(InvtCHE(1), {"status": [Status.FORWARD, Status.FORWARD, Status.STANDBY]})
+    wire.drive.stop()
+    assert wire.sent == [STOP]
+    assert wire.reads == ["status"] * 3
+
+
+def test_a_jog_that_does_not_stop_is_stopped_as_one() -> None:
+    wire = Wire(InvtCHE(1, stop_time=20), {"status": Status.FORWARD})
+    with pytest.raises(Unconfirmed, match="20 s"):
+        wire.drive.stop()
+    assert wire.sent[0] == STOP
+    assert [it[:17] for it in wire.sent[1:]] == ["01 06 10 00 00 08"]
+
+
+def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
+    refusal = DriveRefused("drive", 1, "")
+    wire = Wire(InvtCHE(1), {"status": Status.FAULT}, {STOP: [refusal] * 3})
+    wire.drive.stop()
+    wire = Wire(InvtCHE(1), {"status": Status.FORWARD}, {STOP: [refusal] * 3})
+    with pytest.raises(DriveRefused):
+        wire.drive.stop()
+
+
+def test_coast_and_reset() -> None:
+    wire = Wire(InvtCHE(1), STANDBY)
+    wire.drive.coast()
+    wire.drive.reset_fault()
+    assert wire.sent == [COAST, RESET]
+    wire = Wire(InvtCHE(1), STANDBY, {RESET: [Unconfirmed("drive", "reset", "no reply")]})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [RESET]
+
+
+def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
+    wire = Wire(InvtCHE(1, maximum_frequency=80))
+    wire.drive.set_frequency(40)
+    wire.drive.set_frequency(0)
+    assert wire.sent == [HALF, ZERO]
+    for wrong in (-0.1, 80.1, float("nan")):
+        with pytest.raises(ValueError, match="0 to 80 Hz"):
+            wire.drive.set_frequency(wrong)
+    wire.says["setpoint"] = [30.0]
+    with pytest.raises(Unconfirmed, match=r"30\.00 %"):
+        wire.drive.set_frequency(40)
+    with pytest.raises(Refused, match="maximum_frequency"):
+        Wire(InvtCHE(1)).drive.set_frequency(40)
+
+
+def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
+    with pytest.raises(ValueError, match="0 to 100 %"):
+        InvtCHE.setpoint.encode(-1)
+
+
+@pytest.mark.parametrize(
+    ("says", "state"),
+    [
+        (STANDBY, State(Condition.STOPPED)),
+        ({"status": Status.FORWARD}, State(Condition.RUNNING, Direction.FORWARD)),
+        ({"status": Status.REVERSE}, State(Condition.RUNNING, Direction.REVERSE)),
+        (
+            {"status": Status.FAULT, "fault": Fault.OL1_MOTOR_OVERLOAD},
+            State(Condition.FAULT, fault="OL1_MOTOR_OVERLOAD"),
+        ),
+        ({"status": Status.FAULT, "fault": 99}, State(Condition.FAULT, fault="99")),
+        ({"status": 9}, State(Condition.UNKNOWN, note="1001H = 9 is not explained")),
+    ],
+)
+def test_state(says: dict[str, object], state: State) -> None:
+    assert Wire(InvtCHE(1), says).drive.state() == state
+
+
+def test_identify_refuses_what_is_no_che() -> None:
+    for device in (0x0101, 0x0102):
+        Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
+    with pytest.raises(Refused, match="010AH"):
+        Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
+
+
+def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
+    class Mine(InvtCHE):
+        """A CHE whose owner has its manual."""
+
+        acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
+        way = parameter(13, Status)
+
+    assert Mine.acceleration_time.ram_address == 0x800C  # as printed in section 11.6.4
+    assert Mine.acceleration_time.kept is Kept.EEPROM
+    assert Mine.acceleration_time.readable
+    assert parameter(58).address == 0x003A
+    assert Mine.way.decode(3) is Status.STANDBY
+    for wrong in (-1, 512):
+        with pytest.raises(ValueError, match="0 to 511"):
+            parameter(wrong)
+
+
+def test_there_is_no_emergency_stop() -> None:
+    with pytest.raises(Unsupported, match="emergency stop"):
+        Wire(InvtCHE(1)).drive.emergency_stop()

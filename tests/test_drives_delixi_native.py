@@ -1,0 +1,158 @@
+"""Delixi's own protocol: its tables, and what its verbs send. Frames as printed in part 3."""
+
+from __future__ import annotations
+
+import pytest
+from scripts import Wire, frame, rows, typed
+from test_drives_delixi_modbus import MONITORS
+
+from multidrop.drive import Condition, Direction, Framing, State, Unconfirmed, Unsupported
+from multidrop.drives.delixi_native import PARAMETER_RAM, DelixiNative, Status
+from multidrop.drives.delixi_parameters import Fault, parameter
+from multidrop.errors import NoReply
+from multidrop.register import Carrier, Kept, setting
+
+FORWARD = ":010200020000000005"  # printed
+FIFTY = ":0104000100001388A1"  # printed
+FIFTY_STORED = ":0106000200001388A4"  # printed
+STOP = ":010200010000000004"
+REVERSE = ":010200030000000006"
+RESET = ":010200040000000007"
+
+STANDING = {"status": Status.STOPPED, "output_frequency": 0.0}
+
+TABLE = """
+00/02 0000 control             - Control
+03/00 0000 status              - Status
+00/04 0001 frequency        0.01 Hz
+00/04 0007 pi_setpoint       0.1
+07/06 0002 stored_frequency 0.01 Hz
+"""
+
+
+def test_the_registers_are_those_of_part_3() -> None:
+    shared = "\n".join(f"07/06 {line}" for line in MONITORS.strip().splitlines())
+    assert rows(DelixiNative) == typed(TABLE + shared)
+
+
+def test_what_carries_a_value() -> None:
+    carriers = {it.table.write or it.table.read: it.table.carrier for it in DelixiNative.registers.values()}
+    assert carriers == {2: Carrier.NUMBER, 3: Carrier.NUMBER, 4: Carrier.LONG, 6: Carrier.LONG}
+    assert (PARAMETER_RAM.read, PARAMETER_RAM.write) == (7, 5)
+
+
+def test_the_line_and_its_limits() -> None:
+    assert DelixiNative(31).framing is Framing.DELIXI
+    assert DelixiNative.formats == {Framing.DELIXI: ("8N1", "8E1", "8O1")}
+    assert set(DelixiNative.exceptions) == {0xF0, 0xFC, 0xFD, 0xFE, 0xFF}
+    assert DelixiNative(1).needed_silence() == 0
+
+
+def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
+    broadcast = {name: it.broadcast for name, it in DelixiNative.registers.items() if it.broadcast}
+    assert broadcast == {"control": (1,)}
+
+
+def test_commands() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    wire.drive.set_frequency(50)
+    wire.drive.start()
+    wire.drive.start(Direction.REVERSE)
+    wire.drive.reset_fault()
+    wire.drive.stop()
+    assert wire.sent == [FIFTY, FORWARD, REVERSE, RESET, STOP]
+
+
+def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+    wire = Wire(DelixiNative(1), {"status": Status.REVERSE})
+    wire.drive.start()
+    wire.drive.start(Direction.FORWARD)
+    assert wire.sent == [REVERSE, FORWARD]
+
+
+def test_the_stored_setpoint() -> None:
+    drive = DelixiNative(1)
+    assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
+    assert DelixiNative.stored_frequency.kept is Kept.EEPROM
+    assert DelixiNative.frequency.kept is Kept.RAM
+
+
+def test_stop_waits_for_state_and_frequency() -> None:
+    wire = Wire(
+        DelixiNative(1),
+        {"status": [Status.REVERSE, Status.STOPPED], "output_frequency": [3.0, 0.0]},
+    )
+    wire.drive.stop()
+    assert wire.reads == ["status", "status", "output_frequency", "status", "output_frequency"]
+    wire = Wire(DelixiNative(1), {"status": Status.FORWARD})
+    with pytest.raises(Unconfirmed, match="60 s"):
+        wire.drive.stop()
+
+
+@pytest.mark.parametrize(
+    ("raw", "fault"),
+    [
+        (0x00, Fault.NONE),
+        (0x09, Fault.OL_OVERLOAD),
+        (0x0A, Fault.EF_EXTERNAL),
+        (0x0E, Fault.FLT_MODULE),
+        (0x10, Fault.EF_EXTERNAL),
+        (0x11, Fault.PARAMETER_WRITE),
+        (0x12, Fault.VFOP_VF1_CHANNEL_BROKEN),
+        (0x13, Fault.IFOP_VF2_CHANNEL_BROKEN),
+        (0x14, Fault.FLT_MODULE),
+        (0x0F, 0x0F),
+        (0x15, 0x15),
+    ],
+)
+def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> None:
+    decoded = DelixiNative.fault.decode(raw)
+    assert decoded == fault
+    assert isinstance(decoded, Fault) == isinstance(fault, Fault)
+
+
+@pytest.mark.parametrize(
+    ("says", "state"),
+    [
+        (STANDING, State(Condition.STOPPED)),
+        ({"status": Status.FORWARD, "output_frequency": 9.0}, State(Condition.RUNNING, Direction.FORWARD)),
+        ({"status": Status.REVERSE, "output_frequency": 9.0}, State(Condition.RUNNING, Direction.REVERSE)),
+        (
+            {"status": Status.FORWARD, "output_frequency": 0.0},  # never taken for stopped
+            State(Condition.RUNNING, Direction.FORWARD, note="output frequency 0"),
+        ),
+        (
+            {"status": Status.FAULT, "fault": Fault.OC_OVERCURRENT},
+            State(Condition.FAULT, fault="OC_OVERCURRENT"),
+        ),
+        ({"status": Status.UNDERVOLTAGE, "fault": Fault.NONE}, State(Condition.FAULT, fault="UNDERVOLTAGE")),
+        ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
+    ],
+)
+def test_state(says: dict[str, object], state: State) -> None:
+    assert Wire(DelixiNative(1), says).drive.state() == state
+
+
+def test_identify_is_a_read() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    wire.drive.identify()
+    assert (wire.reads, wire.sent) == (["output_frequency"], [])
+    with pytest.raises(NoReply):
+        Wire(DelixiNative(1), {"output_frequency": NoReply("drive")}).drive.identify()
+
+
+def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:
+    class Mine(DelixiNative):
+        """A Delixi whose owner has its list of parameters."""
+
+        acceleration_time = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
+
+    assert Mine.output_current.table is DelixiNative.output_current.table
+    assert frame(Mine(1), Mine.acceleration_time, 20).startswith(":01050011000000C8")
+    assert set(Mine.registers) - set(DelixiNative.registers) == {"acceleration_time"}
+
+
+@pytest.mark.parametrize("name", ["coast", "emergency_stop", "jog"])
+def test_what_the_document_does_not_have(name: str) -> None:
+    with pytest.raises(Unsupported, match="Delixi"):
+        getattr(Wire(DelixiNative(1)).drive, name)()

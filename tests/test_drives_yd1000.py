@@ -1,0 +1,298 @@
+"""YD1000: its table, and what its verbs send. The document prints no frames, but command words."""
+
+from __future__ import annotations
+
+import pytest
+from scripts import Wire, frame, rows, typed
+
+from multidrop.drive import Condition, Direction, DriveRefused, Refused, State, Unconfirmed
+from multidrop.drives.yd1000 import YD1000, Control, Inputs, Outputs, Status
+from multidrop.register import Kept
+
+FORWARD = "01 06 10 00 C4 00 DF CA"
+REVERSE = "01 06 10 00 C6 00 DE AA"
+STOP = "01 06 10 00 C0 00 DD 0A"
+EIGHTY = "01 06 10 01 1F 40 D5 0A"
+
+STANDING = {
+    "output_frequency": 0.0,
+    "deceleration_time": 10.0,
+    "fault_record_1": 0.0,
+    "maximum_frequency": 80.0,
+}
+
+# address, name, step and unit; default; changeable while running
+PARAMETERS = """
+0000 automatic_ramp            1            0    Y
+0001 automatic_torque_boost    1            0    N
+0002 automatic_environment     1            0    N
+0003 command_mode              1            1    Y
+0004 frequency_mode            1            2    Y
+0005 meter_selection           1            0    Y
+0006 meter_adjustment          ?            X    Y
+0007 initialisation            1            0    N
+0008 panel_direction           1            0    Y
+0009 acceleration_time       0.1 s         10.0  Y
+0010 deceleration_time       0.1 s         10.0  Y
+0011 maximum_frequency      0.01 Hz        80.0  N
+0012 upper_limit_frequency  0.01 Hz        80.0  Y
+0013 minimum_frequency      0.01 Hz         0.0  Y
+0014 base_frequency         0.01 Hz        60.0  Y
+0015 voltage_frequency_mode    1            0    N
+0016 torque_boost              ?            X    Y
+0017 thermal_protection        1            0    Y
+0018 preset_speed_1         0.01 Hz         0.0  Y
+0019 preset_speed_2         0.01 Hz         0.0  Y
+0020 preset_speed_3         0.01 Hz         0.0  Y
+0021 preset_speed_4         0.01 Hz         0.0  Y
+0022 preset_speed_5         0.01 Hz         0.0  Y
+0023 preset_speed_6         0.01 Hz         0.0  Y
+0024 preset_speed_7         0.01 Hz         0.0  Y
+0100 low_speed_frequency    0.01 Hz         0.0  Y
+0101 speed_reach_frequency  0.01 Hz         0.0  Y
+0102 speed_reach_band       0.01 Hz         2.5  Y
+0103 st_selection              1            1    Y
+0104 rst_selection             1            0    Y
+0110 always_on_function        1            0    Y
+0111 input_1_function          1            2    Y
+0112 input_2_function          1            3    Y
+0113 input_3_function          1           10    Y
+0114 input_4_function          1            6    Y
+0115 input_5_function          1            7    Y
+0130 output_1_function         1            4    Y
+0131 output_2_function         1            6    Y
+"""
+
+OTHERS = """
+03/06 0800 baudrate_setting         - Baudrate
+03/06 0801 parity_setting           - Parity
+03/06 0802 address_setting          1
+03/06 0803 communication_timeout    1 s
+03/06 1000 control                  - Control
+03/06 1001 frequency             0.01 Hz
+03/06 1002 panel_frequency       0.01 Hz
+03/06 1100 output_frequency      0.01 Hz
+03/06 1200 held_frequency        0.01 Hz
+03/06 1201 status                   - Status
+03/06 1202 reference_frequency   0.01 Hz
+03/06 1203 output_current        0.01 %
+03/06 1204 dc_bus_voltage        0.01 %
+03/06 1205 output_voltage        0.01 %
+03/06 1206 inputs                   - Inputs
+03/06 1207 outputs                  - Outputs
+03/06 1208 cpu_version              ?
+03/06 1209 eeprom_version           ?
+03/06 1210 fault_record_1           1
+03/06 1211 fault_record_2           1
+03/06 1212 fault_record_3           1
+03/06 1213 fault_record_4           1
+03/06 1214 run_hours                1 h
+"""
+
+
+def parameters() -> list[tuple[str, ...]]:
+    return [tuple(line.split()) for line in PARAMETERS.strip().splitlines()]
+
+
+def test_the_registers_are_those_of_sections_6_and_7() -> None:
+    basic = "\n".join(f"03/06 {' '.join(row[:-2])}" for row in parameters())
+    assert rows(YD1000) == typed(basic + OTHERS)
+
+
+@pytest.mark.parametrize("row", parameters(), ids=lambda row: row[1])
+def test_factory_settings_and_what_may_be_changed_while_running(row: tuple[str, ...]) -> None:
+    register = YD1000.registers[row[1]]
+    assert register.default == (None if row[-2] == "X" else float(row[-2]))
+    assert register.while_running == (row[-1] == "Y")
+    assert register.kept is Kept.EEPROM
+
+
+def test_spans() -> None:
+    spans = {name: it.span for name, it in YD1000.registers.items() if it.span}
+    assert spans["acceleration_time"] == spans["deceleration_time"] == (0.1, 3600)
+    assert spans["maximum_frequency"] == (30, 320)
+    assert spans["base_frequency"] == (25, 320)
+    assert spans["upper_limit_frequency"] == (0.5, 320)
+    assert [spans[f"input_{number}_function"] for number in range(1, 6)] == [(0, 37)] * 5
+    assert [spans[f"output_{number}_function"] for number in (1, 2)] == [(0, 9)] * 2
+    assert (spans["thermal_protection"], spans["automatic_environment"]) == ((0, 7), (0, 2))
+
+
+def test_ram_and_eeprom() -> None:
+    ram = {name for name, it in YD1000.registers.items() if it.kept is Kept.RAM}
+    assert ram == {"control", "frequency", "panel_frequency"}
+
+
+def test_what_is_never_written() -> None:
+    never = {it.address for it in YD1000.registers.values() if it.never}
+    assert never >= {0x0001, 0x0007, 0x0015, 0x0800, 0x0801, 0x0802, 0x0803}
+    assert never - {0x0001, 0x0007, 0x0015, 0x0800, 0x0801, 0x0802, 0x0803} == {0x0006, 0x0016}
+
+
+def test_bits() -> None:
+    assert {bit.name: bit.value.bit_length() - 1 for bit in Control} == {
+        "COMMAND_VALID": 15,
+        "FREQUENCY_VALID": 14,
+        "RESET": 13,
+        "EMERGENCY_STOP": 12,
+        "COAST": 11,
+        "RUN": 10,
+        "REVERSE": 9,
+        "JOG": 8,
+        "DC_BRAKE": 7,
+        "SECOND_RAMP": 6,
+        "PRESET_SPEED_1": 3,
+        "PRESET_SPEED_2": 2,
+        "PRESET_SPEED_3": 1,
+        "PRESET_SPEED_4": 0,
+    }
+    assert {bit.value.bit_length() - 1 for bit in Status} == {10, 9, 8, 7, 6}
+    assert [bit.name for bit in Inputs] == ["F", "R", "RST", "S1", "S2"]
+    assert Inputs.S1 | Inputs.F == 9  # the example of section 8.2
+    assert Outputs.OUT1 | Outputs.OUT2 == 3
+
+
+def test_reset_and_run_never_travel_together() -> None:
+    for turning in (Control.RUN, Control.JOG):
+        with pytest.raises(ValueError, match=r"RESET.* are never written together"):
+            YD1000.control.encode(Control.COMMAND_VALID | Control.RESET | turning)
+    with pytest.raises(ValueError, match="reserved"):
+        YD1000.control.encode(Control(0x8010))
+
+
+def test_the_line_and_its_limits() -> None:
+    drive = YD1000(63)
+    assert str(drive.settings) == "9600 8E1"
+    assert drive.needed_silence() == pytest.approx(24 * 11 / 9600)
+    assert drive.response_delay == pytest.approx(27.5e-3)
+    assert YD1000(1, baudrate=1200).response_delay == pytest.approx(0.22)
+    assert YD1000(1, baudrate=1200).response_timeout > 0.22
+    assert sorted(YD1000.baudrates) == [1200, 2400, 4800, 9600]
+    assert set(YD1000.formats[drive.framing]) == {"8N1", "8E1", "8O1"}
+    assert YD1000.most_registers == {}
+    assert "F803" in YD1000.watchdog
+
+
+@pytest.mark.parametrize(
+    ("word", "printed"),
+    [
+        (Control.COMMAND_VALID | Control.RUN, "01 06 10 00 84 00 EE 0A"),
+        (Control.COMMAND_VALID | Control.RUN | Control.REVERSE, "01 06 10 00 86 00 EF 6A"),
+        (Control.COMMAND_VALID, "01 06 10 00 80 00 EC CA"),
+        (Control.COMMAND_VALID | Control.EMERGENCY_STOP, "01 06 10 00 90 00 E1 0A"),
+        (Control.COMMAND_VALID | Control.COAST, "01 06 10 00 88 00 EB 0A"),
+        (Control.RESET, "01 06 10 00 20 00 94 CA"),
+        (Control(0), "01 06 10 00 00 00 8D 0A"),
+    ],
+)
+def test_words_without_bit_14(word: Control, printed: str) -> None:
+    assert frame(YD1000(1), YD1000.control, word) == printed
+
+
+def test_start() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    wire.drive.start()
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)
+    assert wire.sent == [FORWARD, FORWARD, REVERSE]
+
+
+def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+    wire = Wire(YD1000(1), {"output_frequency": 20.0, "status": Status.RUN | Status.REVERSE})
+    wire.drive.start()
+    assert wire.sent == [REVERSE]
+
+
+def test_jog_leaves_the_run_bit_off() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    wire.drive.jog()
+    wire.drive.jog(Direction.REVERSE)
+    assert [it[:17] for it in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
+
+
+def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
+    wire = Wire(YD1000(1), {**STANDING, "output_frequency": [20.0, 0.0, 3.0, 0.0, 0.0]})
+    wire.drive.stop()
+    assert wire.sent == [STOP]
+    assert wire.reads.count("output_frequency") == 5
+    wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
+    with pytest.raises(Unconfirmed, match="15 s"):
+        wire.drive.stop()
+    assert wire.sent == [STOP]
+
+
+def test_nothing_releases_the_command() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    for verb in (
+        wire.drive.start,
+        wire.drive.stop,
+        wire.drive.coast,
+        wire.drive.emergency_stop,
+        wire.drive.reset_fault,
+    ):
+        verb()
+    words = [int(text[12:17].replace(" ", ""), 16) for text in wire.sent]
+    assert all(word & 0xC000 == 0xC000 for word in words)
+
+
+def test_emergency_stop_is_taken_back_when_it_has_worked() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    wire.drive.emergency_stop()
+    assert [wire.sent[0][:17], *wire.sent[1:]] == ["01 06 10 00 D0 00", STOP]
+    wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
+    with pytest.raises(Unconfirmed):
+        wire.drive.emergency_stop()
+    assert wire.sent[-1] == STOP
+
+
+def test_coast() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    wire.drive.coast()
+    assert [it[:17] for it in wire.sent] == ["01 06 10 00 C8 00"]
+
+
+def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
+    reset = frame(YD1000(1), YD1000.control, Control(0xE000))
+    wire = Wire(YD1000(1), STANDING, {reset: [Unconfirmed("drive", "reset", "no reply")]})
+    wire.drive.reset_fault()
+    assert wire.sent == [reset, STOP]
+    assert wire.seconds >= 3
+    wire = Wire(YD1000(1), STANDING, {reset: [DriveRefused("drive", 4, "")]})
+    with pytest.raises(DriveRefused):
+        wire.drive.reset_fault()
+    with pytest.raises(Refused, match="runs"):
+        Wire(YD1000(1), {"output_frequency": 5.0}).drive.reset_fault()
+
+
+def test_the_setpoint() -> None:
+    wire = Wire(YD1000(1), STANDING)
+    wire.drive.set_frequency(80)
+    assert wire.sent == [EIGHTY]
+    with pytest.raises(ValueError, match=r"80\.5 Hz is above"):
+        wire.drive.set_frequency(80.5)
+    wire.says["frequency"] = [60.0]
+    with pytest.raises(Unconfirmed, match=r"60\.00 Hz"):
+        wire.drive.set_frequency(80)
+
+
+def test_state() -> None:
+    turning = {"output_frequency": 20.0, "status": Status.RUN}
+    assert Wire(YD1000(1), turning).drive.state() == State(Condition.RUNNING, Direction.FORWARD)
+    wire = Wire(YD1000(1), STANDING)
+    assert wire.drive.state().condition is Condition.STOPPED
+    wire.says["fault_record_1"] = [0x0A]
+    assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
+    assert wire.drive.state().condition is Condition.FAULT
+    wire.drive.reset_fault()
+    assert wire.drive.state().condition is Condition.STOPPED
+
+
+def test_identify() -> None:
+    says = {"address_setting": 5.0, "maximum_frequency": 80.0}
+    wire = Wire(YD1000(5), says)
+    wire.drive.identify()
+    assert wire.sent == []
+    with pytest.raises(Refused, match="0802H"):
+        Wire(YD1000(6), says).drive.identify()
+    with pytest.raises(Refused, match="0011H"):
+        Wire(YD1000(5), {**says, "maximum_frequency": 0.1}).drive.identify()

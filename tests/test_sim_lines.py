@@ -1,0 +1,198 @@
+"""Simulated lines for real: ptys and TCP ports, opened by a client that knows nothing of the simulator."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import checksums
+import pytest
+
+from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.erman_er_g_220 import ErmanERG220
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import EncodedDrive, Simulator, Wire, encoded, serve, simulated
+
+PATIENCE = 5.0  # s until a reply that should come is given up; never waited for when all is well
+READ = Message(1, 0x03, 0x3000, 2)  # of a CHE
+
+
+def wire(*, unpaced: bool = True, port: str = "pty") -> Wire:
+    return Wire([EncodedDrive(InvtCHE(1))], unpaced=unpaced, port=port)
+
+
+def expected(address: int = 1) -> bytes:
+    table = InvtCHE.output_frequency.table
+    return b"".join(encoded(address, table, at).to_bytes(2) for at in (0x3000, 0x3001))
+
+
+@contextmanager
+def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
+    """A descriptor, as a client has it."""
+    if path.startswith("socket://"):
+        host, _, port = path.removeprefix("socket://").partition(":")
+        with socket.create_connection((host, int(port))) as client:
+            yield client.fileno()
+        return
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        set_settings(fd, baudrate, "8N1")
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
+    heard = b""
+    while len(heard) < length and select.select([fd], [], [], patience)[0]:
+        heard += os.read(fd, 1024)
+    return heard
+
+
+def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Message:
+    os.write(fd, build_request(framing, request))
+    heard = receive(fd, reply_length(framing, request))
+    used, reply = parse_reply(framing, heard, request)
+    assert used == len(heard)
+    assert reply is not None
+    return reply
+
+
+def descriptors() -> int:
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+@pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"])
+@pytest.mark.parametrize("unpaced", [True, False], ids=["unpaced", "paced"])
+def test_a_line_is_read_and_opened_again(port: str, unpaced: bool) -> None:
+    with Simulator([wire(port=port, unpaced=unpaced)]) as sim:
+        for _ in range(3):
+            with opened(sim.wires[0].path) as fd:
+                assert exchange(fd, READ).data == expected()
+            time.sleep(0.005)  # the silence that a client owes a paced line
+
+
+def test_nothing_is_left_behind() -> None:
+    before = descriptors(), threading.active_count()
+    for port in ("pty", "socket://127.0.0.1:0"):
+        with Simulator([wire(port=port), wire()]) as sim:
+            with opened(sim.wires[0].path) as fd:
+                exchange(fd, READ)
+            assert threading.active_count() == before[1] + 1
+    assert (descriptors(), threading.active_count()) == before
+
+
+def test_many_lines_are_one_thread() -> None:
+    wires = [Wire([EncodedDrive(InvtCHE(at))], unpaced=True) for at in range(1, 65)]
+    before = threading.active_count()
+    with Simulator(wires) as sim:
+        assert threading.active_count() == before + 1
+        for at, it in enumerate(sim.wires, 1):
+            with opened(it.path) as fd:
+                assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)
+
+
+def test_a_paced_reply_takes_at_least_its_time_on_the_wire() -> None:
+    with Simulator([wire(unpaced=False)]) as sim, opened(sim.wires[0].path) as fd:
+        begin = time.monotonic()
+        exchange(fd, READ)
+        taken = time.monotonic() - begin
+    delay = sim.wires[0].drives[0].delay
+    assert taken >= (8 + 9) * 10 / 9600 + delay  # never early; how late is the machine's business
+
+
+def test_the_next_tcp_client_is_served_when_the_first_has_gone() -> None:
+    with Simulator([wire(port="socket://127.0.0.1:0")]) as sim, ExitStack() as clients:
+        path = sim.wires[0].path
+        with opened(path) as first:
+            exchange(first, READ)
+            second = clients.enter_context(opened(path))
+            os.write(second, build_request(Framing.RTU, READ))
+            assert receive(second, 1, patience=0.05) == b""
+        assert parse_reply(Framing.RTU, receive(second, 9), READ)[0] == 9
+
+
+def test_two_framings_answer_on_one_line() -> None:
+    drives = [
+        EncodedDrive(InvtCHE(1)),
+        simulated(InnovertIBD(2, framing="ascii")),
+        simulated(DelixiNative(3)),
+    ]
+    with Simulator([Wire(drives, unpaced=True)]) as sim, opened(sim.wires[0].path) as fd:
+        assert exchange(fd, READ).data == expected()
+        assert exchange(fd, Message(2, 3, 22, 1), Framing.ASCII).data == b"\x18\x00"
+        assert exchange(fd, Message(3, 3, data=bytes(4)), Framing.DELIXI).start == 1
+        assert exchange(fd, READ).data == expected()
+
+
+def test_a_client_at_another_baud_rate_is_not_heard() -> None:
+    drives = [EncodedDrive(InvtCHE(1)), simulated(ErmanERG220(2))]  # 9600 and 38400
+    state = Message(2, 4, 0x0400, 4)
+    with Simulator([Wire(drives, unpaced=True)]) as sim:
+        path = sim.wires[0].path
+        with opened(path, 38400) as fd:
+            os.write(fd, build_request(Framing.RTU, READ))
+            assert receive(fd, 1, patience=0.05) == b""
+            assert exchange(fd, state).data == bytes(8)
+            set_settings(fd, 9600, "8N1")
+            assert exchange(fd, READ).data == expected()
+            os.write(fd, build_request(Framing.RTU, state))
+            assert receive(fd, 1, patience=0.05) == b""
+
+
+def test_garbage_then_a_good_frame() -> None:
+    with Simulator([wire()]) as sim, opened(sim.wires[0].path) as fd:
+        for garbage in (b"\x00", bytes(range(256)), b":::" * 2000, b"\xff" * 5000):
+            os.write(fd, garbage)
+            time.sleep(0.03)  # more than the silence that ends a frame on an unpaced wire
+            assert exchange(fd, READ).data == expected()
+
+
+def test_an_unknown_function_is_answered_when_silence_has_ended_it() -> None:
+    with Simulator([Wire([simulated(ErmanERG220(1))])]) as sim, opened(sim.wires[0].path, 38400) as fd:
+        os.write(fd, checksums.rtu("01 2B"))
+        assert receive(fd, 5) == checksums.rtu("01 AB 01")
+
+
+def test_a_pty_can_have_a_name(tmp_path: Path) -> None:
+    link = tmp_path / "hall-1"
+    with Simulator([wire(port=str(link))]) as sim:
+        assert sim.wires[0].path == str(link)
+        with opened(str(link)) as fd:
+            assert exchange(fd, READ).data == expected()
+        with pytest.raises(FileExistsError), Simulator([wire(), wire(port=str(link))]):
+            pass
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("url", ["socket://127.0.0.1", "socket://:5020"])
+def test_a_tcp_port_needs_host_and_port(url: str) -> None:
+    with pytest.raises(ValueError, match=r"socket://host:port, such as"), Simulator([wire(port=url)]):
+        pass
+
+
+def _serve(connection: Connection) -> None:
+    serve([wire()], lambda simulator: connection.send(simulator.wires[0].path))
+
+
+def test_a_line_in_another_process() -> None:
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
+    process.start()
+    try:
+        assert ours.poll(60)
+        with opened(ours.recv()) as fd:
+            assert exchange(fd, READ).data == expected()
+    finally:
+        process.terminate()
+        process.join()

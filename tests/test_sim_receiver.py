@@ -1,0 +1,133 @@
+"""Cutting requests out of what is heard; frames are the documents' own."""
+
+import random
+
+import checksums
+import pytest
+
+from multidrop.core import Framing
+from multidrop.sim.receiver import Frame, Receiver
+
+CHARACTER = 1e-3
+GAP = 3.5e-3
+
+READ = bytes.fromhex("01 03 00 01 00 04 15 C9")  # ERMAN, section 6
+WRITE = bytes.fromhex("01 10 00 0C 00 02 04 00 C8 01 90 73 F8")  # ERMAN, section 7
+RUN = b":010620000012C7\r\n"  # Delixi, part 2
+NATIVE = b":010200020000000005\r\n"  # Delixi, part 3
+
+
+def receiver_rtu() -> Receiver:
+    return Receiver(Framing.RTU, CHARACTER, GAP)
+
+
+def functions(frames: list[Frame]) -> list[int]:
+    return [frame.function for frame in frames if frame.message]
+
+
+def test_a_frame_has_the_times_of_its_first_and_last_bit() -> None:
+    (frame,) = receiver_rtu().feed(READ, 10.0)
+    assert frame.message is not None
+    assert (frame.begin, frame.end) == pytest.approx((10.0, 10.008))
+
+
+def test_a_frame_in_pieces_without_a_gap_is_one_frame() -> None:
+    receiver = receiver_rtu()
+    assert receiver.feed(WRITE[:5], 10.0) == []
+    (frame,) = receiver.feed(WRITE[5:], 10.005)
+    assert frame.begin == pytest.approx(10.0)
+    assert frame.end == pytest.approx(10.013)
+
+
+def test_bytes_that_come_faster_than_the_wire_carries_them_are_queued_on_it() -> None:
+    receiver = receiver_rtu()
+    receiver.feed(WRITE[:5], 10.0)
+    (frame,) = receiver.feed(WRITE[5:], 10.001)
+    assert frame.end == pytest.approx(10.013)
+
+
+def test_a_gap_within_a_frame_spoils_it() -> None:
+    receiver = receiver_rtu()
+    receiver.feed(READ[:4], 10.0)
+    assert functions(receiver.feed(READ[4:], 10.004 + GAP + 1e-4)) == []
+    assert functions(receiver.feed(READ, 11.0)) == [3]
+
+
+def test_garbage_then_a_good_frame() -> None:
+    assert functions(receiver_rtu().feed(b"\x55\x00\xff" + READ, 0.0)) == [3]
+
+
+def test_garbage_that_promises_a_long_frame_does_not_swallow_the_next() -> None:
+    promise = bytes.fromhex("01 10 00 00 00 7B F6")  # 246 more bytes
+    assert functions(receiver_rtu().feed(promise + READ, 0.0)) == [3]
+
+
+def test_two_frames_at_once() -> None:
+    assert functions(receiver_rtu().feed(READ + WRITE, 0.0)) == [3, 16]
+
+
+def test_a_frame_that_only_looks_like_one_within_another_does_not_count() -> None:
+    """A write of twelve registers that hold a whole good request, cut after it."""
+    whole = checksums.rtu(bytes.fromhex("01 10 00 00 00 0C 18") + READ + bytes(16))
+    receiver = receiver_rtu()
+    frames = receiver.feed(whole[:20], 0.0) + receiver.feed(whole[20:], 0.02)
+    assert functions(frames) == [16]
+
+
+def test_a_bad_checksum_is_seen_when_the_frame_has_ended() -> None:
+    receiver = receiver_rtu()
+    bad = bytes.fromhex("01 04 00 01 00 05 15 C9")  # ERMAN, section 6: misprinted
+    assert receiver.feed(bad, 0.0) == []
+    assert receiver.silent_at == pytest.approx(0.008 + GAP)
+    (frame,) = receiver.silence(1.0)
+    assert (frame.intact, frame.message, frame.body) == (False, None, bad[:-2])
+    assert receiver.silent_at is None
+
+
+def test_an_unknown_function_ends_by_silence() -> None:
+    receiver = receiver_rtu()
+    assert receiver.feed(checksums.rtu("01 2B"), 0.0) == []
+    assert receiver.silence(0.004 + GAP / 2) == []
+    (frame,) = receiver.silence(1.0)
+    assert (frame.intact, frame.message, frame.address, frame.function) == (True, None, 1, 0x2B)
+
+
+@pytest.mark.parametrize(("framing", "text"), [(Framing.ASCII, RUN), (Framing.DELIXI, NATIVE)])
+def test_text_frames(framing: Framing, text: bytes) -> None:
+    receiver = Receiver(framing, CHARACTER, 1.0)
+    assert receiver.feed(text[:7], 0.0) == []
+    (frame,) = receiver.feed(text[7:], 0.5)
+    assert frame.message is not None
+    assert frame.address == 1
+
+
+def test_a_colon_begins_anew() -> None:
+    assert functions(Receiver(Framing.ASCII, CHARACTER, 1.0).feed(b"\xff:0106:01" + RUN, 0.0)) == [6]
+
+
+def test_text_with_a_wrong_checksum_is_a_damaged_frame() -> None:
+    (frame,) = Receiver(Framing.DELIXI, CHARACTER, 10e-3).feed(NATIVE.replace(b"05\r", b"06\r"), 0.0)
+    assert (frame.intact, frame.message, frame.address) == (False, None, 1)
+
+
+@pytest.mark.parametrize(
+    "text", [b":\r\n", b":0\r\n", b":01\r\n", b":0101\n", b"\n", b":XX0620\r\n", b"::\n"]
+)
+def test_scraps_of_text_are_nothing(text: bytes) -> None:
+    assert Receiver(Framing.ASCII, CHARACTER, 1.0).feed(text, 0.0) == []
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+def test_anything_at_all_is_survived_within_bounds(framing: Framing) -> None:
+    randomness = random.Random(1)
+    good = {Framing.RTU: READ, Framing.ASCII: RUN, Framing.DELIXI: NATIVE}[framing]
+    receiver = Receiver(framing, CHARACTER, GAP)
+    now = 0.0
+    for _ in range(300):
+        chunk = randomness.choice([randomness.randbytes(randomness.randrange(1, 60)), good[:-3], b":" * 99])
+        receiver.feed(chunk, now)
+        now += randomness.choice([0.0, 0.01])
+        assert len(receiver._buffer) <= 1024
+    now += 1000
+    receiver.silence(now)
+    assert len(functions(receiver.feed(good, now))) == 1
