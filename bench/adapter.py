@@ -6,7 +6,7 @@ import select
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,21 +14,21 @@ import numpy
 import pyarrow
 import pyarrow.compute
 from jobs import REGISTERS, Job, expected
-from played import Played, Unpaced
+from played import Played
 
 from multidrop.batch import Batch, Row
-from multidrop.bus import exchange
-from multidrop.core import Block, Columns, Completions, Field, Message
-from multidrop.line import Line
+from multidrop.core import Block, Columns, Field, new_completion
 from multidrop.plant import load_plant
-from multidrop.poller import CHUNK_ROWS, Poller
+from multidrop.poller import Poller
 from multidrop.recording import open_writer
+
+BATCH_ROWS = 1 << 14
 
 
 def silence(baudrate: int) -> float:
-    """Seconds that multidrop keeps between two exchanges with the played drives."""
-    request = Message(1, 3, 0, REGISTERS)
-    return exchange(Played(1, baudrate=baudrate), request).silence_ns / 1e9
+    """Seconds that multidrop keeps between two exchanges: one bit more, for a second stop bit."""
+    drive = Played(1, baudrate=baudrate)
+    return drive.needed_silence() + drive.settings.bit
 
 
 def _plant_text(job: Job) -> str:
@@ -96,22 +96,23 @@ def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
     return good, numpy.concatenate(late) / 1e6
 
 
-def decoder(job: Job) -> Callable[[], Batch]:
-    """Asks every drive once, and gives what decodes these replies into a new batch, again and again."""
-    drives = [Unpaced(address) for address in range(1, job.drives + 1)]
-    registers = list(Unpaced.registers.values())
-    completions = Completions(len(drives))
-    with closing(Line(job.port)) as line:
-        line.run([exchange(it, Message(it.address, 3, 0, REGISTERS)) for it in drives], completions)
-    wires = [Field(register.address, register.wire, 0, register.address, 1, 1) for register in registers]
-    blocks = [Block([field._replace(drive=at) for field in wires]) for at in range(len(drives))]
-    names = [f"drive-{it.address}" for it in drives], [register.name for register in registers]
+def decoder(drives: int) -> Callable[[], Batch]:
+    """What decodes one reply of each drive in turn, again and again, until a new batch is full."""
+    registers = list(Played.registers.values())
+    replies = []
+    for address in range(1, drives + 1):
+        fields = [Field(it.address, it.wire, address - 1, it.address, 1, 10) for it in registers]
+        data = b"".join(value.to_bytes(2, "big") for value in expected(address))
+        found = new_completion()
+        found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
+        found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
+        replies.append((Block(fields), found))
+    names = [f"drive-{address}" for address in range(1, drives + 1)], [it.name for it in registers]
 
     def decode() -> Batch:
-        columns = Columns(CHUNK_ROWS)
-        for turn in range(CHUNK_ROWS // REGISTERS):
-            at = turn % len(blocks)
-            columns.add(blocks[at], completions, at, 0)
+        columns = Columns(BATCH_ROWS)
+        for turn in range(BATCH_ROWS // REGISTERS):
+            columns.add(*replies[turn % drives], 0)
         return Batch(columns, *names)
 
     return decode

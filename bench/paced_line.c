@@ -241,6 +241,9 @@ static int open_tcp(void)
         exit(1);
     printf("socket://127.0.0.1:%d\n", ntohs(at.sin_port));
     fflush(stdout);
+    struct pollfd ready[2] = {{.fd = listener, .events = POLLIN}, {.fd = 0, .events = POLLIN}};
+    if (poll(ready, 2, -1) < 0 || ready[1].revents)
+        exit(1);
     int fd = accept4(listener, NULL, NULL, SOCK_NONBLOCK);
     setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &yes, sizeof yes);
     return fd;

@@ -1,6 +1,6 @@
 """Decoding, batches and writing to disk: values per second, and CPU per value.
 
-The replies are real ones, of one run on a line without waits, and are decoded anew for every batch.
+The same 16 replies of 10 registers are decoded anew for every batch.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from tempfile import TemporaryDirectory
 
 import adapter
 import tables
-from jobs import Job
-from programs import paced_line
 
 
 def cpu_seconds() -> float:
@@ -31,8 +29,7 @@ def main() -> None:
     arguments = parser.parse_args()
     tables.heading(f"{arguments.values} values decoded and recorded, {arguments.slices} times.")
 
-    with paced_line(baudrate=0) as line:
-        decode = adapter.decoder(Job(line.path, 0, 0))
+    decode = adapter.decoder(drives=16)
     rows = []
     with TemporaryDirectory(dir=arguments.out) as directory:
         for suffix in arguments.suffixes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import closing
 from ctypes import CDLL
 from typing import Any
 
@@ -11,28 +12,40 @@ import pytest
 from multidrop.core import (
     Block,
     Columns,
-    Completions,
     Exchange,
     Field,
     Framing,
     Message,
     Port,
+    Respondent,
     Wire,
     build_request,
     crc16,
+    new_completion,
     parse_reply,
     set_settings,
 )
+from multidrop.line import await_notice
 
 EXCHANGES = 256
 READ_TEN = Message(1, 3, 0, 10)
 REPLY = bytes.fromhex("010308010001F401F4003225C4")  # ERMAN ER-G-220, section 6, FC03
 
 
+TEN_VALUES = Block([Field(at, Wire.U16, 0, at, 1, 10) for at in range(10)])
+
+
 def unhurried(request: Message) -> Exchange:
     """An exchange that waits for nothing: what is left is the host's own cost."""
     return Exchange(
-        Framing.RTU, request, baudrate=115200, format="8N1", character=0.0, silence=0.0, timeout=1.0
+        Framing.RTU,
+        request,
+        Respondent(least_timeout=1, most_timeout=1),
+        baudrate=115200,
+        format="8N1",
+        character=0.0,
+        silence=0.0,
+        block=TEN_VALUES,
     )
 
 
@@ -60,28 +73,40 @@ def fd(responder: str) -> Any:
     os.close(opened)
 
 
-def test_256_exchanges(benchmark: Any, fd: int) -> None:
-    port = Port(fd, -1)
-    exchanges, completions = [unhurried(READ_TEN)] * EXCHANGES, Completions(EXCHANGES)
-    assert benchmark(port.run, exchanges, completions) == EXCHANGES
-    assert all(completion.result == 25 for completion in completions)
+def carry_out(port: Port, exchanges: list[Exchange], columns: Columns) -> None:
+    """Queue them all, and collect their rows as the poller does."""
+    columns.clear()
+    port.submit(exchanges, [0] * len(exchanges))
+    left = len(exchanges)
+    while left:
+        await_notice(0.02)
+        left -= port.reap(columns, 0)
+
+
+def test_256_exchanges_and_their_2560_values(benchmark: Any, fd: int) -> None:
+    columns = Columns(10 * EXCHANGES)
+    with closing(Port(fd, -1, room=EXCHANGES)) as port:
+        benchmark(carry_out, port, [unhurried(READ_TEN)] * EXCHANGES, columns)
+    assert set(columns.array("status")) == {0}
+    assert columns.array("value")[0] == 0x0304 / 10
 
 
 def test_256_exchanges_of_a_bare_c_loop(benchmark: Any, fd: int, bare: CDLL) -> None:
     assert benchmark(bare.bare_exchanges, fd, EXCHANGES) == EXCHANGES
 
 
-def test_decode_2560_values(benchmark: Any, fd: int) -> None:
-    completions = Completions(EXCHANGES)
-    Port(fd, -1).run([unhurried(READ_TEN)] * EXCHANGES, completions)
-    block = Block([Field(at, Wire.U16, 0, at, 1, 10) for at in range(10)])
+def test_decode_ten_values(benchmark: Any, fd: int) -> None:
+    found = new_completion()
+    with closing(Port(fd, -1)) as port:
+        reply = port.carry_out(unhurried(READ_TEN)).reply
+    found.result, found.sent_ns, found.first_ns = 25, 1, 2
+    found.reply.data_len = len(reply.data)
+    found.reply.data[0 : len(reply.data)] = list(reply.data)
+    columns = Columns(10)
 
-    def decode() -> Columns:
-        columns = Columns(10 * EXCHANGES)
-        for at in range(EXCHANGES):
-            columns.add(block, completions, at, 0)
-        return columns
+    def decode() -> None:
+        columns.clear()
+        columns.add(TEN_VALUES, found, 0)
 
-    columns = benchmark(decode)
-    assert len(columns) == 10 * EXCHANGES
+    benchmark(decode)
     assert columns.array("value")[0] == 0x0304 / 10

@@ -1,15 +1,74 @@
-/* Lines driven on descriptors: the only file of the core that waits, reads and writes. */
+/* The thread that runs every line of the process. It never takes the interpreter lock.
+ *
+ * Exchanges come to a port through a ring, are carried out in its slots, and are reaped from them:
+ * each of the ring's counters has one writer, and nothing is copied. An urgent exchange goes ahead
+ * of the ring, and whoever wants it waits for it. */
 #define _GNU_SOURCE
 #include "multidrop.h"
 
 #include <errno.h>
-#include <poll.h>
+#include <pthread.h>
 #include <stdatomic.h>
+#include <stdlib.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/prctl.h>
 #include <time.h>
 #include <unistd.h>
-#ifdef __linux__
-#include <sys/prctl.h>
-#endif
+
+enum {
+    EVENTS = 256,           /* taken from epoll at a time */
+    WORTH_BLINDNESS = 200000 /* ns; a shorter wait is not worth the system calls to look away */
+};
+static const int64_t NEVER = INT64_MAX;
+static const int64_t RETRY_WRITE_NS = 1000000;
+
+struct slot {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns;
+    struct md_completion completion;
+};
+
+/* An urgent exchange; it lives where its caller waits. */
+struct wish {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns, expires_ns;
+    struct md_completion *completion;
+    struct wish *next;
+    int done;
+};
+
+struct md_port {
+    struct md_engine *engine;
+    unsigned index; /* among the engine's ports */
+    int fd, must_take;
+    struct md_settings settings; /* in force; baudrate 0: not yet set */
+    struct md_line line;
+
+    struct slot *slots;
+    unsigned room; /* a power of two */
+    atomic_uint submitted, done, reaped;
+    atomic_int idle;    /* the thread waits to be told of more */
+    struct wish *wishes;
+
+    struct slot *slot; /* under way, or */
+    struct wish *wish; /* under way */
+    int blind;         /* nothing is worth reading before the port's waking time */
+    int watched;       /* epoll tells when it can be read */
+    atomic_int lost;   /* errno + 1 of the failure after which nothing can be carried out */
+    int closing, closed;
+};
+
+struct md_engine {
+    pthread_t thread;
+    pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the wishes */
+    pthread_cond_t changed; /* a wish was granted, a port closed */
+    int epoll, bell, notice;
+    struct md_port **ports;
+    int64_t *wakes; /* when each port wants to be looked at, whatever happens */
+    unsigned count, room;
+    int stopping;
+};
 
 int64_t md_now_ns(void)
 {
@@ -18,30 +77,34 @@ int64_t md_now_ns(void)
     return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
 }
 
-void md_port_init(struct md_port *port, int fd, int must_take)
+static void ring(int eventfd)
 {
-    *port = (struct md_port){.fd = fd, .must_take = must_take};
-    md_line_init(&port->line, md_now_ns());
+    uint64_t one = 1;
+    (void)!write(eventfd, &one, sizeof one);
 }
 
-void md_port_yield(struct md_port *port, int yield_now)
+static void silence(int eventfd)
 {
-    atomic_store((_Atomic int *)&port->yield_now, yield_now);
+    uint64_t count;
+    (void)!read(eventfd, &count, sizeof count);
 }
 
-/* Wait for the descriptor or the time: is there something to do? Its errors show when it is read. */
-static int wait_for(int fd, short events, int64_t until_ns)
+/* ---- one port, on the engine's thread ---- */
+
+static void watch(struct md_port *port, int watched)
 {
-    struct pollfd pollfd = {.fd = fd, .events = events};
-    int64_t left = until_ns - md_now_ns();
-    if (left < 0)
-        left = 0;
-#ifdef __linux__
-    struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
-    return ppoll(&pollfd, 1, &span, NULL) > 0;
-#else
-    return poll(&pollfd, 1, (int)(left / 1000000)) > 0;
-#endif
+    if (port->watched == watched || port->lost)
+        return;
+    struct epoll_event event = {.events = watched ? EPOLLIN : 0, .data.ptr = port};
+    epoll_ctl(port->engine->epoll, EPOLL_CTL_MOD, port->fd, &event);
+    port->watched = watched;
+}
+
+static void lose(struct md_port *port, int error)
+{
+    port->lost = error + 1;
+    epoll_ctl(port->engine->epoll, EPOLL_CTL_DEL, port->fd, NULL); /* a port that hung up is ready for ever */
+    md_line_abandon(&port->line, MD_LINE_LOST, error);
 }
 
 static int is_transient(int error)
@@ -49,74 +112,389 @@ static int is_transient(int error)
     return error == EAGAIN || error == EWOULDBLOCK || error == EINTR;
 }
 
-static void pump_out(struct md_port *port)
-{
-    struct md_line *line = &port->line;
-    int64_t before = md_now_ns();
-    ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
-    if (written > 0)
-        md_line_sent(line, (size_t)written, before);
-    else if (written < 0 && !is_transient(errno))
-        md_line_lost(line, MD_LINE_LOST, errno);
-    else
-        wait_for(port->fd, POLLOUT, line->wake_ns);
-}
-
 static void pump_in(struct md_port *port)
 {
-    struct md_line *line = &port->line;
     uint8_t bytes[1024];
-    if (!wait_for(port->fd, POLLIN, line->wake_ns))
-        return;
     ssize_t got = read(port->fd, bytes, sizeof bytes);
     if (got > 0)
-        md_line_received(line, bytes, (size_t)got, md_now_ns());
+        md_line_received(&port->line, bytes, (size_t)got, md_now_ns());
     else if (got == 0)
-        md_line_lost(line, MD_LINE_LOST, 0);
+        lose(port, 0);
     else if (!is_transient(errno))
-        md_line_lost(line, MD_LINE_LOST, errno);
+        lose(port, errno);
+}
+
+/* Whether the port took anything. */
+static int pump_out(struct md_port *port, int64_t now_ns)
+{
+    struct md_line *line = &port->line;
+    ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
+    if (written > 0)
+        md_line_sent(line, (size_t)written, now_ns);
+    else if (written < 0 && !is_transient(errno))
+        lose(port, errno);
+    return written != 0 && (written > 0 || port->lost);
 }
 
 static int same_settings(const struct md_settings *a, const struct md_settings *b)
 {
-    return a->baudrate == b->baudrate && a->databits == b->databits && a->parity == b->parity && a->stopbits == b->stopbits;
+    return a->baudrate == b->baudrate && a->databits == b->databits && a->parity == b->parity &&
+           a->stopbits == b->stopbits;
 }
 
 static void apply_settings(struct md_port *port, const struct md_settings *settings)
 {
     if (port->must_take < 0 || same_settings(&port->settings, settings))
         return;
-    wait_for(-1, 0, port->line.quiet_ns); /* a broadcast may still be on its way out */
     int refused = md_port_set(port->fd, settings);
     if (refused < 0)
-        md_line_lost(&port->line, MD_LINE_LOST, -refused);
+        lose(port, -refused);
     else if (refused & port->must_take)
-        md_line_lost(&port->line, MD_SETTINGS_REFUSED, refused);
+        md_line_abandon(&port->line, MD_SETTINGS_REFUSED, refused);
     else
         port->settings = *settings;
 }
 
-int md_run(struct md_port *port, const struct md_exchange *const *exchanges,
-           struct md_completion *completions, int n)
+static void begin(struct md_port *port, const struct md_exchange *exchange, struct md_completion *completion, int64_t now_ns)
+{
+    md_line_begin(&port->line, exchange, completion, now_ns);
+    if (port->lost)
+        md_line_abandon(&port->line, MD_LINE_LOST, port->lost - 1);
+}
+
+static unsigned pending(struct md_port *port)
+{
+    return atomic_load(&port->submitted) - atomic_load_explicit(&port->done, memory_order_relaxed);
+}
+
+/* Take up what is to be done next, or say when; whether there is anything to carry out now. */
+static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
+{
+    struct wish *wish = port->wishes;
+    if (wish && now_ns >= wish->not_before_ns) {
+        port->wish = wish;
+        begin(port, wish->exchange, wish->completion, now_ns);
+        if (wish->expires_ns && now_ns > wish->expires_ns)
+            md_line_abandon(&port->line, MD_EXPIRED, 0);
+        return 1;
+    }
+    if (wish)
+        *wake_ns = wish->not_before_ns;
+    if (!pending(port)) {
+        atomic_store(&port->idle, 1);
+        if (!pending(port))
+            return 0;
+        atomic_store(&port->idle, 0);
+    }
+    struct slot *slot = &port->slots[atomic_load(&port->done) & (port->room - 1)];
+    if (now_ns < slot->not_before_ns) {
+        if (slot->not_before_ns < *wake_ns)
+            *wake_ns = slot->not_before_ns;
+        return 0;
+    }
+    port->slot = slot;
+    begin(port, slot->exchange, &slot->completion, now_ns);
+    return 1;
+}
+
+static void finish(struct md_port *port)
+{
+    if (port->wish) {
+        port->wishes = port->wish->next;
+        port->wish->done = 1;
+        port->wish = NULL;
+        pthread_cond_broadcast(&port->engine->changed);
+        return;
+    }
+    port->slot = NULL;
+    atomic_fetch_add(&port->done, 1);
+    unsigned left = pending(port);
+    if (left == port->room / 4 || left == 0)
+        ring(port->engine->notice);
+}
+
+/* Carry on until there is nothing to do but to wait. */
+static void advance(struct md_port *port)
 {
     struct md_line *line = &port->line;
-#ifdef __linux__
-    prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* of this thread; the default is 50 us */
-#endif
-    for (int i = 0; i < n; i++) {
-        if (atomic_load((_Atomic int *)&port->yield_now))
-            return i;
-        md_line_begin(line, exchanges[i], &completions[i], md_now_ns());
-        apply_settings(port, &exchanges[i]->settings);
-        int want;
-        while ((want = md_line_want(line, md_now_ns())) != MD_DONE) {
-            if (want == MD_WRITE)
-                pump_out(port);
-            else
-                pump_in(port);
+    int64_t wake_ns = NEVER;
+    for (;;) {
+        int64_t now_ns = md_now_ns();
+        if (!port->slot && !port->wish && !take_up(port, &wake_ns, now_ns))
+            break;
+        int want = md_line_want(line, now_ns);
+        if (want == MD_DONE) {
+            finish(port);
+            continue;
         }
-        if (completions[i].result == MD_LINE_LOST || completions[i].result == MD_SETTINGS_REFUSED)
-            return i + 1;
+        wake_ns = line->wake_ns;
+        if (want == MD_WRITE) {
+            apply_settings(port, &line->exchange->settings);
+            if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, md_now_ns()))
+                continue;
+            wake_ns = now_ns + RETRY_WRITE_NS;
+            break;
+        }
+        if (want == MD_READ && (port->blind || now_ns >= wake_ns)) {
+            port->blind = 0;
+            pump_in(port);
+            continue;
+        }
+        port->blind = want == MD_WAIT;
+        break;
     }
-    return n;
+    if (port->blind && wake_ns - md_now_ns() > WORTH_BLINDNESS)
+        watch(port, 0);
+    else if (!port->blind)
+        watch(port, 1);
+    port->engine->wakes[port->index] = wake_ns;
+}
+
+/* ---- the thread ---- */
+
+static int64_t earliest(const struct md_engine *engine)
+{
+    int64_t least = NEVER;
+    for (unsigned i = 0; i < engine->count; i++)
+        if (engine->wakes[i] < least)
+            least = engine->wakes[i];
+    return least;
+}
+
+static int wait_for_events(struct md_engine *engine, struct epoll_event *events, int64_t until_ns)
+{
+    int64_t left = until_ns == NEVER ? NEVER : until_ns - md_now_ns();
+    struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
+    if (left <= 0)
+        span = (struct timespec){0};
+    return epoll_pwait2(engine->epoll, events, EVENTS, until_ns == NEVER ? NULL : &span, NULL);
+}
+
+/* Close those ports whose clients wait for it; nobody is on them now. */
+static void close_ports(struct md_engine *engine)
+{
+    for (unsigned i = engine->count; i-- > 0;) {
+        struct md_port *port = engine->ports[i];
+        if (!port->closing)
+            continue;
+        if (!port->lost)
+            epoll_ctl(engine->epoll, EPOLL_CTL_DEL, port->fd, NULL);
+        struct md_port *last = engine->ports[--engine->count];
+        engine->ports[i] = last;
+        engine->wakes[i] = engine->wakes[engine->count];
+        last->index = i;
+        for (struct wish *wish = port->wishes; wish; wish = wish->next) {
+            *wish->completion = (struct md_completion){.result = MD_LINE_LOST};
+            wish->done = 1;
+        }
+        port->closed = 1;
+        pthread_cond_broadcast(&engine->changed);
+    }
+}
+
+static void *run(void *argument)
+{
+    struct md_engine *engine = argument;
+    struct epoll_event events[EVENTS];
+#ifdef __linux__
+    prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
+#endif
+    pthread_mutex_lock(&engine->mutex);
+    while (!engine->stopping) {
+        int64_t until_ns = earliest(engine);
+        pthread_mutex_unlock(&engine->mutex);
+        int n = wait_for_events(engine, events, until_ns);
+        pthread_mutex_lock(&engine->mutex);
+        int told = 0;
+        for (int i = 0; i < n; i++) {
+            struct md_port *port = events[i].data.ptr;
+            if (!port) {
+                told = 1;
+                continue;
+            }
+            pump_in(port);
+            advance(port);
+        }
+        if (told) {
+            silence(engine->bell);
+            close_ports(engine);
+        }
+        int64_t now_ns = md_now_ns();
+        for (unsigned i = 0; i < engine->count; i++)
+            if (engine->wakes[i] <= now_ns || (told && !engine->ports[i]->slot && !engine->ports[i]->wish))
+                advance(engine->ports[i]);
+    }
+    pthread_mutex_unlock(&engine->mutex);
+    return NULL;
+}
+
+/* ---- the client's side ---- */
+
+static void release(struct md_engine *engine)
+{
+    int fds[] = {engine->epoll, engine->bell, engine->notice};
+    for (int i = 0; i < 3; i++)
+        if (fds[i] >= 0)
+            close(fds[i]);
+    pthread_mutex_destroy(&engine->mutex);
+    pthread_cond_destroy(&engine->changed);
+    free(engine->ports);
+    free(engine->wakes);
+    free(engine);
+}
+
+struct md_engine *md_engine_start(void)
+{
+    struct md_engine *engine = calloc(1, sizeof *engine);
+    if (!engine)
+        return NULL;
+    pthread_mutex_init(&engine->mutex, NULL);
+    pthread_cond_init(&engine->changed, NULL);
+    engine->epoll = epoll_create1(EPOLL_CLOEXEC);
+    engine->bell = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    engine->notice = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    struct epoll_event event = {.events = EPOLLIN, .data.ptr = NULL};
+    if (engine->epoll >= 0 && engine->bell >= 0 && engine->notice >= 0 &&
+        epoll_ctl(engine->epoll, EPOLL_CTL_ADD, engine->bell, &event) == 0 &&
+        pthread_create(&engine->thread, NULL, run, engine) == 0)
+        return engine;
+    release(engine);
+    return NULL;
+}
+
+void md_engine_stop(struct md_engine *engine)
+{
+    pthread_mutex_lock(&engine->mutex);
+    engine->stopping = 1;
+    pthread_mutex_unlock(&engine->mutex);
+    ring(engine->bell);
+    pthread_join(engine->thread, NULL);
+    release(engine);
+}
+
+int md_engine_notice(struct md_engine *engine)
+{
+    return engine->notice;
+}
+
+/* Make room for one more port; 0 when there is no memory. */
+static int grow(struct md_engine *engine)
+{
+    if (engine->count < engine->room)
+        return 1;
+    unsigned room = engine->room ? 2 * engine->room : 16;
+    struct md_port **ports = realloc(engine->ports, room * sizeof *ports);
+    if (ports)
+        engine->ports = ports;
+    int64_t *wakes = realloc(engine->wakes, room * sizeof *wakes);
+    if (wakes)
+        engine->wakes = wakes;
+    if (!ports || !wakes)
+        return 0;
+    engine->room = room;
+    return 1;
+}
+
+struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room)
+{
+    struct md_port *port = calloc(1, sizeof *port);
+    struct slot *slots = calloc(room, sizeof *slots);
+    if (!port || !slots || room == 0 || (room & (room - 1))) {
+        free(port);
+        free(slots);
+        errno = ENOMEM;
+        return NULL;
+    }
+    *port = (struct md_port){.engine = engine, .fd = fd, .must_take = must_take, .slots = slots, .room = room, .idle = 1, .watched = 1};
+    md_line_init(&port->line, md_now_ns());
+    /* Raw before it is first read: a terminal at VMIN 0 looks like one that hung up. */
+    struct md_settings settings;
+    if (must_take >= 0 && md_port_get(fd, &settings) == 0)
+        md_port_set(fd, &settings);
+    struct epoll_event event = {.events = EPOLLIN, .data.ptr = port};
+    pthread_mutex_lock(&engine->mutex);
+    int added = grow(engine) && epoll_ctl(engine->epoll, EPOLL_CTL_ADD, fd, &event) == 0;
+    if (added) {
+        port->index = engine->count;
+        engine->wakes[engine->count] = NEVER;
+        engine->ports[engine->count++] = port;
+    }
+    pthread_mutex_unlock(&engine->mutex);
+    if (added)
+        return port;
+    free(slots);
+    free(port);
+    return NULL;
+}
+
+void md_port_stop(struct md_port *port)
+{
+    struct md_engine *engine = port->engine;
+    pthread_mutex_lock(&engine->mutex);
+    port->closing = 1;
+    ring(engine->bell);
+    while (!port->closed)
+        pthread_cond_wait(&engine->changed, &engine->mutex);
+    pthread_mutex_unlock(&engine->mutex);
+}
+
+void md_port_free(struct md_port *port)
+{
+    free(port->slots);
+    free(port);
+}
+
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns, int n)
+{
+    unsigned submitted = atomic_load(&port->submitted);
+    unsigned free_slots = port->room - (submitted - atomic_load(&port->reaped));
+    int taken = 0;
+    for (; taken < n && (unsigned)taken < free_slots; taken++) {
+        struct slot *slot = &port->slots[(submitted + (unsigned)taken) & (port->room - 1)];
+        slot->exchange = exchanges[taken];
+        slot->not_before_ns = not_before_ns[taken];
+    }
+    atomic_store(&port->submitted, submitted + (unsigned)taken);
+    if (taken && atomic_exchange(&port->idle, 0))
+        ring(port->engine->bell);
+    return taken;
+}
+
+int md_port_lost(struct md_port *port)
+{
+    return port->lost != 0;
+}
+
+int md_port_pending(struct md_port *port)
+{
+    return (int)pending(port);
+}
+
+int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns)
+{
+    unsigned reaped = atomic_load(&port->reaped), done = atomic_load(&port->done);
+    int count = 0;
+    for (; reaped != done; reaped++, count++) {
+        const struct slot *slot = &port->slots[reaped & (port->room - 1)];
+        if (md_columns_add(columns, slot->exchange->block, &slot->completion, utc_minus_monotonic_ns) == 0)
+            break;
+    }
+    atomic_store(&port->reaped, reaped);
+    return count;
+}
+
+void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
+                       int64_t expires_ns, struct md_completion *completion)
+{
+    struct md_engine *engine = port->engine;
+    struct wish wish = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns, .completion = completion};
+    pthread_mutex_lock(&engine->mutex);
+    struct wish **last = &port->wishes;
+    while (*last)
+        last = &(*last)->next;
+    *last = &wish;
+    ring(engine->bell);
+    while (!wish.done)
+        pthread_cond_wait(&engine->changed, &engine->mutex);
+    pthread_mutex_unlock(&engine->mutex);
 }

@@ -429,3 +429,15 @@ int md_reply_length(int framing, const struct md_message *request)
     int body = function->reply == DATA ? 3 + (int)data_bytes(function, request->count) : 6;
     return framing == MD_RTU ? body + 2 : 2 * body + 5;
 }
+
+int md_is_mistakable(int framing, const struct md_message *one, const struct md_message *other)
+{
+    if (one->address != other->address || one->function != other->function)
+        return 0;
+    if (framing == MD_DELIXI)
+        return one->start == other->start;
+    /* Replies to reads say nothing of what was asked for but its length. */
+    if (find_function(one->function)->reply == DATA)
+        return md_reply_length(framing, one) == md_reply_length(framing, other);
+    return one->start == other->start;
+}

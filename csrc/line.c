@@ -4,7 +4,8 @@
  * The expected reply may begin anywhere in what was received, because driver turn-on junk, local
  * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
- * echoes what it sends shows in the replies that are no copies of their requests. */
+ * echoes what it sends shows in the replies that are no copies of their requests. From a drive's
+ * replies its response delay is learnt: how long to wait for it, and when it is worth looking. */
 #include "multidrop.h"
 
 #include <errno.h>
@@ -41,6 +42,66 @@ static int64_t later(int64_t a, int64_t b)
     return a > b ? a : b;
 }
 
+static int64_t clamp(int64_t value, int64_t least, int64_t most)
+{
+    return value < least ? least : value > most ? most : value;
+}
+
+/* Before this delay no reply is to be expected: nothing is worth reading. */
+static int64_t early_ns(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    return later(0, drive->delay_ns - 2 * drive->deviation_ns - exchange->character_ns);
+}
+
+/* Longer after each failure: the drive may have become slower, or is slower than most. */
+static int64_t timeout_ns(const struct md_drive *drive)
+{
+    int64_t usual = drive->delay_ns ? drive->delay_ns + 4 * drive->deviation_ns : 4 * drive->least_timeout_ns;
+    usual = later(usual, drive->least_timeout_ns);
+    return clamp(usual << (drive->failures < 8 ? drive->failures : 8), 0, drive->most_timeout_ns);
+}
+
+/* As TCP learns its retransmission time-out (RFC 6298), from the delay of one reply. */
+static void learn_delay(struct md_drive *drive, int64_t delay_ns)
+{
+    int64_t off = delay_ns - drive->delay_ns;
+    if (drive->delay_ns == 0) {
+        drive->delay_ns = later(delay_ns, 1);
+        drive->deviation_ns = delay_ns / 2;
+        return;
+    }
+    drive->deviation_ns += ((off < 0 ? -off : off) - drive->deviation_ns) / 4;
+    drive->delay_ns = later(drive->delay_ns + off / 8, 1);
+}
+
+/* Whether this says that the drive does not answer, or cannot be reached. */
+static int is_failure(int result)
+{
+    return result < 0 && result != MD_LATE_ANSWER_DUE && result != MD_EXPIRED && result != MD_LINE_LOST;
+}
+
+static void count(const struct md_exchange *exchange, const struct md_completion *completion)
+{
+    struct md_drive *drive = exchange->drive;
+    struct md_tally *tally = &drive->tally;
+    uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
+    tally->exchanges++;
+    tally->stray_bytes += completion->stale + completion->skipped;
+    if (completion->result < 0)
+        tally->missed[-completion->result] += values;
+    else if (completion->reply.exception)
+        tally->exceptions += values;
+    else
+        tally->values += values;
+    if (is_failure(completion->result))
+        drive->failures++;
+    if (completion->result > 0) {
+        tally->answered++;
+        drive->failures = 0;
+    }
+}
+
 static void finish(struct md_line *line, int result, const uint8_t *raw, size_t raw_len)
 {
     struct md_completion *completion = line->completion;
@@ -51,10 +112,31 @@ static void finish(struct md_line *line, int result, const uint8_t *raw, size_t 
     completion->result = result;
     completion->raw_len = (uint16_t)raw_len;
     memcpy(completion->raw, raw, raw_len);
+    line->rx_len = line->rx_from = 0;
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
     if (completion->sent_ns) /* else what went before it still has its say */
         line->silence_ns = line->exchange->silence_ns;
     line->state = IDLE;
+    count(line->exchange, completion);
+}
+
+/* The reply is there: what it says of the drive's own delay, and what it had to take of the line. */
+static void measure(struct md_line *line, int reply_len)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_completion *completion = line->completion;
+    int64_t request_ns = line->tx_len * exchange->character_ns, reply_ns = reply_len * exchange->character_ns;
+    int64_t left_ns = completion->sent_ns + request_ns, begun_ns = completion->last_ns - reply_ns;
+    /* Characters that follow each other tell better when the first came than a late look at them. */
+    int64_t first_ns = later(begun_ns + exchange->character_ns, left_ns);
+    if (first_ns < completion->first_ns)
+        completion->first_ns = first_ns;
+    int64_t delay_ns = later(begun_ns - left_ns, 0);
+    /* A reply that was whole when first looked at may have been so for long. */
+    if (line->looks == 1 && line->ready_ns && early_ns(exchange) < delay_ns)
+        delay_ns = early_ns(exchange);
+    learn_delay(exchange->drive, delay_ns);
+    exchange->drive->tally.ideal_ns += (uint64_t)(exchange->silence_ns + request_ns + delay_ns + reply_ns);
 }
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
@@ -65,6 +147,31 @@ static int parse_at(const struct md_line *line, size_t at, struct md_message *re
 static int is_copy(const struct md_line *line, size_t at)
 {
     return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
+}
+
+static void expect_late_answer(struct md_line *line)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_drive *drive = exchange->drive;
+    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    drive->late = exchange->request;
+    drive->late_framing = exchange->framing;
+    drive->late_until_ns = line->quiet_ns + later(3 * timeout_ns(drive), drive->most_timeout_ns) + reply_ns;
+    line->late = drive;
+}
+
+/* What came unasked may be the answer to an earlier request; then it need not be waited for. */
+static void recognise_late_answer(struct md_line *line)
+{
+    struct md_message reply;
+    struct md_drive *drive = line->late;
+    for (size_t at = 0; drive && at < line->rx_len; at++) {
+        if (md_parse_reply(drive->late_framing, line->rx + at, line->rx_len - at, &drive->late, &reply) <= 0)
+            continue;
+        drive->tally.late++;
+        drive->late_until_ns = 0;
+        drive = line->late = NULL;
+    }
 }
 
 static void time_out(struct md_line *line)
@@ -79,6 +186,8 @@ static void time_out(struct md_line *line)
         if (weight(why) > weight(reason))
             reason = why;
     }
+    if (reason == MD_NO_REPLY || reason == MD_CUT_SHORT)
+        expect_late_answer(line);
     finish(line, reason, line->rx, line->rx_len);
 }
 
@@ -111,6 +220,7 @@ static void search(struct md_line *line)
             line->completion->reply = reply;
             line->completion->skipped -= (uint32_t)used;
             learn_echo(line, at);
+            measure(line, used);
             finish(line, used, line->rx + at, (size_t)used);
             return;
         }
@@ -120,13 +230,26 @@ static void search(struct md_line *line)
     line->rx_from = (uint16_t)first_open;
 }
 
+/* A reply that has begun comes character by character: it is not worth looking at each. */
+static void foresee(struct md_line *line, int64_t now_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    const uint8_t *begun = line->rx + line->rx_from;
+    int have = line->rx_len - line->rx_from;
+    int function_at = exchange->framing == MD_RTU ? 1 : 3;
+    int missing = md_reply_length(exchange->framing, &exchange->request) - have;
+    int may_be_exception = have <= function_at || (begun[function_at] & 0x80) || begun[function_at] >= '8';
+    if (missing > 1 && !(may_be_exception && have > 0))
+        line->ready_ns = now_ns + (missing - 1) * exchange->character_ns;
+}
+
 /* Make room: the older half goes. No reply can have begun there and not be whole by now. */
 static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
     line->rx_len = (uint16_t)(line->rx_len - GONE);
-    line->rx_from = (uint16_t)(line->rx_from - GONE);
+    line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);
     memmove(line->rx, line->rx + GONE, line->rx_len);
 }
 
@@ -138,14 +261,19 @@ void md_line_init(struct md_line *line, int64_t now_ns)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
                    struct md_completion *completion, int64_t now_ns)
 {
-    *completion = (struct md_completion){.begun_ns = now_ns};
+    *completion = (struct md_completion){.begun_ns = now_ns, .stale = line->rx_len};
     line->exchange = exchange;
     line->completion = completion;
-    line->tx_at = line->rx_len = line->rx_from = 0;
+    line->tx_at = 0;
     line->echo_due = line->echoes;
     line->silence_ns = later(line->silence_ns, exchange->silence_ns);
-    line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->timeout_ns;
+    line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     line->state = SILENT;
+    if (now_ns < exchange->drive->late_until_ns &&
+        md_is_mistakable(exchange->framing, &exchange->drive->late, &exchange->request)) {
+        finish(line, MD_LATE_ANSWER_DUE, line->rx, 0);
+        return;
+    }
     int length = md_build_request(exchange->framing, &exchange->request, line->tx, sizeof line->tx);
     if (length < 0)
         finish(line, length, line->rx, 0);
@@ -160,19 +288,27 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         line->wake_ns = line->quiet_ns + line->silence_ns;
         if (line->wake_ns > line->give_up_ns)
             line->wake_ns = line->give_up_ns;
-        if (now_ns >= line->wake_ns)
-            line->state = LOOKING;
+        if (now_ns < line->wake_ns)
+            return MD_WAIT;
+        line->state = LOOKING;
         return MD_READ;
     case LOOKING:
         line->state = SENDING;
-        line->wake_ns = now_ns + line->exchange->timeout_ns + line->tx_len * line->exchange->character_ns;
+        line->rx_len = line->rx_from = 0;
+        line->wake_ns = now_ns + line->exchange->drive->most_timeout_ns + line->tx_len * line->exchange->character_ns;
         return MD_WRITE;
     case SENDING: /* a port that takes nothing is a broken port */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
-        md_line_lost(line, MD_LINE_LOST, ETIMEDOUT);
+        md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
         return MD_DONE;
     case LISTENING:
+        if (now_ns < line->ready_ns && line->ready_ns < line->give_up_ns) {
+            line->wake_ns = line->ready_ns;
+            return MD_WAIT;
+        }
+        line->wake_ns = line->give_up_ns;
+        line->looks++;
         if (now_ns >= line->wake_ns)
             line->state = ENDING;
         return MD_READ;
@@ -201,8 +337,35 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
         line->silence_ns = later(exchange->silence_ns, exchange->turnaround_ns);
         return;
     }
-    line->wake_ns = line->quiet_ns + exchange->timeout_ns + reply_len * exchange->character_ns;
+    int64_t reply_ns = reply_len * exchange->character_ns;
+    line->give_up_ns = line->quiet_ns + timeout_ns(exchange->drive) + reply_ns;
+    line->ready_ns = exchange->drive->delay_ns ? line->quiet_ns + early_ns(exchange) + reply_ns : 0;
+    line->looks = 0;
     line->state = LISTENING;
+}
+
+/* Take in as much as there is room for; how much. */
+static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
+{
+    if (line->rx_len == sizeof line->rx)
+        forget(line);
+    size_t room = sizeof line->rx - line->rx_len, taken = len < room ? len : room;
+    memcpy(line->rx + line->rx_len, bytes, taken);
+    line->rx_len = (uint16_t)(line->rx_len + taken);
+    return taken;
+}
+
+/* Bytes that nobody asked for: they put off the next request, which must find the line silent. */
+static void take_stale(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    line->quiet_ns = now_ns;
+    if (line->state != IDLE)
+        line->completion->stale += (uint32_t)len;
+    if (line->state == LOOKING && now_ns < line->give_up_ns)
+        line->state = SILENT;
+    for (size_t at = 0; at < len;)
+        at += keep(line, bytes + at, len - at);
+    recognise_late_answer(line);
 }
 
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
@@ -210,32 +373,23 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
     struct md_completion *completion = line->completion;
     if (len == 0)
         return;
-    if (line->state == SILENT || line->state == LOOKING) {
-        completion->stale += (uint32_t)len;
-        line->quiet_ns = now_ns;
-        if (now_ns < line->give_up_ns)
-            line->state = SILENT;
+    if (line->state != LISTENING && line->state != ENDING) {
+        take_stale(line, bytes, len, now_ns);
         return;
     }
-    if (line->state != LISTENING && line->state != ENDING)
-        return;
     if (completion->first_ns == 0)
         completion->first_ns = now_ns;
     completion->last_ns = now_ns;
     completion->skipped += (uint32_t)len;
-    while (len > 0 && line->state != IDLE) {
-        if (line->rx_len == sizeof line->rx)
-            forget(line);
-        size_t room = sizeof line->rx - line->rx_len, taken = len < room ? len : room;
-        memcpy(line->rx + line->rx_len, bytes, taken);
-        line->rx_len = (uint16_t)(line->rx_len + taken);
-        bytes += taken;
-        len -= taken;
+    for (size_t at = 0; at < len && line->state != IDLE;) {
+        at += keep(line, bytes + at, len - at);
         search(line);
     }
+    if (line->state == LISTENING)
+        foresee(line, now_ns);
 }
 
-void md_line_lost(struct md_line *line, int result, int error)
+void md_line_abandon(struct md_line *line, int result, int error)
 {
     if (line->state == IDLE)
         return;

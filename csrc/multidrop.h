@@ -40,8 +40,10 @@ enum md_result {
     MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
     MD_LINE_LOST = -11,        /* the port failed: completion.error is the errno, 0 at its end */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
+    MD_LATE_ANSWER_DUE = -13,  /* not sent: an earlier answer would be mistaken for its reply */
+    MD_EXPIRED = -14,          /* not sent: its time was over before its turn came */
     /* of a value that was due (only seen in columns) */
-    MD_NOT_ASKED = -13         /* the drive is silent and was given a rest */
+    MD_NOT_ASKED = -15         /* the drive is silent and was given a rest */
 };
 
 /* One frame's meaning, whatever its framing. Which fields count depends on the function:
@@ -70,6 +72,9 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
                    const struct md_message *request, struct md_message *reply);
 
+/* Whether an answer to the one request could pass for the reply to the other. */
+int md_is_mistakable(int framing, const struct md_message *one, const struct md_message *other);
+
 /* Length in bytes of the good reply to `request`; 0 when nobody answers (broadcast). */
 int md_reply_length(int framing, const struct md_message *request);
 
@@ -92,15 +97,38 @@ int md_port_get(int fd, struct md_settings *settings);
 
 /* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
 
+/* What became of a drive's exchanges. Values are those of the exchange's block, or one. */
+struct md_tally {
+    uint64_t exchanges, answered, values;
+    uint64_t missed[16];  /* values, by -result */
+    uint64_t exceptions;  /* values that the drive refused */
+    uint64_t late;        /* answers that came after their time-out */
+    uint64_t stray_bytes; /* bytes that were no part of a reply */
+    uint64_t ideal_ns;    /* what the answered exchanges had to take of the line */
+};
+
+/* What is known of a drive: the bounds of its time-out are given, the rest is learnt from its
+ * exchanges and starts as 0. A time-out runs from the request's last bit to the reply's first. */
+struct md_drive {
+    int64_t least_timeout_ns, most_timeout_ns;
+    int64_t delay_ns, deviation_ns; /* the response delay, smoothed, and its mean deviation */
+    int64_t late_until_ns;          /* so long the answer to `late` may still come */
+    struct md_message late;
+    int late_framing;
+    uint32_t failures;              /* in a row */
+    struct md_tally tally;
+};
+
 /* One request and all that is needed to carry it out; constant while it is in use. */
 struct md_exchange {
     int framing;
     struct md_message request;
     struct md_settings settings;
-    int64_t character_ns;   /* one character on the wire */
-    int64_t silence_ns;     /* before the request and after its reply */
-    int64_t timeout_ns;     /* from the request's last bit to the reply's first character */
-    int64_t turnaround_ns;  /* after a broadcast */
+    int64_t character_ns;  /* one character on the wire */
+    int64_t silence_ns;    /* before the request and after its reply */
+    int64_t turnaround_ns; /* after a broadcast */
+    struct md_drive *drive;
+    const struct md_block *block; /* what its reply holds; NULL: nobody makes rows of it */
 };
 
 /* What became of it. Times are of CLOCK_MONOTONIC; first and last are 0 where nothing came. */
@@ -119,6 +147,7 @@ struct md_completion {
 
 enum md_want {
     MD_DONE,  /* nothing: the completion is filled in */
+    MD_WAIT,  /* to be left alone until wake_ns: nothing worth reading comes before */
     MD_WRITE, /* tx[tx_at] to tx[tx_len] written, as much as the port takes */
     MD_READ   /* bytes, or to be asked again at wake_ns */
 };
@@ -128,13 +157,16 @@ struct md_line {
     int64_t quiet_ns;   /* since when nobody has been sending */
     int64_t silence_ns; /* demanded after what went last */
     int64_t wake_ns;
-    int64_t give_up_ns; /* until then it waits for a babbling line to fall silent; then it sends */
+    int64_t give_up_ns; /* until then it waits for a babbling line to fall silent, or for the reply */
+    int64_t ready_ns;   /* before then the reply cannot be whole */
+    struct md_drive *late; /* whose answer may still come */
     const struct md_exchange *exchange;
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
     uint16_t rx_len, rx_from; /* no reply begins before rx_from */
     int echoes;               /* the adapter echoes what it sends: learnt, never forgotten by failures */
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
+    int looks;                /* how often the line was looked at since the request left */
     uint8_t tx[513], rx[1026];
 };
 
@@ -145,27 +177,36 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
 void md_line_sent(struct md_line *line, size_t len, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
-/* The port failed: ends the exchange under way. */
-void md_line_lost(struct md_line *line, int result, int error);
+/* End the exchange under way: the port failed, or it is not to be sent any more. */
+void md_line_abandon(struct md_line *line, int result, int error);
 
-/* ---- engine.c: lines driven on descriptors ---- */
+/* ---- engine.c: the thread that runs every line of the process ---- */
 
-/* A descriptor with its line. */
-struct md_port {
-    int fd;
-    int must_take;   /* which refusals (enum md_refusal) are failures; -1: a port without settings */
-    struct md_settings settings; /* in force; baudrate 0: not yet set */
-    int yield_now;   /* atomic: other than 0 makes md_run return after the exchange under way */
-    struct md_line line;
-};
+struct md_engine;
+struct md_port; /* a descriptor with its line */
+struct md_columns;
 
 int64_t md_now_ns(void); /* CLOCK_MONOTONIC */
-void md_port_init(struct md_port *port, int fd, int must_take);
-void md_port_yield(struct md_port *port, int yield_now);
-/* Carry out `n` exchanges one after another; how many were completed. Fewer when the port fails
- * (the last completion says so) or when asked to yield. Blocks. */
-int md_run(struct md_port *port, const struct md_exchange *const *exchanges,
-           struct md_completion *completions, int n);
+struct md_engine *md_engine_start(void); /* NULL: see errno */
+void md_engine_stop(struct md_engine *engine); /* when all its ports are closed */
+int md_engine_notice(struct md_engine *engine); /* a descriptor, readable when a port wants more */
+
+/* `must_take`: which refusals (enum md_refusal) are failures; -1: a port without settings. `room`
+ * for exchanges, a power of two. NULL: see errno. */
+struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room);
+/* Nothing more is carried out, and the descriptor is the caller's again; what was can be reaped. */
+void md_port_stop(struct md_port *port);
+void md_port_free(struct md_port *port); /* a port that was stopped */
+/* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time. */
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns, int n);
+int md_port_pending(struct md_port *port); /* how many are not carried out yet */
+/* Make rows of what was carried out; how many exchanges, fewer when the columns are full. */
+int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns);
+/* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */
+void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
+                       int64_t expires_ns, struct md_completion *completion);
+int md_port_lost(struct md_port *port); /* the descriptor failed: all that comes is MD_LINE_LOST */
 
 /* ---- columns.c: completions become columns ---- */
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from multidrop.batch import Batch, Row
-from multidrop.core import Block, Columns, Completions, Field, Result, Wire
+from multidrop.core import Block, Columns, Field, Result, Wire, new_completion
 
 # 2026-11-21 09:30:00.123456789 UTC lies 1 s of monotonic time before UTC_0 + 1 s
 UTC_0 = 1_795_253_399_123_456_789
@@ -24,26 +26,23 @@ def block(drive: int, *registers: int, divisor: float = 100.0) -> Block:
     )
 
 
-def completion(
-    sent_ns: int, *, first_ns: int = 0, words: tuple[int, ...] = (), exception: int = 0
-) -> Completions:
+def completion(sent_ns: int, *, first_ns: int = 0, words: tuple[int, ...] = (), exception: int = 0) -> Any:
     """A reply of these words, or an exception, whose request was sent at `sent_ns`."""
-    found = Completions(1)
-    found.count = 1
+    found = new_completion()
     data = b"".join(word.to_bytes(2, "big") for word in words)
-    found.c[0].result = 5 + len(data)
-    found.c[0].sent_ns, found.c[0].first_ns = sent_ns, first_ns
-    found.c[0].reply.exception = exception
-    found.c[0].reply.data_len = len(data)
-    found.c[0].reply.data[0 : len(data)] = list(data)
+    found.result = 5 + len(data)
+    found.sent_ns, found.first_ns = sent_ns, first_ns
+    found.reply.exception = exception
+    found.reply.data_len = len(data)
+    found.reply.data[0 : len(data)] = list(data)
     return found
 
 
 def example() -> Batch:
     """Two samples, an exception, a drive that says nothing, and one that was not asked."""
     columns = Columns(8)
-    assert columns.add(block(0, 0, 1), completion(SECOND, first_ns=SECOND + 7, words=(4999, 30)), 0, UTC_0)
-    assert columns.add(block(1, 0), completion(2 * SECOND, exception=0x12), 0, UTC_0)
+    assert columns.add(block(0, 0, 1), completion(SECOND, first_ns=SECOND + 7, words=(4999, 30)), UTC_0)
+    assert columns.add(block(1, 0), completion(2 * SECOND, exception=0x12), UTC_0)
     assert columns.add_miss(block(2, 1), Result.NO_REPLY, 3 * SECOND, UTC_0)
     assert columns.add_miss(block(1, 1), Result.NOT_ASKED, 4 * SECOND, UTC_0)
     return Batch(columns, DRIVES, REGISTERS)
@@ -69,7 +68,7 @@ EXAMPLE = [
         'fan, the "old" one',
         "motor_speed",
         None,
-        "not asked: the drive is silent",
+        "not asked: drive is silent",
     ),
 ]
 
@@ -82,5 +81,5 @@ def counting(rows: int, start: int = 0) -> Batch:
         if at % 10 == 9:
             assert columns.add_miss(drive, Result.NO_REPLY, at + 1, UTC_0)
         else:
-            assert columns.add(drive, completion(at + 1, first_ns=at + 3, words=(at,)), 0, UTC_0)
+            assert columns.add(drive, completion(at + 1, first_ns=at + 3, words=(at,)), UTC_0)
     return Batch(columns, DRIVES, REGISTERS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Completions, Exchange
+from multidrop.core import Completion, Exchange, completion, new_completion
 
 MS = 1_000_000
 
@@ -16,14 +16,19 @@ class LineDriver:
         self.now = 1000 * MS
         self._line = ffi.new("struct md_line *")
         lib.md_line_init(self._line, self.now)
-        self.completions = Completions(1)
-        self.completions.count = 1
+        self.found = new_completion()
+        self._exchanges: list[Exchange] = []  # the line holds on to them
 
     @property
     def want(self) -> str:
-        return {lib.MD_DONE: "done", lib.MD_WRITE: "write", lib.MD_READ: "read"}[
+        return {lib.MD_DONE: "done", lib.MD_WAIT: "wait", lib.MD_WRITE: "write", lib.MD_READ: "read"}[
             lib.md_line_want(self._line, self.now)
         ]
+
+    @property
+    def listens(self) -> bool:
+        """Whether it wants no more than time or bytes."""
+        return self.want in ("wait", "read")
 
     @property
     def wake(self) -> int:
@@ -31,7 +36,7 @@ class LineDriver:
 
     @property
     def completion(self) -> Completion:
-        return self.completions[0]
+        return completion(self.found)
 
     @property
     def still_open(self) -> int:
@@ -39,8 +44,8 @@ class LineDriver:
         return int(self._line.rx_len - self._line.rx_from)
 
     def begin(self, exchange: Exchange) -> None:
-        self._exchange = exchange  # the line holds on to it
-        lib.md_line_begin(self._line, exchange.c, self.completions.c, self.now)
+        self._exchanges.append(exchange)
+        lib.md_line_begin(self._line, exchange.c, self.found, self.now)
 
     def take(self, most: int = 513) -> bytes:
         """The port takes up to `most` bytes of what the line wants written."""
@@ -53,7 +58,7 @@ class LineDriver:
             lib.md_line_received(self._line, data[at : at + piece], len(data[at : at + piece]), self.now)
 
     def lose(self, error: int) -> None:
-        lib.md_line_lost(self._line, lib.MD_LINE_LOST, error)
+        lib.md_line_abandon(self._line, lib.MD_LINE_LOST, error)
 
     def wait_until_write(self) -> bytes:
         """Let the silence pass, as the engine does, and send the request."""

@@ -67,7 +67,7 @@ def test_capsules_stay_valid_when_the_batch_is_gone() -> None:
 
 def test_numbers_are_not_copied() -> None:
     columns = Columns(1)
-    assert columns.add(block(0, 0), completion(1, first_ns=2, words=(100,)), 0, 0)
+    assert columns.add(block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
     taken = pa.record_batch(Batch(columns, ["a"], ["b"]))
     columns.c.value[0] = 7.5
     assert taken.column("value")[0].as_py() == 7.5
@@ -118,7 +118,7 @@ def test_every_status_can_be_spelt() -> None:
         if reason is not Result.INCOMPLETE:
             assert columns.add_miss(block(0, 0), reason, SECOND, UTC_0)
     for code in range(1, 256):
-        assert columns.add(block(0, 0), completion(SECOND, exception=code), 0, UTC_0)
+        assert columns.add(block(0, 0), completion(SECOND, exception=code), UTC_0)
     batch = Batch(columns, ["a"], ["b"])
     statuses = pa.record_batch(batch).column("status").to_pylist()
     reasons = [str(reason) for reason in Result if reason is not Result.INCOMPLETE]

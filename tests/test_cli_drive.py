@@ -11,7 +11,6 @@ import pytest
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
-from multidrop.core import Message
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import Cell
 from multidrop.sim.simulator import Simulator
@@ -26,10 +25,10 @@ class Stubborn(SimulatedDrive):
     def accept(self, cell: Cell, raw: int) -> int:
         return min(raw, 200) if cell.name == "acceleration_time" else super().accept(cell, raw)
 
-    def carry_out(self, request: Message) -> Message:
-        if request.function == 3 and request.start <= 4 < request.start + request.count:
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start <= 4 < start + count:
             raise Refusal(Reason.READ_ADDRESS)
-        return super().carry_out(request)
+        return super().read(function, start, count)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -100,8 +101,10 @@ def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> No
     assert {row.drive for row in samples} == {"pump-1"}
     assert len(samples) == summary["samples"] > 0
     misses = [row for row in rows if row.value is None]
-    assert {(row.drive, row.status) for row in misses} == {("pump-9", "no reply")}
-    assert len(misses) == summary["misses"] == summary["lines"]["hall-1"]["misses"]["no reply"]
+    assert {row.drive for row in misses} == {"pump-9"}
+    assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
+    assert {"no reply"} <= {row.status for row in misses} <= {"no reply", "not asked: late reply due"}
+    assert len(misses) == summary["misses"]
     assert summary["lines"]["hall-1"]["exchanges"] > 0
     assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0
     assert summary["lines"]["hall-1"]["utilisation"] > 0

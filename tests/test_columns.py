@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from frames import words
@@ -14,11 +15,11 @@ from multidrop.core import (
     EXCEPTION_STATUS,
     Block,
     Columns,
-    Completions,
     Exchange,
     Field,
     Framing,
     Message,
+    Respondent,
     Result,
     Wire,
     build_reply,
@@ -67,20 +68,28 @@ def test_beyond_the_data_there_is_no_number(wire: Wire) -> None:
     assert math.isnan(raw_value(b"", 0, wire))
 
 
-def completed(request: Message, received: bytes) -> Completions:
+def completed(request: Message, received: bytes) -> Any:
     """What becomes of an exchange that begins at 1000 ms and whose reply begins 30 ms later."""
     line = LineDriver()
     line.begin(
-        Exchange(Framing.RTU, request, baudrate=9600, format="8N1", character=1e-3, silence=0, timeout=0.1)
+        Exchange(
+            Framing.RTU,
+            request,
+            Respondent(least_timeout=0.1, most_timeout=0.1),
+            baudrate=9600,
+            format="8N1",
+            character=1e-6,
+            silence=0,
+        )
     )
     line.wait_until_write()
     line.now += 30 * MS
     line.receive(received)
     line.wait_until_done()
-    return line.completions
+    return line.found
 
 
-def reply(*values: int) -> Completions:
+def reply(*values: int) -> Any:
     request = Message(1, 0x03, 0, len(values))
     return completed(request, build_reply(Framing.RTU, Message(1, 0x03, data=words(*values))))
 
@@ -94,12 +103,12 @@ def test_rows_of_a_block() -> None:
         ]
     )
     columns = Columns(8)
-    assert columns.add(block, reply(3, 0xFFFF, 0xFF9C), 0, UTC)
+    assert columns.add(block, reply(3, 0xFFFF, 0xFF9C), UTC)
     assert len(columns) == 3
     sent = 1000 * MS
     assert list(columns.array("time")) == [UTC + sent] * 3
     assert list(columns.array("sent")) == [sent] * 3
-    assert list(columns.array("uncertainty")) == [30 * MS] * 3
+    assert list(columns.array("uncertainty")) == [30 * MS - 10 * 1000] * 3
     assert list(columns.array("drive")) == [5, 5, 5]
     assert list(columns.array("reg")) == [50, 51, 52]
     assert list(columns.array("status")) == [0, 0, 0]
@@ -111,7 +120,7 @@ def test_rows_of_a_block() -> None:
 def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
     """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
     columns = Columns(1)
-    assert columns.add(Block([Field(0, Wire.U16, 0, 0, 1, divisor)]), reply(raw), 0, 0)
+    assert columns.add(Block([Field(0, Wire.U16, 0, 0, 1, divisor)]), reply(raw), 0)
     assert columns.array("value")[0] == raw / divisor
 
 
@@ -133,7 +142,7 @@ ONE = Block([Field(0, Wire.U16, 1, 2, 1, 1)])
 )
 def test_missing_value_has_a_row_that_says_why(received: bytes, status: int, text: str) -> None:
     columns = Columns(1)
-    assert columns.add(ONE, completed(Message(1, 0x03, 0, 1), received), 0, UTC)
+    assert columns.add(ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
     assert list(columns.array("status")) == [status]
     assert status_text(columns.array("status")[0]) == text
     assert (columns.array("valid")[0] & 1, columns.array("value")[0]) == (0, 0.0)
@@ -154,23 +163,23 @@ def test_request_that_never_left_has_the_time_at_which_it_was_taken_up() -> None
         Exchange(
             Framing.RTU,
             Message(1, 3, 0, 1),
+            Respondent(least_timeout=1, most_timeout=1),
             baudrate=9600,
             format="8N1",
             character=1e-3,
             silence=1,
-            timeout=1,
         )
     )
     line.lose(5)
     columns = Columns(1)
-    assert columns.add(ONE, line.completions, 0, UTC)
+    assert columns.add(ONE, line.found, UTC)
     assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, -Result.LINE_LOST)
 
 
 def test_field_beyond_the_reply_is_a_miss() -> None:
     columns = Columns(2)
     block = Block([Field(0, Wire.U16, 1, 2, 1, 1), Field(1, Wire.U16, 1, 3, 1, 1)])
-    assert columns.add(block, reply(9), 0, 0)
+    assert columns.add(block, reply(9), 0)
     assert list(columns.array("status")) == [0, -Result.BAD_LENGTH]
     assert list(columns.array("value")) == [9, 0]
 
@@ -180,7 +189,7 @@ def test_bitmap_of_values_and_misses() -> None:
     good, bad = reply(1), completed(Message(1, 0x03, 0, 1), b"")
     pattern = [1, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 0, 0, 1]
     for bit in pattern:
-        assert columns.add(ONE, good if bit else bad, 0, 0)
+        assert columns.add(ONE, good if bit else bad, 0)
     valid = columns.array("valid")
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
@@ -189,11 +198,11 @@ def test_block_without_room_is_left_out_whole() -> None:
     columns = Columns(3)
     two = Block([Field(0, Wire.U16, 1, 2, 1, 1), Field(1, Wire.U16, 1, 3, 1, 1)])
     answer = reply(1, 2)
-    assert columns.add(two, answer, 0, 0)
-    assert not columns.add(two, answer, 0, 0)
+    assert columns.add(two, answer, 0)
+    assert not columns.add(two, answer, 0)
     assert len(columns) == 2
-    assert columns.add(ONE, answer, 0, 0)
-    assert not columns.add(ONE, answer, 0, 0)
+    assert columns.add(ONE, answer, 0)
+    assert not columns.add(ONE, answer, 0)
     assert list(columns.array("value")) == [1, 2, 1]
 
 

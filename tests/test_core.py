@@ -6,7 +6,10 @@ import errno
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 from frames import words
@@ -14,12 +17,16 @@ from frames import words
 from multidrop.core import (
     EXCEPTION_STATUS,
     REFUSALS,
-    Completions,
+    Block,
+    Columns,
     Exchange,
+    Field,
     Framing,
     Message,
     Port,
+    Respondent,
     Result,
+    Wire,
     build_reply,
     now_ns,
     parse_request,
@@ -30,18 +37,36 @@ PARITY = next(bit for bit, name in REFUSALS.items() if name == "parity")
 ANY_SETTINGS, NO_SETTINGS = 0, -1
 
 
-def read(start: int, *, timeout: float = 5.0, format: str = "8N1") -> Exchange:
+ONE_VALUE = Block([Field(0, Wire.U16, 0, 0, 1, 1)])
+
+
+def read(
+    start: int, *, timeout: float = 5.0, format: str = "8N1", respondent: Respondent | None = None
+) -> Exchange:
     """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
     return Exchange(
         Framing.RTU,
         Message(1, 0x03, start, 1),
+        respondent or Respondent(least_timeout=timeout, most_timeout=timeout),
         baudrate=115_200,
         format=format,
         character=1e-6,
         silence=1e-4,
-        timeout=timeout,
         turnaround=1e-4,
+        block=ONE_VALUE,
     )
+
+
+def wait_until(look: Callable[[], bool]) -> None:
+    while not look():
+        time.sleep(0.001)
+
+
+def reaped(port: Port, exchanges: int) -> Columns:
+    """The rows of so many exchanges."""
+    columns = Columns(exchanges)
+    wait_until(lambda: port.reap(columns, 0) >= 0 and len(columns) == exchanges)
+    return columns
 
 
 def echo_start(request: Message) -> bytes:
@@ -100,31 +125,93 @@ def drive() -> Iterator[Callable[[Callable[[Message], bytes]], int]]:
 Drive = Callable[[Callable[[Message], bytes]], int]
 
 
-def test_run_of_exchanges(drive: Drive) -> None:
-    port, done = Port(drive(echo_start), NO_SETTINGS), Completions(100)
-    began = now_ns()
-    assert port.run([read(start) for start in range(100)], done) == len(done) == 100
-    before = began
-    for start, found in enumerate(done):
-        assert (found.result, found.status, found.reply) == (7, 0, Message(1, 0x03, start, 1, words(start)))
-        assert found.raw == echo_start(Message(1, 0x03, start, 1))
-        assert before <= found.sent_ns <= found.first_ns <= found.last_ns <= now_ns()
-        before = found.last_ns
-        assert (found.stale, found.skipped, found.error) == (0, 0, 0)
+def test_queued_exchanges_are_carried_out_in_turn(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS, room=128)) as port:
+        queued = [read(start) for start in range(100)]
+        assert port.submit(queued, [0] * 100) == 100
+        columns = reaped(port, 100)
+    assert list(columns.array("value")) == list(range(100))
+    assert list(columns.array("status")) == [0] * 100
+    sent = list(columns.array("sent"))
+    assert sent == sorted(sent)
+    assert queued[0].respondent.tally().values == 1
+
+
+def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS, room=4)) as port:
+        later = [now_ns() + 60_000_000_000] * 6
+        queued = [read(start) for start in range(6)]
+        assert port.submit(queued, later) == 4
+        assert port.submit(queued, later) == 0
+        assert port.pending == 4
+
+
+def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
+        queued = [read(0), read(1)]
+        port.submit(queued, due)
+        sent = list(reaped(port, 2).array("sent"))
+    assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
+
+
+def test_rows_wait_for_columns_with_room(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        queued = [read(start) for start in range(5)]
+        port.submit(queued, [0] * 5)
+        wait_until(lambda: port.pending == 0)
+        first, second = Columns(3), Columns(3)
+        assert (port.reap(first, 0), port.reap(second, 0)) == (3, 2)
+        assert [*first.array("value"), *second.array("value")] == [0, 1, 2, 3, 4]
+
+
+def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        waiting = [read(0)]
+        port.submit(waiting, [now_ns() + 60_000_000_000])
+        found = port.carry_out(read(7))
+        assert (found.result, found.reply.data) == (7, words(7))
+        assert port.pending == 1
+
+
+def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        found = port.carry_out(read(3), expires_ns=now_ns() - 1)
+        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+        assert port.carry_out(read(4)).result == 7
+    assert heard == [4]
 
 
 def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
-    port, done = Port(fd, NO_SETTINGS), Completions(2)
-    assert port.run([read(0), read(1)], done) == 2
-    assert [found.status for found in done] == [EXCEPTION_STATUS + 2] * 2
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        assert port.carry_out(read(0)).status == EXCEPTION_STATUS + 2
 
 
 def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
-    port, done = Port(fd, NO_SETTINGS), Completions(3)
-    assert port.run([read(0), read(1, timeout=0.02), read(2)], done) == 3
-    assert [found.status for found in done] == [0, -Result.NO_REPLY, 0]
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        queued = [read(0), read(1, timeout=0.02), read(2)]
+        port.submit(queued, [0] * 3)
+        assert list(reaped(port, 3).array("status")) == [0, -Result.NO_REPLY, 0]
+
+
+def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> None:
+    slow = Respondent(least_timeout=0.01, most_timeout=0.02)
+    fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        queued = [read(1, respondent=slow), read(2, respondent=slow)]
+        port.submit(queued, [0] * 2)
+        assert list(reaped(port, 2).array("status")) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+        assert slow.failures == 1
+        wait_until(lambda: now_ns() > slow.late_until_ns)
+        assert port.carry_out(queued[1]).result == 7
 
 
 def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
@@ -137,42 +224,43 @@ def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
     stop = Exchange(
         Framing.RTU,
         Message(0, 0x06, 0x2000, data=words(1)),
+        Respondent(least_timeout=5, most_timeout=5),
         baudrate=115_200,
         format="8N1",
         character=1e-6,
         silence=1e-4,
-        timeout=5,
         turnaround=1e-3,
     )
-    port, done = Port(drive(answer), NO_SETTINGS), Completions(2)
-    assert port.run([stop, read(7)], done) == 2
-    assert [found.status for found in done] == [0, 0]
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        sent, read_back = port.carry_out(stop), port.carry_out(read(7))
+    assert (sent.status, read_back.status) == (0, 0)
     assert heard == [0, 1]
-    assert done[1].sent_ns - done[0].sent_ns >= 1_000_000  # the turnaround delay
+    assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
 
-def test_run_ends_where_the_line_is_lost() -> None:
+def test_all_that_is_queued_on_a_lost_port_says_so() -> None:
     near, far = socket.socketpair()
     near.setblocking(False)
-    port, done = Port(near.fileno(), NO_SETTINGS), Completions(3)
-    far.close()
-    assert port.run([read(0), read(1), read(2)], done) == 1
-    assert done[0].result == Result.LINE_LOST
+    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        far.close()
+        queued = [read(0), read(1), read(2)]
+        port.submit(queued, [0] * 3)
+        assert list(reaped(port, 3).array("status")) == [-Result.LINE_LOST] * 3
+        assert port.lost
+        assert port.carry_out(read(0)).result == Result.LINE_LOST
     near.close()
-    assert port.run([read(0)], done) == 1
-    assert (done[0].result, done[0].error) == (Result.LINE_LOST, errno.EBADF)
 
 
 def test_pty_whose_far_end_hangs_up() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
-    port, done = Port(slave, ANY_SETTINGS), Completions(2)
-    os.close(master)
-    assert port.run([read(0), read(1)], done) == 1
-    assert (done[0].result, done[0].error) in (
-        (Result.LINE_LOST, errno.EIO),
-        (Result.LINE_LOST, 0),  # the end of the file
-    )
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        os.close(master)
+        found = port.carry_out(read(0))
+        assert (found.result, found.error) in (
+            (Result.LINE_LOST, errno.EIO),
+            (Result.LINE_LOST, 0),  # the end of the file
+        )
     os.close(slave)
 
 
@@ -181,57 +269,58 @@ def test_refused_settings_that_must_be_taken() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     os.set_blocking(master, False)
-    done = Completions(1)
-    assert Port(slave, PARITY).run([read(0, format="8E1")], done) == 1
-    assert (done[0].result, done[0].error, done[0].sent_ns) == (Result.SETTINGS_REFUSED, PARITY, 0)
+    with closing(Port(slave, PARITY)) as port:
+        found = port.carry_out(read(0, format="8E1"))
+        assert (found.result, found.error, found.sent_ns) == (Result.SETTINGS_REFUSED, PARITY, 0)
     with pytest.raises(BlockingIOError):
         os.read(master, 1)
-    assert Port(slave, ANY_SETTINGS).run([read(0, format="8E1", timeout=0.001)], done) == 1
-    assert done[0].result == Result.NO_REPLY
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        assert port.carry_out(read(0, format="8E1", timeout=0.001)).result == Result.NO_REPLY
     os.close(slave)
     os.close(master)
 
 
 def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
-    done = Completions(1)
-    assert Port(drive(echo_start), ANY_SETTINGS).run([read(0)], done) == 1
-    assert (done[0].result, done[0].error) == (Result.LINE_LOST, errno.ENOTTY)
+    with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
+        found = port.carry_out(read(0))
+        assert (found.result, found.error) == (Result.LINE_LOST, errno.ENOTTY)
 
 
-def test_yielding_keeps_a_run_from_beginning(drive: Drive) -> None:
-    port, done = Port(drive(echo_start), NO_SETTINGS), Completions(2)
-    port.yield_now(True)
-    assert port.run([read(0), read(1)], done) == len(done) == 0
-    port.yield_now(False)
-    assert port.run([read(0), read(1)], done) == 2
+def test_a_descriptor_that_is_none_is_refused() -> None:
+    with pytest.raises(OSError, match="cannot be waited for"):
+        Port(-1, NO_SETTINGS)
 
 
-def test_yielding_ends_a_run_after_the_exchange_under_way(drive: Drive) -> None:
-    ports: list[Port] = []
+def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Drive) -> None:
+    heard = threading.Event()
 
-    def answer(request: Message) -> bytes:
-        ports[0].yield_now(request.start == 2)  # while this exchange is under way
-        return echo_start(request)
+    def answer(_: Message) -> bytes:
+        heard.set()
+        return b""
 
-    ports.append(Port(drive(answer), NO_SETTINGS))
-    done = Completions(5)
-    assert ports[0].run([read(start) for start in range(5)], done) == 3
-    assert [found.reply.start for found in done] == [0, 1, 2]
-
-
-def test_more_exchanges_than_room_for_what_becomes_of_them() -> None:
-    port = Port(0, NO_SETTINGS)
-    with pytest.raises(ValueError, match="3 exchanges, but room for 2 completions"):
-        port.run([read(0)] * 3, Completions(2))
+    port = Port(drive(answer), NO_SETTINGS)
+    found: list[int] = []
+    waiting = threading.Thread(target=lambda: found.append(port.carry_out(read(0, timeout=60)).result))
+    waiting.start()
+    heard.wait()
+    port.close()
+    waiting.join()
+    assert found == [Result.LINE_LOST]
 
 
-def test_completions_end_where_the_run_did(drive: Drive) -> None:
-    port, done = Port(drive(echo_start), NO_SETTINGS), Completions(5)
-    port.run([read(0), read(1)], done)
-    assert len(list(done)) == 2
-    for at in (2, -1):
-        with pytest.raises(IndexError):
-            done[at]
+def test_ports_come_and_go(drive: Drive) -> None:
+    """Opened and closed a thousand times, under way or not, on one engine."""
+    before = len(list(Path("/dev/fd").iterdir()))
+    for start in range(1000):
+        near, far = socket.socketpair()
+        near.setblocking(False)
+        port = Port(near.fileno(), NO_SETTINGS, room=4)
+        queued = [read(start)]
+        port.submit(queued, [0])
+        port.close()
+        near.close()
+        far.close()
+    assert len(list(Path("/dev/fd").iterdir())) == before
 
 
 @pytest.mark.parametrize("result", list(Result))

@@ -13,6 +13,7 @@ from multidrop.core import (
     Exchange,
     Framing,
     Message,
+    Respondent,
     Result,
     build_reply,
     build_request,
@@ -41,11 +42,11 @@ def exchange(framing: Framing, request: Message) -> Exchange:
     return Exchange(
         framing,
         request,
+        Respondent(least_timeout=0.1, most_timeout=0.1),
         baudrate=9600,
         format="8N1",
         character=1e-3,
         silence=4e-3,
-        timeout=0.1,
         turnaround=0.2,
     )
 

@@ -168,7 +168,7 @@ def test_csv_as_it_stands(tmp_path: Path) -> None:
         '2026-11-21T09:30:01.123456789Z,2000000000,,"fan, the ""old"" one",output_frequency,,exception 12',
         "2026-11-21T09:30:02.123456789Z,3000000000,,насос,motor_speed,,no reply",
         '2026-11-21T09:30:03.123456789Z,4000000000,,"fan, the ""old"" one",motor_speed,,'
-        "not asked: the drive is silent",
+        "not asked: drive is silent",
     ]
     assert json.loads((tmp_path / "a.csv.json").read_text(encoding="utf-8")) == METADATA
 

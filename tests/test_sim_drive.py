@@ -1,5 +1,7 @@
 """A simulated drive of a class of one's own: memory, access, limits, refusals, counters."""
 
+import math
+
 import pytest
 
 from multidrop.core import Message, Wire
@@ -38,6 +40,7 @@ class Own(Drive):
     )
     total = setting(0x12, wire=Wire.U32)
     frequency = command(0x30, "Hz", step=0.01, span=(0, 50), kept=Kept.RAM)
+    offset = setting(0x40, "%", wire=Wire.I16, span=(-100, 100))
     relay = setting(0x05, table=COIL)
     lamp = setting(0x06, table=COIL)
     door = reading(0x05, table=DISCRETE)
@@ -136,6 +139,18 @@ def test_a_write_of_several_happens_whole_or_not_at_all(sim: SimulatedDrive) -> 
 def test_refusals(sim: SimulatedDrive, function: int, start: int, count: int, data: bytes, code: int) -> None:
     assert exception_of(ask(sim, function, start, count, data)) == code
     assert sim.counters.refusals == 1
+
+
+def test_a_span_knows_signs(sim: SimulatedDrive) -> None:
+    assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9c")) == 0  # -100
+    assert sim["offset"] == -100
+    assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9b")) == 3
+
+
+def test_a_dead_drive(sim: SimulatedDrive) -> None:
+    sim.deaf_until = math.inf
+    assert ask(sim, 4, 1, 1) is None
+    assert sim.counters.requests == 0
 
 
 def test_diagnostics_echo(sim: SimulatedDrive) -> None:

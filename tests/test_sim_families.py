@@ -9,7 +9,7 @@ from __future__ import annotations
 import checksums
 import pytest
 
-from multidrop.core import Framing, Message, build_request
+from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.delixi_native import PARAMETER, DelixiNative
@@ -18,7 +18,7 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE, parameter
 from multidrop.drives.yd1000 import YD1000
 from multidrop.register import setting
-from multidrop.sim import PoweredDrive, Wire, simulated
+from multidrop.sim import EncodedDrive, PoweredDrive, Wire, encoded, simulated
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.yd1000 import SimulatedYD1000
 
@@ -263,7 +263,7 @@ def test_che_stops_along_the_ramp_or_coasts(che: Bench, word: int, stopped_after
 
 
 def test_che_in_a_fault(che: Bench) -> None:
-    che.motor.trip(10)
+    che.sim.trip(10)
     assert (che.ask(3, 0x1001), che.ask(3, 0x5000)) == ([4], [10])
     assert che.write(0x1000, 1) == 0x01  # "or the drive has a fault"
     assert che.write(0x1000, 7) == 0
@@ -370,7 +370,7 @@ def test_ibd_its_outputs_say_what_the_motor_does_if_they_are_programmed(ibd: Ben
     ibd.say("01 06 20 00 00 01 43 CA")
     ibd.wait(1)
     assert ibd.ask(3, 22) == [0x1800 | 1 << 8 | 1 << 10]
-    ibd.motor.trip(1)
+    ibd.sim.trip(1)
     assert ibd.ask(3, 22) == [0x1800 | 1 << 13]
     ibd.sim["output_virtual"] = 1
     assert ibd.ask(3, 22) == [0x1800]
@@ -407,7 +407,7 @@ def test_ibd_obeys_a_broadcast_in_silence(ibd: Bench) -> None:
 
 
 def test_ibd_the_bit_that_is_delixi_s_forward_resets_the_fault(ibd: Bench) -> None:
-    ibd.motor.trip(1)
+    ibd.sim.trip(1)
     ibd.say("01 06 20 00 00 10 83 C6")  # built
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
@@ -435,7 +435,7 @@ def test_delixi_shows_its_frequency(delixi: Bench) -> None:
     delixi.say("01 06 20 00 00 12 02 07")
     delixi.wait(60)
     assert delixi.say("01 03 01 F4 00 01 C4 04") == "01 03 02 13 88 B5 12"
-    delixi.motor.trip(9)
+    delixi.sim.trip(9)
     assert delixi.ask(3, 0x0213) == [9]
     assert delixi.ask(3, 0x020D) == [9]
 
@@ -497,7 +497,7 @@ def test_native_shows_its_frequency_and_state(native: Bench) -> None:
     [(9, "00000009", 4), (10, "00000010", 4), (14, "00000014", 4), (7, "00000007", 5)],
 )
 def test_native_faults_are_shown_as_printed(native: Bench, fault: int, shown: str, state: int) -> None:
-    native.motor.trip(fault)
+    native.sim.trip(fault)
     assert native.say(":01070213000000001D")[9:17] == shown
     assert native.say(":010300000000000004")[5:9] == f"{state:04X}"
     assert native.say(":010200040000000007") == ":010200040000000007"  # reset
@@ -533,7 +533,7 @@ def test_native_limits_and_locks() -> None:
 
 
 def test_native_start_in_a_fault_cannot_be_executed(native: Bench) -> None:
-    native.motor.trip(1)
+    native.sim.trip(1)
     assert native.say(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
@@ -638,7 +638,7 @@ def test_yd_freezes_what_it_shows_in_a_trip(yd: Bench) -> None:
 
 def test_yd_restarts_on_a_reset_and_is_deaf_meanwhile(yd: Bench) -> None:
     yd.write(0x1001, 5000)
-    yd.motor.trip(3)
+    yd.sim.trip(3)
     assert yd.write(0x1000, RESET) == 0
     assert yd.write(0x1000, STOP) is None
     yd.wait(2.5)
@@ -692,3 +692,20 @@ def test_every_declared_register_can_be_read_or_written_as_declared(family: type
             )
         if register.writable:
             assert bench.sim.memory.writable(register.table.write or 0, register.address)
+
+
+@pytest.mark.parametrize("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
+def test_every_family_can_be_encoded(family: type[Drive]) -> None:
+    """What is read of a register is what `encoded` says, through whole frames."""
+    drive = family(5)
+    wire = Wire([EncodedDrive(drive)], unpaced=True)
+    for at, register in enumerate(it for it in family.registers.values() if it.readable):
+        table = register.table
+        asked = Message(5, table.read or 0, register.address, 1)
+        if drive.framing is Framing.DELIXI:
+            asked = Message(5, table.read or 0, register.address, data=bytes(4))
+        wire.receive(build_request(drive.framing, asked), float(at))
+        used, reply = parse_reply(drive.framing, wire.advance(at + 0.5), asked)
+        assert used > 0
+        assert reply is not None
+        assert int.from_bytes(reply.data) == encoded(5, table, register.address)

@@ -181,13 +181,15 @@ def test_a_tcp_port_needs_host_and_port(url: str) -> None:
         pass
 
 
-def _serve(connection: Connection) -> None:
-    serve([wire()], lambda simulator: connection.send(simulator.wires[0].path))
+def _serve(link: str, connection: Connection) -> None:
+    serve([wire(port=link)], lambda simulator: connection.send(simulator.wires[0].path))
 
 
-def test_a_line_in_another_process() -> None:
+def test_a_line_in_another_process_that_is_terminated(tmp_path: Path) -> None:
+    link = tmp_path / "hall-1"
     ours, theirs = multiprocessing.Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
+    arguments = (str(link), theirs)
+    process = multiprocessing.get_context("spawn").Process(target=_serve, args=arguments, daemon=True)
     process.start()
     try:
         assert ours.poll(60)
@@ -196,3 +198,5 @@ def test_a_line_in_another_process() -> None:
     finally:
         process.terminate()
         process.join()
+    assert process.exitcode == 0
+    assert not link.is_symlink()

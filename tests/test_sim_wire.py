@@ -130,6 +130,39 @@ def test_a_request_that_begins_while_a_reply_is_under_way_is_not_understood() ->
     assert sim.counters.requests == 1
 
 
+def test_where_no_document_demands_it_a_missing_silence_is_only_counted() -> None:
+    sim = SimulatedDrive(Own(1), response_delay=0.02)
+    wire = Wire([sim])
+    wire.receive(READ, 0.0)
+    end = timeline(wire, 5.0)[-1][0]
+    assert exchange(wire, READ, end + 1e-3) != b""
+    assert sim.counters.early == 1
+
+
+def test_a_quick_drive_does_not_wait_for_a_slow_one_s_late_reply() -> None:
+    slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
+    slow["value"], quick["value"] = 1, 2
+    wire = Wire([slow, quick])
+    wire.receive(READ, 0.0)
+    wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.2)
+    heard = timeline(wire, 5.0)
+    quick_reply, slow_reply = checksums.rtu("02 03 02 00 02"), checksums.rtu("01 03 02 00 01")
+    assert b"".join(piece for _, piece in heard) == quick_reply + slow_reply
+    assert heard[6][0] == pytest.approx(0.2 + 0.01 + (8 + 7) * CHARACTER_8N1)
+    assert heard[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
+
+
+def test_replies_that_meet_follow_one_another() -> None:
+    slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
+    wire = Wire([slow, quick])
+    wire.receive(READ, 0.0)
+    wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.487)
+    heard = timeline(wire, 5.0)
+    first, second = checksums.rtu("02 03 02 00 00"), checksums.rtu("01 03 02 00 00")
+    assert b"".join(piece for _, piece in heard) in (first + second, second + first)
+    assert heard[-1][0] - heard[0][0] == pytest.approx(13 * CHARACTER_8N1)
+
+
 def test_a_late_reply_is_sent_all_the_same() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2

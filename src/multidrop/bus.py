@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from multidrop.core import Completion, Completions, Exchange, Message, Result, raw_value
+from multidrop import core
+from multidrop.core import Completion, Exchange, Message, Respondent, Result, raw_value
 from multidrop.drive import Drive, Read, Script, Step, Wait
 from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
 from multidrop.line import Line, now_ns, sleep
@@ -17,21 +18,25 @@ D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)
 
 READ_ATTEMPTS = 3
+LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 
 
-def exchange(drive: Drive, request: Message) -> Exchange:
+def exchange(
+    drive: Drive, request: Message, respondent: Respondent, block: core.Block | None = None
+) -> Exchange:
     """What the core needs to carry out a request to this drive."""
     settings = drive.settings
     return Exchange(
         drive.framing,
         request,
+        respondent,
         baudrate=settings.baudrate,
         format=settings.format,
         character=settings.character,
         # One bit more: the other side may still be sending its second stop bit.
         silence=drive.needed_silence() + settings.bit,
-        timeout=drive.response_timeout,
         turnaround=drive.turnaround_delay,
+        block=block,
     )
 
 
@@ -48,7 +53,7 @@ class Bus:
         self.format = format
         self.drives: list[Drive] = []
         self.line = Line(port)
-        self._late_until_ns: dict[Drive, int] = {}
+        self._respondents: dict[Drive, Respondent] = {}
 
     def __enter__(self) -> Bus:
         return self
@@ -78,6 +83,10 @@ class Bus:
             if other.address == drive.address:
                 raise ValueError(f"address {drive.address} is taken by {other.name}")
         drive.perform = lambda script: self.perform(drive, script)
+        self._respondents[drive] = Respondent(
+            least_timeout=min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay)),
+            most_timeout=drive.response_timeout,
+        )
         self.drives.append(drive)
         return drive
 
@@ -103,10 +112,9 @@ class Bus:
         return {register.name: raw[register.name] for register in registers}
 
     def _ask(self, drive: Drive, block: Block) -> Message:
-        request = exchange(drive, block.request(drive.address))
         for attempt in range(READ_ATTEMPTS):
             try:
-                return self._reply(drive, self._carry_out(drive, request))
+                return self._reply(drive, self._carry_out(drive, block.request(drive.address)))
             except (NoReply, BadReply):
                 if attempt == READ_ATTEMPTS - 1:
                     raise
@@ -128,7 +136,7 @@ class Bus:
             if held == register.decode(raw):
                 return held
         what = f"{register.name} = {register.format(register.decode(raw))}"
-        completion = self._carry_out(drive, exchange(drive, write_request(drive, register, raw)))
+        completion = self._carry_out(drive, write_request(drive, register, raw))
         try:
             self._reply(drive, completion)
         except (NoReply, BadReply) as failure:
@@ -159,9 +167,7 @@ class Bus:
         raw = self._checked(drive, register, value)
         if raw not in register.broadcast:
             raise Refused(f"{drive.title} has no harmless broadcast of {register.name} = {value}")
-        completion = self._carry_out(drive, exchange(drive, write_request(drive, register, raw, address=0)))
-        if completion.result < 0:
-            raise self._failure(drive, completion)
+        self._carry_out(drive, write_request(drive, register, raw, address=0))
 
     def _checked(self, drive: Drive, register: Register[T], value: T) -> int:
         if register.never:
@@ -197,33 +203,29 @@ class Bus:
 
     # ---- exchanges ----
 
-    def _carry_out(self, drive: Drive, request: Exchange) -> Completion:
-        """One exchange, ahead of any polling. A drive that may still answer late is waited for first."""
-        still_late = self._late_until_ns.pop(drive, 0) - now_ns()
-        if still_late > 0:
-            sleep(still_late / 1e9)
-        completions = Completions(1)
-        self.line.run_urgent(request, completions)
-        completion = completions[0]
-        if completion.result in (Result.NO_REPLY, Result.CUT_SHORT):
-            self._late_until_ns[drive] = now_ns() + round(drive.response_timeout * 1e9)
-        return completion
+    def _carry_out(self, drive: Drive, request: Message) -> Completion:
+        """One exchange, ahead of any polling; first an answer that may still come late is waited for."""
+        made = exchange(drive, request, self.respondent(drive))
+        while True:
+            late_until_ns = made.respondent.late_until_ns
+            completion = self.line.carry_out(made)
+            if completion.result != Result.LATE_ANSWER_DUE:
+                return completion
+            sleep(max(0, late_until_ns - now_ns()) / 1e9)
+
+    def respondent(self, drive: Drive) -> Respondent:
+        """What is known of how this drive answers."""
+        return self._respondents[drive]
 
     def _reply(self, drive: Drive, completion: Completion) -> Message:
+        if completion.result == Result.NO_REPLY:
+            raise NoReply(drive.name)
         if completion.result <= 0:
-            raise self._failure(drive, completion)
+            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
         if completion.reply.exception:
             code = completion.reply.exception
             raise DriveRefused(drive.name, code, drive.exception(code))
         return completion.reply
-
-    def _failure(self, drive: Drive, completion: Completion) -> BusError:
-        lost = self.line.failure(completion.result, completion.error)
-        if lost:
-            return lost
-        if completion.result == Result.NO_REPLY:
-            return NoReply(drive.name)
-        return BadReply(drive.name, str(Result(completion.result)), completion.raw)
 
 
 def _why(failure: BusError) -> str:

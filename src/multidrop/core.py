@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple
 
@@ -57,6 +57,8 @@ class Result(IntEnum):
     NO_REPLY = lib.MD_NO_REPLY
     LINE_LOST = lib.MD_LINE_LOST
     SETTINGS_REFUSED = lib.MD_SETTINGS_REFUSED
+    LATE_ANSWER_DUE = lib.MD_LATE_ANSWER_DUE
+    EXPIRED = lib.MD_EXPIRED
     NOT_ASKED = lib.MD_NOT_ASKED
 
     def __str__(self) -> str:
@@ -77,7 +79,9 @@ _REASONS = {
     Result.NO_REPLY: "no reply",
     Result.LINE_LOST: "port lost",
     Result.SETTINGS_REFUSED: "port refused its settings",
-    Result.NOT_ASKED: "not asked: the drive is silent",
+    Result.LATE_ANSWER_DUE: "not asked: late reply due",
+    Result.EXPIRED: "not sent: expired",
+    Result.NOT_ASKED: "not asked: drive is silent",
 }
 
 EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
@@ -212,31 +216,89 @@ REFUSALS = {
 }
 
 
+class Respondent:
+    """What is known of a drive as one who answers (struct md_drive): shared by all its exchanges.
+
+    `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
+    bit to the reply's first; between them it is learnt from the drive's own response delays.
+    """
+
+    def __init__(self, *, least_timeout: float, most_timeout: float) -> None:
+        self.c = ffi.new(
+            "struct md_drive *",
+            {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
+        )
+
+    @property
+    def failures(self) -> int:
+        """Exchanges in a row without an answer."""
+        return int(self.c.failures)
+
+    @property
+    def late_until_ns(self) -> int:
+        """So long the answer to an earlier request may still come."""
+        return int(self.c.late_until_ns)
+
+    @property
+    def response_delay(self) -> float:
+        """In s, smoothed; 0 before the first reply."""
+        return float(self.c.delay_ns) / 1e9
+
+    def tally(self) -> Tally:
+        """What became of its exchanges so far."""
+        found = self.c.tally
+        return Tally(
+            found.exchanges,
+            found.answered,
+            found.values,
+            found.exceptions,
+            found.late,
+            found.stray_bytes,
+            found.ideal_ns,
+            {Result(-code): count for code, count in enumerate(found.missed) if count},
+        )
+
+
+class Tally(NamedTuple):
+    """What became of a drive's exchanges, by number (struct md_tally)."""
+
+    exchanges: int
+    answered: int
+    values: int
+    exceptions: int  # values that the drive refused
+    late: int
+    stray_bytes: int
+    ideal_ns: int
+    missed: dict[Result, int]  # values, by reason
+
+
 class Exchange:
     """One request and all that is needed to carry it out; made once, run as often as wanted.
 
     Times are in seconds: `character` of one character, `silence` before the request and after
-    its reply, `timeout` to the reply's first character, `turnaround` after a broadcast.
+    its reply, `turnaround` after a broadcast. `block` is what rows are made of.
     """
 
-    __slots__ = ("c", "framing", "reply_length", "request", "request_length", "settings")
+    __slots__ = ("block", "c", "framing", "request", "respondent", "settings")
 
     def __init__(
         self,
         framing: Framing,
         request: Message,
+        respondent: Respondent,
         *,
         baudrate: int,
         format: str,
         character: float,
         silence: float,
-        timeout: float,
         turnaround: float = 0.1,
+        block: Block | None = None,
     ) -> None:
-        self.request_length = len(build_request(framing, request))  # raises for what no frame can say
-        self.reply_length = reply_length(framing, request)
+        build_request(framing, request)  # raises for what no frame can say
         self.framing = framing
         self.request = request
+        self.respondent = respondent
+        self.block = block
         self.settings = (baudrate, format)
         self.c = ffi.new(
             "struct md_exchange *",
@@ -246,22 +308,11 @@ class Exchange:
                 "settings": _settings(baudrate, format),
                 "character_ns": round(character * 1e9),
                 "silence_ns": round(silence * 1e9),
-                "timeout_ns": round(timeout * 1e9),
                 "turnaround_ns": round(turnaround * 1e9),
+                "drive": respondent.c,
+                "block": block.c if block else ffi.NULL,
             },
         )
-
-    @property
-    def timeout_ns(self) -> int:
-        return int(self.c.timeout_ns)
-
-    @property
-    def silence_ns(self) -> int:
-        return int(self.c.silence_ns)
-
-    @property
-    def character_ns(self) -> int:
-        return int(self.c.character_ns)
 
 
 @dataclass(frozen=True)
@@ -270,6 +321,7 @@ class Completion:
 
     result: int
     error: int
+    begun_ns: int
     sent_ns: int
     first_ns: int
     last_ns: int
@@ -286,58 +338,97 @@ class Completion:
         return EXCEPTION_STATUS + self.reply.exception if self.reply.exception else 0
 
 
-class Completions:
-    """What became of a run of exchanges, in the core's own memory until it is looked at."""
+def new_completion() -> Any:
+    """The core's own memory for what becomes of one exchange (struct md_completion)."""
+    return ffi.new("struct md_completion *")
 
-    def __init__(self, room: int) -> None:
-        self.c = ffi.new("struct md_completion[]", room)
-        self.room = room
-        self.count = 0
 
-    def __len__(self) -> int:
-        return self.count
+def completion(found: Any) -> Completion:
+    """What the core's memory says."""
+    return Completion(
+        found.result,
+        found.error,
+        found.begun_ns,
+        found.sent_ns,
+        found.first_ns,
+        found.last_ns,
+        found.stale,
+        found.skipped,
+        _from_c(found.reply),
+        bytes(ffi.buffer(found.raw, found.raw_len)),
+    )
 
-    def __getitem__(self, at: int) -> Completion:
-        if not 0 <= at < self.count:
-            raise IndexError(at)
-        found = self.c[at]
-        return Completion(
-            found.result,
-            found.error,
-            found.sent_ns,
-            found.first_ns,
-            found.last_ns,
-            found.stale,
-            found.skipped,
-            _from_c(found.reply),
-            bytes(ffi.buffer(found.raw, found.raw_len)),
-        )
 
-    def __iter__(self) -> Iterator[Completion]:
-        return (self[at] for at in range(self.count))
+class _Engine:
+    """The core's thread, started when the first port is opened; there is one in a process."""
+
+    def __init__(self) -> None:
+        self.c = lib.md_engine_start()
+        if self.c == ffi.NULL:
+            raise OSError(ffi.errno, "the core's thread cannot be started")
+
+
+@cache
+def _engine() -> _Engine:
+    return _Engine()
+
+
+def notice_fd() -> int:
+    """A descriptor that is readable when a port wants more exchanges; one client reads it empty."""
+    return int(lib.md_engine_notice(_engine().c))
 
 
 class Port:
-    """A line driven on a descriptor (struct md_port).
+    """A line driven on a descriptor by the core's thread (struct md_port).
 
-    `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings.
+    `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings. `room` is
+    how many exchanges may be queued, a power of two. OSError where the descriptor cannot be waited for.
     """
 
-    def __init__(self, fd: int, must_take: int) -> None:
-        self.c = ffi.new("struct md_port *")
-        lib.md_port_init(self.c, fd, must_take)
+    def __init__(self, fd: int, must_take: int, room: int = 256) -> None:
+        self.c = lib.md_port_open(_engine().c, fd, must_take, room)
+        if self.c == ffi.NULL:
+            raise OSError(ffi.errno, "the port cannot be waited for")
+        self.room = room
+        self._stopped = False
 
-    def run(self, exchanges: Sequence[Exchange], completions: Completions) -> int:
-        """Carry them out one after another, without the interpreter lock; how many were completed."""
-        if len(exchanges) > completions.room:
-            raise ValueError(f"{len(exchanges)} exchanges, but room for {completions.room} completions")
+    def stop(self) -> None:
+        """Nothing more is carried out, and the descriptor is the caller's; what was can be reaped."""
+        if not self._stopped:
+            lib.md_port_stop(self.c)
+            self._stopped = True
+
+    def close(self) -> None:
+        """Stop, and forget what was not reaped."""
+        self.stop()
+        lib.md_port_free(self.c)
+        self.c = ffi.NULL
+
+    def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
+        """Queue exchanges, none to be sent before its time; how many there was room for."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
-        completions.count = lib.md_run(self.c, todo, completions.c, len(exchanges))
-        return int(completions.count)
+        times = ffi.new("int64_t[]", not_before_ns)
+        return int(lib.md_port_submit(self.c, todo, times, len(exchanges)))
 
-    def yield_now(self, wanted: bool) -> None:
-        """Make a run under way return after its present exchange, until this is taken back."""
-        lib.md_port_yield(self.c, wanted)
+    @property
+    def pending(self) -> int:
+        """How many queued exchanges are not carried out yet."""
+        return int(lib.md_port_pending(self.c))
+
+    @property
+    def lost(self) -> bool:
+        """The descriptor failed, and nothing more is carried out on it."""
+        return bool(lib.md_port_lost(self.c))
+
+    def reap(self, columns: Columns, utc_minus_monotonic_ns: int) -> int:
+        """Make rows of what was carried out; how many exchanges, fewer when the columns are full."""
+        return int(lib.md_port_reap(self.c, columns.c, utc_minus_monotonic_ns))
+
+    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
+        """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
+        found = ffi.new("struct md_completion *")
+        lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
+        return completion(found)
 
 
 class Field(NamedTuple):
@@ -387,14 +478,18 @@ class Columns:
     def __len__(self) -> int:
         return int(self.c.rows)
 
-    def add(self, block: Block, completions: Completions, at: int, utc_minus_monotonic_ns: int) -> bool:
-        """Append the rows of one completion; False when there is no room for all of them."""
-        return bool(lib.md_columns_add(self.c, block.c, completions.c + at, utc_minus_monotonic_ns))
+    def add(self, block: Block, found: Any, utc_minus_monotonic_ns: int) -> bool:
+        """Append the rows of one struct md_completion; False when there is no room for all of them."""
+        return bool(lib.md_columns_add(self.c, block.c, found, utc_minus_monotonic_ns))
 
     def add_miss(self, block: Block, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
         """Append rows for values that were due at `due_ns` but never asked for."""
         missed = ffi.new("struct md_completion *", {"result": result, "sent_ns": due_ns})
         return bool(lib.md_columns_add(self.c, block.c, missed, utc_minus_monotonic_ns))
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.c.rows = 0
 
     def array(self, name: str) -> memoryview[Any]:
         """A column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""

@@ -6,20 +6,19 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import socket
 import termios
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from itertools import groupby
+from contextlib import suppress
 
 import serial
 
-from multidrop.core import REFUSALS, Completions, Exchange, Port, Result, now_ns
+from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, notice_fd, now_ns
 from multidrop.errors import LineError
 
-__all__ = ["Line", "Wake", "now_ns", "sleep", "utc_minus_monotonic_ns"]
+__all__ = ["Line", "Wake", "await_notice", "now_ns", "sleep", "utc_minus_monotonic_ns"]
 
 sleep = time.sleep
 
@@ -53,10 +52,6 @@ def _reason(failure: BaseException) -> str:
     return str(failure)
 
 
-def _lost(error: int) -> str:
-    return f"the port was lost ({os.strerror(error) if error else 'hung up'})"
-
-
 class Wake:
     """A descriptor that becomes readable when it is set: for select, poll or an asyncio loop."""
 
@@ -82,12 +77,20 @@ class Wake:
         os.close(self._writer)
 
 
+def await_notice(seconds: float) -> None:
+    """Until a port's queue wants more, or for so long."""
+    fd = notice_fd()
+    if select.select([fd], [], [], seconds)[0]:
+        os.read(fd, 8)
+
+
 class _Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction."""
 
     def __init__(self, port: serial.SerialBase) -> None:
         self._port = port
         self._port.timeout = 0.01
+        self._settings: tuple[int, str] | None = None
         self._ours, self.theirs = socket.socketpair()
         self.theirs.setblocking(False)
         self._closing = threading.Event()
@@ -113,11 +116,15 @@ class _Bridge:
         with suppress(OSError):
             self._ours.shutdown(socket.SHUT_RDWR)
 
-    def set(self, baudrate: int, format: str) -> None:
-        self._port.baudrate = baudrate
-        self._port.bytesize = int(format[0])
-        self._port.parity = format[1]
-        self._port.stopbits = int(format[2])
+    def takes(self, settings: tuple[int, str]) -> bool:
+        """Make them the port's; False when it has others already, which its queue may still need."""
+        if self._settings is None:
+            baudrate, format = self._settings = settings
+            self._port.baudrate = baudrate
+            self._port.bytesize = int(format[0])
+            self._port.parity = format[1]
+            self._port.stopbits = int(format[2])
+        return self._settings == settings
 
     def close(self) -> None:
         self._closing.set()
@@ -129,18 +136,16 @@ class _Bridge:
 
 
 class Line:
-    """An open port. Exchanges are carried out one at a time; urgent ones go ahead of the others.
+    """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
 
     `port` is a device or any pyserial URL. Every failure of the port is a LineError.
     """
 
     def __init__(self, port: str) -> None:
         self.port = port
-        self._turn = threading.Condition()
-        self._busy = False
-        self._urgent = 0
         self._bridge: _Bridge | None = None
         self._core: Port | None = None
+        self._lock = threading.RLock()  # one opens, closes or queues at a time
         self._open()
 
     def _open(self) -> None:
@@ -169,9 +174,11 @@ class Line:
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
 
     def close(self) -> None:
-        """Close the port; an exchange under way is finished first."""
-        with self._taking_turn(urgent=True):
-            self._core = None
+        """Close the port; what is queued and not yet sent never will be."""
+        with self._lock:
+            if self._core:
+                self._core.close()
+                self._core = None
             if self._bridge:
                 self._bridge.close()
                 self._bridge = None
@@ -180,57 +187,35 @@ class Line:
 
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
-        self.close()
-        with self._taking_turn(urgent=True):
+        with self._lock:
+            self.close()
             self._open()
 
-    @contextmanager
-    def _taking_turn(self, *, urgent: bool) -> Iterator[None]:
-        with self._turn:
-            if urgent:
-                self._urgent += 1
-                self._yield_now(True)
-                self._turn.wait_for(lambda: not self._busy)
-                self._urgent -= 1
-                self._yield_now(False)
-            else:
-                self._turn.wait_for(lambda: not self._busy and not self._urgent)
-            self._busy = True
-        try:
-            yield
-        finally:
-            with self._turn:
-                self._busy = False
-                self._turn.notify_all()
-
-    def _yield_now(self, wanted: bool) -> None:
-        if self._core:
-            self._core.yield_now(wanted)
-
-    def run(self, exchanges: Sequence[Exchange], completions: Completions) -> int:
-        """Carry them out in turn; how many were, fewer when something urgent or a failure came between."""
-        with self._taking_turn(urgent=False):
-            return self._run(exchanges, completions)
-
-    def run_urgent(self, exchange: Exchange, completions: Completions) -> None:
-        """Carry one out ahead of everything else."""
-        with self._taking_turn(urgent=True):
-            self._run([exchange], completions)
-
-    def _run(self, exchanges: Sequence[Exchange], completions: Completions) -> int:
+    def _opened(self, settings: tuple[int, str]) -> Port:
         if self._core is None:
             raise LineError(self.port, "it is closed")
-        if self._bridge is None:
-            return self._core.run(exchanges, completions)
-        (baudrate, format), group = next(groupby(exchanges, lambda exchange: exchange.settings))
-        self._bridge.set(baudrate, format)
-        return self._core.run(list(group), completions)
+        if self._bridge and not self._bridge.takes(settings):
+            raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
+        return self._core
 
-    def failure(self, result: int, error: int) -> LineError | None:
-        """The error that a completion's result means for the port, if it does."""
+    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
+        """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
+        core = self._opened(exchange.settings)
+        found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
+        failure = self._failure(found.result, found.error)
+        if failure:
+            raise failure
+        return found
+
+    def _failure(self, result: int, error: int) -> LineError | None:
         if result == Result.LINE_LOST:
-            return LineError(self.port, _lost(error))
+            return LineError(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
         if result == Result.SETTINGS_REFUSED:
             refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
             return LineError(self.port, f"the port does not take the {refused} that the drive needs")
         return None
+
+    @property
+    def queue(self) -> Port | None:
+        """The core's port, for whoever keeps it busy; None while it is closed."""
+        return self._core

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.core import Completion, Exchange, Message, build_request, reply_length
+from multidrop.core import Message, build_request, reply_length
 from multidrop.drive import Drive
 from multidrop.register import Carrier, Register, Table
 
@@ -38,14 +38,6 @@ def duration(drive: Drive, block: Block) -> float:
     request = block.request(drive.address)
     characters = len(build_request(drive.framing, request)) + reply_length(drive.framing, request)
     return characters * drive.settings.character + drive.needed_silence() + drive.response_delay
-
-
-def ideal_ns(exchange: Exchange, completion: Completion) -> int:
-    """What an answered exchange had to take: silence, characters, and the drive's own response delay."""
-    character = exchange.character_ns
-    request_ns = exchange.request_length * character
-    delay_ns = completion.first_ns - completion.sent_ns - request_ns - character
-    return exchange.silence_ns + request_ns + max(0, delay_ns) + exchange.reply_length * character
 
 
 def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:

@@ -1,34 +1,37 @@
-"""Poller: plan, schedule and line together, turned into batches of columns.
+"""Poller: plan, schedule and lines together, turned into batches of columns.
 
-One thread a line tops up the core with exchanges and collects what became of them. Rows gather in
-one table of bounded size; whoever takes them gets all that came since the last time.
+One thread for all lines tops up the core's queues, many exchanges at a time and some way ahead, and
+collects what became of them; the lines themselves are kept busy by the core's own thread, which
+waits for nobody. Rows gather in chunks of bounded number; whoever takes them gets the oldest first.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
 from multidrop import core, plant
 from multidrop.batch import Batch
 from multidrop.bus import Bus, exchange
-from multidrop.core import Columns, Completion, Completions, Exchange, Field, Result, now_ns
+from multidrop.core import Columns, Exchange, Field, Port, Result, now_ns
 from multidrop.drive import Drive
 from multidrop.errors import LineError
-from multidrop.line import Wake, sleep, utc_minus_monotonic_ns
-from multidrop.plan import Block, blocks, duration, ideal_ns
+from multidrop.line import Wake, await_notice, sleep, utc_minus_monotonic_ns
+from multidrop.plan import Block, blocks, duration
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
 
-RUN_NS = 50_000_000  # a run of exchanges takes about so long, so that its rows arrive soon
-RUN_EXCHANGES = 256
-REOPEN_S = 0.5  # between attempts to open a port that was lost
+LOOK_S = 0.02  # the longest that rows wait to be collected
+AHEAD_NS = 150_000_000  # so far ahead the lines are planned
+REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 CHUNK_ROWS = 1 << 14
+MOST_FIELDS = 2000  # of a block: as many bits as one reply holds
 MOST_CHUNKS = 64  # that wait to be taken; further rows are dropped, and counted
 
 
@@ -61,25 +64,12 @@ def _code(names: list[str], name: str) -> int:
     return names.index(name)
 
 
-@dataclass
-class Tally:
-    """What became of a drive's exchanges so far."""
-
-    exchanges: int = 0
-    answered: int = 0
-    values: int = 0
-    skipped_bytes: int = 0
-    ideal_ns: int = 0  # what the answered exchanges had to take
-    misses: Counter[str] = field(default_factory=Counter)
-
-
 @dataclass(eq=False, kw_only=True)
 class _Asked(Job):
-    """A job with all that is needed to ask, and to make rows of the answer."""
+    """A job with what the core needs to carry it out and to make rows of it."""
 
     exchange: Exchange
     fields: core.Block
-    tally: Tally
 
 
 class _Rows:
@@ -92,26 +82,35 @@ class _Rows:
         self._lock = threading.Lock()
         self._chunks = deque([Columns(CHUNK_ROWS)])
 
-    def add(self, jobs: Sequence[_Asked], completions: Completions) -> None:
+    def collect(self, port: Port) -> int:
+        """Make rows of all that a port has carried out; how many exchanges that were."""
         offset = utc_minus_monotonic_ns()
+        count = 0
         with self._lock:
-            for at, job in enumerate(jobs):
-                if not self._room(job.fields.count).add(job.fields, completions, at, offset):
-                    self.dropped += job.fields.count
-        self.wake.set()
+            while True:
+                columns = self._last()
+                count += port.reap(columns, offset)
+                if CHUNK_ROWS - len(columns) >= MOST_FIELDS:
+                    break
+        if count:
+            self.wake.set()
+        return count
 
     def add_misses(self, slots: Iterable[tuple[_Asked, int]], why: Result) -> None:
         offset = utc_minus_monotonic_ns()
         with self._lock:
             for job, due_ns in slots:
-                job.tally.misses[str(why)] += job.fields.count
-                if not self._room(job.fields.count).add_miss(job.fields, why, due_ns, offset):
-                    self.dropped += job.fields.count
+                self._last().add_miss(job.fields, why, due_ns, offset)
         self.wake.set()
 
-    def _room(self, rows: int) -> Columns:
-        if CHUNK_ROWS - len(self._chunks[-1]) < rows and len(self._chunks) < MOST_CHUNKS:
-            self._chunks.append(Columns(CHUNK_ROWS))
+    def _last(self) -> Columns:
+        """A chunk with room for any block; when too many wait, the newest one's rows are dropped."""
+        if CHUNK_ROWS - len(self._chunks[-1]) < MOST_FIELDS:
+            if len(self._chunks) < MOST_CHUNKS:
+                self._chunks.append(Columns(CHUNK_ROWS))
+            else:
+                self.dropped += len(self._chunks[-1])
+                self._chunks[-1].clear()
         return self._chunks[-1]
 
     def take(self) -> Batch | None:
@@ -127,116 +126,149 @@ class _Rows:
 
 
 class _PolledLine:
-    """A line's bus, its schedule, and the thread that keeps it busy."""
+    """A line's bus, its schedule, and what is queued on it."""
 
     def __init__(self, declared: plant.Line, rows: _Rows, codes: _Codes) -> None:
         self.name = declared.name
         self.bus = Bus(declared.port)
-        self.tallies: dict[str, Tally] = {}
+        self.schedule: Schedule[_Asked] = Schedule()
+        self.unasked: Counter[tuple[int, Result]] = Counter()  # values, by address and reason
         self.started_ns = self.ended_ns = now_ns()
-        self.jobs: list[_Asked] = []
         self._rows = rows
-        self._schedule: Schedule[_Asked] = Schedule()
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._poll, name=f"multidrop {self.name}", daemon=True)
+        self._jobs: list[_Asked] = []
+        self._average_ns = 0  # of what was queued last
+        self._reopening: threading.Thread | None = None
+        self._reopen_ns = 0
         for polled in declared.drives:
             self.bus.attach(polled.drive)
             self._declare(polled, codes)
 
     def _declare(self, polled: plant.PolledDrive, codes: _Codes) -> None:
         drive = polled.drive
-        tally = self.tallies[drive.name] = Tally()
+        respondent = self.bus.respondent(drive)
         rates: dict[float | None, list[Register[Any]]] = {}
         for poll in polled.polls:
             rates.setdefault(poll.every, []).append(poll.register)
         for every, registers in rates.items():
             for block in blocks(drive, registers):
-                self.jobs.append(
+                fields = codes.fields(drive, block)
+                self._jobs.append(
                     _Asked(
                         drive=drive.address,
                         period_ns=None if every is None else round(every * 1e9),
                         duration_ns=round(duration(drive, block) * 1e9),
-                        exchange=exchange(drive, block.request(drive.address)),
-                        fields=codes.fields(drive, block),
-                        tally=tally,
+                        exchange=exchange(drive, block.request(drive.address), respondent, fields),
+                        fields=fields,
                     )
                 )
 
     def start(self) -> None:
         self.started_ns = self.ended_ns = now_ns()
-        for job in sorted(self.jobs, key=_kinship):
-            self._schedule.add(job, self.started_ns)
-        self._thread.start()
+        for job in sorted(self._jobs, key=_kinship):
+            self.schedule.add(job, self.started_ns)
+
+    def tend(self, now: int) -> None:
+        """Collect what was carried out, and queue what comes next."""
+        self.ended_ns = now
+        port = self.bus.line.queue
+        if port is None:
+            self._regain(now)
+            return
+        count = self._rows.collect(port)
+        if port.lost:
+            self.bus.line.close()
+            self._reopen_ns = now
+            return
+        if count or port.pending == 0:
+            self._observe(now)
+            self._top_up(port, now)
+
+    def _observe(self, now: int) -> None:
+        for drive in self.bus.drives:
+            respondent = self.bus.respondent(drive)
+            self.schedule.observe(
+                drive.address,
+                respondent.failures,
+                now,
+                late_until_ns=respondent.late_until_ns,
+                cost_ns=round(drive.response_timeout * 1e9),
+            )
+
+    def _top_up(self, port: Port, now: int) -> None:
+        pending = port.pending
+        start_ns = now + pending * self._average_ns
+        queued = self.schedule.take(now, start_ns, now + AHEAD_NS, port.room - pending)
+        if queued:
+            port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
+            self._average_ns = sum(job.duration_ns for job, _ in queued) // len(queued)
+        if self.schedule.unasked:
+            self._miss(self.schedule.unasked, Result.NOT_ASKED)
+            self.schedule.unasked = []
+
+    def _miss(self, slots: list[tuple[_Asked, int]], why: Result) -> None:
+        for job, _ in slots:
+            self.unasked[job.drive, why] += job.fields.count
+        self._rows.add_misses(slots, why)
+
+    def _regain(self, now: int) -> None:
+        """Until the port is back every value that is due is missed because of it."""
+        if now < self._reopen_ns or (self._reopening and self._reopening.is_alive()):
+            return
+        self._miss(self.schedule.pass_all(now), Result.LINE_LOST)
+        self._reopen_ns = now + REOPEN_NS
+        self._reopening = threading.Thread(target=self._reopen, daemon=True)
+        self._reopening.start()
+
+    def _reopen(self) -> None:
+        with suppress(LineError):
+            self.bus.line.reopen()
 
     def close(self) -> None:
-        self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join()
+        if self._reopening:
+            self._reopening.join()
+        port = self.bus.line.queue
+        if port:
+            port.stop()
+            self._rows.collect(port)
         self.bus.close()
 
-    def _poll(self) -> None:
-        completions = Completions(RUN_EXCHANGES)
-        while not self._closing.is_set():
-            now = now_ns()
-            jobs = self._schedule.take(now, RUN_NS)[:RUN_EXCHANGES]
-            unasked = self._schedule.unasked(now)
-            if unasked:
-                self._rows.add_misses(unasked, Result.NOT_ASKED)
-            if not jobs:
-                self._idle(now)
-            elif not self._run(sorted(jobs, key=_kinship), completions):
-                self._regain_port()
-            self.ended_ns = now_ns()
+    def summary(self) -> dict[str, Any]:
+        seconds = max((self.ended_ns - self.started_ns) / 1e9, 1e-9)
+        drives = {drive.name: self._told(drive, seconds) for drive in self.bus.drives}
+        tallies = [self.bus.respondent(drive).tally() for drive in self.bus.drives]
+        misses: Counter[str] = sum((Counter(it["misses"]) for it in drives.values()), Counter())
+        return {
+            "seconds": round(seconds, 3),
+            "exchanges": sum(tally.exchanges for tally in tallies),
+            "samples": sum(tally.values for tally in tallies),
+            "misses": dict(misses),
+            "late_replies": sum(tally.late for tally in tallies),
+            "stray_bytes": sum(tally.stray_bytes for tally in tallies),
+            "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
+            "overrun_slots": sum(job.skipped for job in self._jobs),
+            "drives": drives,
+        }
 
-    def _idle(self, now: int) -> None:
-        due_ns = self._schedule.next_ns(now)
-        wait_ns = RUN_NS if due_ns is None else min(max(0, due_ns - now), RUN_NS)
-        self._closing.wait(wait_ns / 1e9)
-
-    def _run(self, jobs: list[_Asked], completions: Completions) -> bool:
-        """Carry them out and make rows of what became of them; False when the port was lost."""
-        try:
-            count = self.bus.line.run([job.exchange for job in jobs], completions)
-        except LineError:
-            return False
-        now = now_ns()
-        lost = None
-        for job, completion in zip(jobs, completions, strict=False):
-            self._finished(job, completion, now)
-            lost = self.bus.line.failure(completion.result, completion.error)
-        self._rows.add(jobs[:count], completions)
-        return lost is None
-
-    def _finished(self, job: _Asked, completion: Completion, now: int) -> None:
-        tally = job.tally
-        tally.exchanges += 1
-        tally.skipped_bytes += completion.skipped + completion.stale
-        if completion.status:
-            tally.misses[core.status_text(completion.status)] += job.fields.count
-        else:
-            tally.values += job.fields.count
-        answered = completion.result > 0
-        if answered:
-            tally.answered += 1
-            tally.ideal_ns += ideal_ns(job.exchange, completion)
-        may_come_late = completion.result in (Result.NO_REPLY, Result.CUT_SHORT)
-        late_ns = job.exchange.timeout_ns if may_come_late else 0
-        self._schedule.done(job, now, answered=answered, late_ns=late_ns)
-
-    def _regain_port(self) -> None:
-        """Until the port is back every value that is due is missed because of it."""
-        while not self._closing.wait(REOPEN_S):
-            self._rows.add_misses(self._schedule.pass_all(now_ns()), Result.LINE_LOST)
-            try:
-                return self.bus.line.reopen()
-            except LineError:
-                continue
-        return None
+    def _told(self, drive: Drive, seconds: float) -> dict[str, Any]:
+        respondent = self.bus.respondent(drive)
+        tally = respondent.tally()
+        misses = Counter({str(why): count for why, count in tally.missed.items()})
+        misses.update({str(why): n for (address, why), n in self.unasked.items() if address == drive.address})
+        if tally.exceptions:
+            misses["exception"] = tally.exceptions
+        return {
+            "exchanges": tally.exchanges,
+            "samples": tally.values,
+            "exchanges_per_second": round(tally.answered / seconds, 2),
+            "samples_per_second": round(tally.values / seconds, 2),
+            "response_delay_ms": round(respondent.response_delay * 1e3, 3),
+            "misses": dict(misses),
+        }
 
 
 def _kinship(job: _Asked) -> tuple[object, ...]:
     """Exchanges of like settings and silence stand side by side, so that the line switches seldom."""
-    return (*job.exchange.settings, job.exchange.silence_ns)
+    return (*job.exchange.settings, job.exchange.c.silence_ns)
 
 
 class Poller:
@@ -250,6 +282,8 @@ class Poller:
         codes = _Codes()
         self._rows = _Rows(codes)
         self._lines: list[_PolledLine] = []
+        self._closing = False
+        self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         try:
             for declared in plant.lines:
                 self._lines.append(_PolledLine(declared, self._rows, codes))
@@ -260,6 +294,7 @@ class Poller:
     def __enter__(self) -> Poller:
         for line in self._lines:
             line.start()
+        self._thread.start()
         return self
 
     def __exit__(
@@ -272,8 +307,17 @@ class Poller:
 
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be."""
+        self._closing = True
+        if self._thread.is_alive():
+            self._thread.join()
         for line in self._lines:
             line.close()
+
+    def _poll(self) -> None:
+        while not self._closing:
+            for line in self._lines:
+                line.tend(now_ns())
+            await_notice(LOOK_S)
 
     def bus(self, line: str) -> Bus:
         """The bus of the line with this name."""
@@ -300,35 +344,10 @@ class Poller:
 
     def summary(self) -> dict[str, Any]:
         """So far, per line and drive: exchanges, values, misses by reason, rates, utilisation."""
-        lines = {line.name: _line_summary(line) for line in self._lines}
+        lines = {line.name: line.summary() for line in self._lines}
         return {
             "lines": lines,
             "samples": sum(line["samples"] for line in lines.values()),
             "misses": sum(sum(line["misses"].values()) for line in lines.values()),
             "dropped": self._rows.dropped,
         }
-
-
-def _line_summary(line: _PolledLine) -> dict[str, Any]:
-    seconds = max((line.ended_ns - line.started_ns) / 1e9, 1e-9)
-    tallies = line.tallies.values()
-    misses: Counter[str] = sum((tally.misses for tally in tallies), Counter())
-    return {
-        "seconds": round(seconds, 3),
-        "exchanges": sum(tally.exchanges for tally in tallies),
-        "samples": sum(tally.values for tally in tallies),
-        "misses": dict(misses),
-        "skipped_bytes": sum(tally.skipped_bytes for tally in tallies),
-        "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
-        "overrun_slots": sum(job.skipped for job in line.jobs),
-        "drives": {
-            name: {
-                "exchanges": tally.exchanges,
-                "samples": tally.values,
-                "samples_per_second": round(tally.values / seconds, 2),
-                "exchanges_per_second": round(tally.answered / seconds, 2),
-                "misses": dict(tally.misses),
-            }
-            for name, tally in line.tallies.items()
-        },
-    }

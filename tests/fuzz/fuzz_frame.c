@@ -67,7 +67,8 @@ static void check_line(int framing, const uint8_t *bytes, size_t len, size_t chu
 {
     static struct md_line line;
     static struct md_completion done;
-    struct md_exchange exchange = {.framing = framing, .request = *request, .character_ns = 1, .timeout_ns = 1000};
+    struct md_drive drive = {.least_timeout_ns = 100, .most_timeout_ns = 1000};
+    struct md_exchange exchange = {.framing = framing, .request = *request, .character_ns = 1, .drive = &drive};
     md_line_init(&line, 1);
     for (int round = 0; round < 2; round++) {
         md_line_begin(&line, &exchange, &done, 10 * (round + 1));

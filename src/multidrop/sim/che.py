@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from multidrop.core import Message
 from multidrop.register import HOLDING
-from multidrop.sim.drive import Reason, Refusal
+from multidrop.sim.dialect import Reason, Refusal
 from multidrop.sim.memory import Cell
 from multidrop.sim.powered import PoweredDrive
-from multidrop.sim.receiver import Frame
 
 CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
 FULL = 10_000  # the setpoint that is 100 %
 DEVICE_CODE = 0x0101  # CHE, universal
-CHECK_ERROR = 0x11
 _MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # 5001H by exception code
 
 
@@ -28,6 +26,7 @@ class SimulatedCHE(PoweredDrive):
     """
 
     functions = (0x03, 0x06)
+    needs_silence = True  # 11.5
     codes = {
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 2,
@@ -37,6 +36,7 @@ class SimulatedCHE(PoweredDrive):
         Reason.LOCKED: 0x12,
         Reason.CANNOT: 1,  # "or drive in fault"
         Reason.BUSY: 6,
+        Reason.DAMAGED: 0x11,  # 11.1: a receive error is answered with a fault frame
     }
 
     def prepare(self) -> None:
@@ -69,12 +69,6 @@ class SimulatedCHE(PoweredDrive):
     def refused(self, request: Message, code: int) -> Message:
         self._modbus_fault = _MODBUS_FAULTS.get(code, 0)
         return super().refused(request, code)
-
-    def answer_damaged(self, frame: Frame) -> Message | None:
-        """A receive error is answered with a fault frame (11.1)."""
-        if frame.function not in self.functions:
-            return None
-        return self.refused(Message(frame.address, frame.function), CHECK_ERROR)
 
     def _control(self, command: int) -> None:
         actions = {

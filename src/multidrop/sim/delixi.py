@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.sim.drive import Reason, Refusal
+from multidrop.sim.dialect import COMMAND, QUERY, STATE, Reason, Refusal
 from multidrop.sim.memory import Cell
 from multidrop.sim.powered import PoweredDrive
-from multidrop.sim.receiver import Frame
 
-MOST_GAP = 10e-3  # s between two bytes
+MOST_GAP = 10e-3  # s between two bytes; of part 3, for want of another
 UNDER_VOLTAGE = 7  # fault number, POFF
 
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
 MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # of P04.29, first ASCII, then RTU
 NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-BY_LINE = {0: 2, 1: 1}  # P00.00 and P00.01
-
-# Delixi's own function codes K.
-COMMAND, STATE, SETPOINT, SET, STORE, QUERY = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 COMMANDS, STARTS = range(1, 5), (2, 3)  # what K = 02 may command
-BAD_CHECKSUM = 0xFF
-NOTHING = bytes(4)
+BY_LINE = {0: 2, 1: 1}  # P00.00 and P00.01
 
 
 class SimulatedDelixi(PoweredDrive):
@@ -54,51 +48,15 @@ class SimulatedDelixi(PoweredDrive):
 class SimulatedDelixiNative(PoweredDrive):
     """Delixi's own protocol: a set is answered with its copy, a query with what was asked for."""
 
-    functions = (COMMAND, STATE, SETPOINT, SET, STORE, QUERY)
-    codes = {
-        Reason.FUNCTION: 0xF0,
-        Reason.CANNOT: 0xF0,
-        Reason.READ_ADDRESS: 0xFC,
-        Reason.WRITE_ADDRESS: 0xFC,
-        Reason.VALUE: 0xFD,
-        Reason.LOCKED: 0xFE,
-    }
     begins = BY_LINE
-
-    @property
-    def most_gap(self) -> float:
-        return MOST_GAP
 
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == COMMAND
 
-    def refused(self, request: Message, code: int) -> Message:
-        return Message(request.address, request.function, data=NOTHING, exception=code)
-
-    def answer_damaged(self, frame: Frame) -> Message | None:
-        if len(frame.body) != 8:
-            return None
-        return self.refused(Message(frame.address, frame.function), BAD_CHECKSUM)
-
-    def carry_out(self, request: Message) -> Message:
-        if request.function == COMMAND:
-            if request.start not in COMMANDS or (request.start in STARTS and self.motor.fault):
-                raise Refusal(Reason.CANNOT)
-            self.write(COMMAND, 0, [request.start])
-        elif request.function == STATE:
-            state = self.read_cell(self.memory.readable(STATE, 0))
-            return Message(request.address, STATE, start=state, data=NOTHING)
-        elif request.function == QUERY:
-            raw = self.read_cell(self.memory.readable(QUERY, request.start))
-            return Message(request.address, QUERY, request.start, data=raw.to_bytes(4))
-        elif request.function in (SETPOINT, SET, STORE):
-            self.write(request.function, request.start, [int.from_bytes(request.data)])
-        else:
-            raise Refusal(Reason.FUNCTION)
-        return request
-
-    def wears(self, cell: Cell, function: int, address: int) -> bool:
-        return function == STORE
+    def accept(self, cell: Cell, raw: int) -> int:
+        if cell.table.write == COMMAND and (raw not in COMMANDS or (raw in STARTS and self.motor.fault)):
+            raise Refusal(Reason.CANNOT)
+        return super().accept(cell, raw)
 
     def changed(self, cell: Cell) -> None:
         if cell.name == "stored_frequency":  # whichever was written last counts

@@ -7,42 +7,20 @@ reply or nothing comes out. What one family does differently is in that family's
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Any, ClassVar, NamedTuple
 
 from multidrop.core import Framing, Message
 from multidrop.drive import Drive
 from multidrop.register import Access, Carrier, Kept
-from multidrop.sim.memory import Cell, Memory
+from multidrop.sim.dialect import DIALECTS, Reason, Refusal
+from multidrop.sim.memory import Cell, Memory, decode
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
 MOST_CELLS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}  # in any reply
-ASCII_GAP = 1.0  # s (serial-line guide 2.5.2.1)
-COIL_ON = b"\xff\x00"
-
-
-class Reason(Enum):
-    """Why a drive refuses; each family has its own code for it, or says nothing."""
-
-    FUNCTION = "no such function"
-    READ_ADDRESS = "nothing to be read there"
-    WRITE_ADDRESS = "nothing to be written there"
-    COUNT = "too many or none at all"
-    VALUE = "outside its span"
-    LOCKED = "not while the motor runs"
-    CANNOT = "not in this state"
-    BUSY = "storing"
-
-
-class Refusal(Exception):
-    """The drive does not do what it was asked."""
-
-    def __init__(self, reason: Reason) -> None:
-        super().__init__(reason.value)
-        self.reason = reason
+GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
 
 
 class Written(NamedTuple):
@@ -63,7 +41,7 @@ class Counters:
     refusals: int = 0
     broadcasts: int = 0
     damaged: int = 0  # frames that seemed to be for it
-    early: int = 0  # came before the silence was over, and were not understood
+    early: int = 0  # frames for it before the silence after a reply was over
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
@@ -75,25 +53,18 @@ class SimulatedDrive:
     `drive[name]` is a register's value in its own unit, to be read and set from outside.
     """
 
-    functions: ClassVar[Collection[int]] = (0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    codes: ClassVar[Mapping[Reason, int]] = {  # a reason without a code is answered with silence
-        Reason.FUNCTION: 1,
-        Reason.READ_ADDRESS: 2,
-        Reason.WRITE_ADDRESS: 2,
-        Reason.COUNT: 3,
-        Reason.VALUE: 3,
-        Reason.LOCKED: 4,
-        Reason.CANNOT: 4,
-        Reason.BUSY: 6,
-    }
+    functions: ClassVar[Collection[int] | None] = None  # None: all that its protocol has
+    codes: ClassVar[Mapping[Reason, int] | None] = None  # of refusal; None: the protocol's own
+    needs_silence: ClassVar[bool] = False  # the document says that a frame within it is not understood
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
+        self.dialect = DIALECTS[drive.framing]
         self.response_delay = drive.response_delay if response_delay is None else response_delay
         self.memory = Memory(type(drive), drive.framing)
         self.counters = Counters()
         self.now = 0.0  # of the last request
-        self.deaf_until = 0.0  # it hears nothing before
+        self.deaf_until = 0.0  # it hears nothing before; inf: a dead drive
         self.most = {  # cells in one request, by the function code that reads them
             table.read: min(most, MOST_CELLS[table.carrier]) for table, most in drive.most_registers.items()
         }
@@ -126,12 +97,11 @@ class SimulatedDrive:
         register = cell.register
         if register is None or register.words > 1:
             return raw
+        value = decode(register, raw)
         if register.values is not None:
-            known = isinstance(register.decode(raw), register.values)
-        elif register.span is not None:
-            known = register.span[0] <= register.decode(raw) <= register.span[1]
+            known = isinstance(value, register.values)
         else:
-            known = True
+            known = register.span is None or register.span[0] <= value <= register.span[1]
         if not known:
             raise Refusal(Reason.VALUE)
         return raw
@@ -145,22 +115,22 @@ class SimulatedDrive:
     def takes_broadcast(self, request: Message) -> bool:
         return self.drive.broadcasts
 
-    def answer_damaged(self, frame: Frame) -> Message | None:
-        """The reply to a frame with a wrong checksum whose address seems to be this drive's."""
-        return None
-
     # ---- the line's side ----
 
     @property
     def delay(self) -> float:
         """From the request's end to the reply's begin: never within the silence after an RTU frame."""
-        silence = self.drive.needed_silence() if self.drive.framing is Framing.RTU else 0.0
-        return max(self.response_delay, silence)
+        return max(self.response_delay, self.silence)
+
+    @property
+    def silence(self) -> float:
+        """What the drive demands on both sides of an RTU frame, in s; text frames need none."""
+        return self.drive.needed_silence() if self.drive.framing is Framing.RTU else 0.0
 
     @property
     def most_gap(self) -> float:
         """Silence in s within a frame that makes the drive throw away what came before it."""
-        return ASCII_GAP if self.drive.framing is Framing.ASCII else self.drive.settings.t3_5
+        return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
     def hear(self, frame: Frame) -> Message | None:
         """The reply to a frame of the line, whoever it is for."""
@@ -168,12 +138,26 @@ class SimulatedDrive:
             return None
         if not frame.intact:
             self.counters.damaged += 1
-            return self.answer_damaged(frame) if frame.address else None
+            return self._answer_damaged(frame)
         if frame.message is not None:
             return self.answer(frame.message, frame.end)
-        if frame.address and frame.function not in self.functions:
+        if frame.address and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
         return None  # of a length that its function does not have
+
+    def _knows(self, function: int) -> bool:
+        return function in (self.dialect.answers if self.functions is None else self.functions)
+
+    def _answer_damaged(self, frame: Frame) -> Message | None:
+        """The few that have a code for a wrong checksum answer what looks like a request of theirs."""
+        code = self._code(Reason.DAMAGED)
+        whole = len(frame.body) == self.dialect.octets and self._knows(frame.function)
+        if code is None or not whole or not frame.address:
+            return None
+        return self.refused(Message(frame.address, frame.function), code)
+
+    def _code(self, reason: Reason) -> int | None:
+        return (self.dialect.codes if self.codes is None else self.codes).get(reason)
 
     def answer(self, request: Message, now: float) -> Message | None:
         """Carry out a request; its reply, or None where the drive keeps silent."""
@@ -189,10 +173,10 @@ class SimulatedDrive:
         self.counters.functions[request.function] += 1
         self.pass_time(now)
         try:
-            reply = self.carry_out(request)
+            reply = self._carry_out(request)
         except Refusal as refusal:
             self.counters.refusals += 1
-            code = self.codes.get(refusal.reason)
+            code = self._code(refusal.reason)
             if code is None:
                 return None
             reply = self.refused(request, code)
@@ -205,67 +189,34 @@ class SimulatedDrive:
         self.counters.broadcasts += 1
         self.pass_time(now)
         try:
-            self.carry_out(request)
+            self._carry_out(request)
         except Refusal:
             self.counters.refusals += 1
 
     def refused(self, request: Message, code: int) -> Message:
-        return Message(request.address, request.function, exception=code)
+        return Message(request.address, request.function, data=self.dialect.nothing, exception=code)
 
-    # ---- Modbus ----
-
-    def carry_out(self, request: Message) -> Message:
-        if request.function not in self.functions:
+    def _carry_out(self, request: Message) -> Message:
+        if not self._knows(request.function):
             raise Refusal(Reason.FUNCTION)
-        return _ANSWERS[request.function](self, request)
+        return self.dialect.answers[request.function](self, request)
 
-    def _read(self, request: Message) -> list[int]:
-        if not 1 <= request.count <= self.most.get(request.function, 1):
+    # ---- the dialect's side ----
+
+    def check_count(self, function: int, count: int) -> None:
+        if not 1 <= count <= self.most.get(function, 1):
             raise Refusal(Reason.COUNT)
-        cells = [self.memory.readable(request.function, request.start + at) for at in range(request.count)]
-        return [self.read_cell(cell) for cell in cells]
 
-    def read_cell(self, cell: Cell | None) -> int:
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        """What neighbouring cells hold."""
+        self.check_count(function, count)
+        return [self._read_one(self.memory.readable(function, start + at)) for at in range(count)]
+
+    def _read_one(self, cell: Cell | None) -> int:
         if cell is None:
             raise Refusal(Reason.READ_ADDRESS)
         self.refresh(cell)
         return cell.raw
-
-    def _read_words(self, request: Message) -> Message:
-        data = b"".join(raw.to_bytes(2) for raw in self._read(request))
-        return Message(request.address, request.function, request.start, request.count, data)
-
-    def _read_bits(self, request: Message) -> Message:
-        bits = sum(raw << at for at, raw in enumerate(self._read(request)))
-        data = bits.to_bytes((request.count + 7) // 8, "little")
-        return Message(request.address, request.function, request.start, request.count, data)
-
-    def _write_one(self, request: Message) -> Message:
-        self.write(request.function, request.start, [int.from_bytes(request.data)])
-        return request
-
-    def _write_coil(self, request: Message) -> Message:
-        if request.data not in (COIL_ON, b"\0\0"):
-            raise Refusal(Reason.VALUE)
-        self.write(request.function, request.start, [int(request.data == COIL_ON)])
-        return request
-
-    def _write_words(self, request: Message) -> Message:
-        data = request.data
-        return self._write_several(
-            request, [int.from_bytes(data[at : at + 2]) for at in range(0, len(data), 2)]
-        )
-
-    def _write_coils(self, request: Message) -> Message:
-        bits = int.from_bytes(request.data, "little")
-        return self._write_several(request, [bits >> at & 1 for at in range(request.count)])
-
-    def _write_several(self, request: Message, raws: list[int]) -> Message:
-        reads = {0x0F: 0x01, 0x10: 0x03}[request.function]  # the limits are the same
-        if not 1 <= request.count <= self.most.get(reads, 1):
-            raise Refusal(Reason.COUNT)
-        self.write(request.function, request.start, raws)
-        return Message(request.address, request.function, request.start, request.count)
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
         """Write neighbouring cells: all of them, or none when one is refused."""
@@ -293,21 +244,3 @@ class SimulatedDrive:
         if register.kept is Kept.UNKNOWN:
             return register.access is Access.SETTING
         return register.kept is Kept.EEPROM
-
-    def _echo(self, request: Message) -> Message:
-        if request.start != 0:  # subfunction 0: return query data
-            raise Refusal(Reason.FUNCTION)
-        return request
-
-
-_ANSWERS: Mapping[int, Callable[[SimulatedDrive, Message], Message]] = {
-    0x01: SimulatedDrive._read_bits,
-    0x02: SimulatedDrive._read_bits,
-    0x03: SimulatedDrive._read_words,
-    0x04: SimulatedDrive._read_words,
-    0x05: SimulatedDrive._write_coil,
-    0x06: SimulatedDrive._write_one,
-    0x08: SimulatedDrive._echo,
-    0x0F: SimulatedDrive._write_coils,
-    0x10: SimulatedDrive._write_words,
-}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from multidrop.drive import Drive
 from multidrop.register import Carrier, Table
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.memory import Cell
@@ -19,11 +18,9 @@ class EncodedDrive(SimulatedDrive):
     What is written to it is confirmed and forgotten. No value of it can be taken for another's.
     """
 
-    def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
-        super().__init__(drive, response_delay=response_delay)
-        for cell in self.memory.cells():
-            bits = 1 if cell.table.carrier is Carrier.BIT else 0x7FFF
-            cell.raw = encoded(drive.address, cell.table, cell.address) & bits
+    def refresh(self, cell: Cell) -> None:
+        bits = 1 if cell.table.carrier is Carrier.BIT else 0x7FFF
+        cell.raw = encoded(self.drive.address, cell.table, cell.address) & bits
 
     def accept(self, cell: Cell, raw: int) -> int:
         return cell.raw

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop.core import Message
 from multidrop.register import COIL
-from multidrop.sim.drive import Reason
+from multidrop.sim.dialect import Reason
 from multidrop.sim.motor import Phase
 from multidrop.sim.powered import PoweredDrive
 
@@ -50,7 +50,7 @@ class SimulatedERMAN(PoweredDrive):
 
     def _emergency_stop(self, on: int) -> None:
         if on:
-            self.motor.trip(EMERGENCY_STOPPED)
+            self.trip(EMERGENCY_STOPPED)
 
     def _reset(self, on: int) -> None:
         if on:

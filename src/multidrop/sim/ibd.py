@@ -24,6 +24,7 @@ class SimulatedIBD(PoweredDrive):
     """
 
     functions = (0x03, 0x06)
+    needs_silence = True  # table "message in RTU mode"
     codes = {}
     begins = {101: 5, 102: 2, 323: RUNNING, 324: ACCELERATING, 325: DECELERATING, 328: FAULT}
 

@@ -7,8 +7,9 @@ space. Cells hold what one address holds: a bit, a word, or Delixi's four bytes.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from multidrop.core import Framing, Wire, raw_value
@@ -17,6 +18,7 @@ from multidrop.register import Access, Carrier, Register, Table
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
+_DELIXI_STORES = 0x06
 _LOW_WORD_FIRST = (Wire.U32_SWAPPED, Wire.I32_SWAPPED, Wire.F32_SWAPPED)
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
 _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
@@ -40,13 +42,13 @@ class Memory:
     """The cells of one drive, found by function code and address."""
 
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
+        self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
         self._cells: dict[tuple[Table, int], Cell] = {}
-        self._read: dict[tuple[int, int], Cell] = {}
+        self._read: dict[tuple[int, int], Cell | None] = {}  # None: not to be read, gap or not
+        self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], Cell] = {}
         self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
-        for table, addresses in drive.readable_gaps.items():
-            self.make_readable(table, addresses)
         for register in drive.registers.values():
             self._declare(register)
 
@@ -58,10 +60,8 @@ class Memory:
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
             cell.register = register
-            if table.read is not None and register.access is not Access.COMMAND:
-                self._read[table.read, cell.address] = cell
-            else:
-                self._read.pop((table.read or 0, cell.address), None)
+            if table.read is not None:
+                self._read[table.read, cell.address] = cell if register.access is not Access.COMMAND else None
             if register.access is Access.READING:
                 continue
             self.make_writable(table, [cell.address])
@@ -80,26 +80,32 @@ class Memory:
         for address in addresses:
             for code in self._codes(table):
                 self._written[code, address] = self._cell(table, address)
+                if self._framing is Framing.DELIXI and code != _DELIXI_STORES:
+                    self.aliases.add((code, address))
 
     def _codes(self, table: Table) -> set[int]:
         """The function codes that write this table."""
         return set() if table.write is None else {table.write, self._also.get(table.write, table.write)}
 
     def readable(self, function: int, address: int) -> Cell | None:
-        return self._read.get((function, address))
+        key = function, address
+        if key not in self._read:
+            tables = (table for code, table, gap in self._gaps if code == function and address in gap)
+            table = next(tables, None)
+            if table is None:
+                return None
+            self._read[key] = self._cell(table, address)
+        return self._read[key]
 
     def writable(self, function: int, address: int) -> Cell | None:
         """The cell that a write there changes, whatever the library itself would write."""
         return self._written.get((function, address))
 
-    def cells(self) -> Iterator[Cell]:
-        yield from self._cells.values()
-
     # ---- registers as a whole ----
 
     def get(self, register: Register[Any]) -> Any:
         """The register's value in its own unit."""
-        data = b"".join(pack(cell) for cell in self.of(register))
+        data = b"".join(pack(register.table, cell.raw) for cell in self.of(register))
         return register.decode(raw_value(data, 0, register.wire))
 
     def set(self, register: Register[Any], value: float) -> None:
@@ -109,7 +115,8 @@ class Memory:
         elif register.values is not None:
             raw = int(value)
         else:
-            raw = round(value / register.scale)
+            numerator, denominator = _scale(register)
+            raw = round(value * denominator / numerator)
         self.set_raw(register, raw)
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
@@ -123,6 +130,16 @@ class Memory:
         return [self._cells[register.table, register.address + at] for at in range(register.words)]
 
 
-def pack(cell: Cell) -> bytes:
-    """What the cell holds, as a reply carries it."""
-    return cell.raw.to_bytes(_BYTES[cell.table.carrier])
+@cache  # a monitor's value is worked out at every request
+def _scale(register: Register[Any]) -> tuple[int, int]:
+    return register.scale.as_integer_ratio()
+
+
+def pack(table: Table, raw: int) -> bytes:
+    """A raw count as a reply carries it."""
+    return raw.to_bytes(_BYTES[table.carrier])
+
+
+def decode(register: Register[Any], raw: int) -> Any:
+    """The value of a raw count that one cell holds."""
+    return register.decode(raw_value(pack(register.table, raw), 0, register.wire))

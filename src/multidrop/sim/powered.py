@@ -12,7 +12,8 @@ from typing import Any, ClassVar
 
 from multidrop.drive import Drive
 from multidrop.register import Register
-from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
+from multidrop.sim.dialect import Reason, Refusal
+from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.memory import Cell
 from multidrop.sim.motor import MONITORS, RATED, Motor, Rating
 
@@ -51,6 +52,10 @@ class PoweredDrive(SimulatedDrive):
 
     def prepare(self) -> None:
         """Hold from the beginning what the document says beyond the class's declarations."""
+
+    def trip(self, code: int) -> None:
+        """Provoke a fault; its code is the family's own."""
+        self.motor.trip(code)
 
     def pass_time(self, now: float) -> None:
         self.motor.run_to(now)

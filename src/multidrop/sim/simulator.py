@@ -7,6 +7,7 @@ import math
 import os
 import select
 import selectors
+import signal
 import threading
 from collections.abc import Callable, Sequence
 from time import monotonic
@@ -120,13 +121,18 @@ class Simulator:
 
 
 def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda simulator: None) -> None:
-    """Run wires in this process until Ctrl-C; `announce` is called once their paths are known."""
+    """Run wires in this process's main thread until it is interrupted or terminated.
+
+    `announce` is called once, when the wires' paths are known.
+    """
     simulator = Simulator(wires)
     simulator.open()
+    before = signal.signal(signal.SIGTERM, lambda *_: simulator.interrupt())
     try:
         announce(simulator)
         simulator.run()
     except KeyboardInterrupt:
         pass
     finally:
+        signal.signal(signal.SIGTERM, before)
         simulator.close()

@@ -5,8 +5,8 @@ Bytes and times come in, bytes and times come out; the port at its end is port.p
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -88,7 +88,7 @@ class Wire:
         self._port: Port | None = None
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
         self._ears = self._group()
-        self._outgoing: deque[_Transmission] = deque()
+        self._outgoing: list[_Transmission] = []  # by their begin
         self._quiet_since = -math.inf  # the end of the last reply
         self._baudrate: int | None = None
 
@@ -132,7 +132,9 @@ class Wire:
             heard += self._outgoing[0].take(now)
             if now < self._outgoing[0].end:
                 break
-            self._quiet_since = self._outgoing.popleft().end
+            self._quiet_since = self._outgoing.pop(0).end
+            if self._outgoing:  # two at once cannot be read: the second waits
+                self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
         return bytes(heard)
 
     @property
@@ -151,26 +153,26 @@ class Wire:
     def _deliver(self, ears: _Ears, frames: Sequence[Frame]) -> None:
         for frame in frames:
             for it in ears.listeners(frame):
-                if self._too_early(it, frame):
-                    it.counters.early += 1
-                elif (reply := it.hear(frame)) is not None:
+                if self._may_hear(it, frame) and (reply := it.hear(frame)) is not None:
                     data = self.distort(build_reply(it.drive.framing, reply))
-                    begin = max(frame.end + it.delay * self._pace, self._busy_until())
-                    self._outgoing.append(_Transmission(data, begin, ears.receiver.character))
+                    begin = frame.end + it.delay * self._pace
+                    sending = _Transmission(data, begin, ears.receiver.character)
+                    bisect.insort(self._outgoing, sending, key=lambda it: it.begin)
 
-    def _busy_until(self) -> float:
-        return self._outgoing[-1].end if self._outgoing else self._quiet_since
+    def _may_hear(self, it: SimulatedDrive, frame: Frame) -> bool:
+        """Count a frame that came before its silence was over, and say whether it is heard all the same.
 
-    def _too_early(self, it: SimulatedDrive, frame: Frame) -> bool:
-        """Whether it began within a reply, or within the silence that the drive demands after one.
-
-        Only replies count: when they ended is known here to the bit, so that a client that keeps
-        the silence is never found guilty because this process woke late.
+        What begins within a reply is lost. Silence is counted from the end of a reply only: that is
+        known here to the bit, so that a client that keeps the silence is never found guilty because
+        this process woke late.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
-        quiet_since = self._outgoing[0].end if replying else self._quiet_since
-        silence = it.drive.needed_silence() if it.drive.framing is Framing.RTU else 0.0
-        return frame.begin < quiet_since + (silence - it.drive.settings.bit) * self._pace
+        silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)
+        bit = it.drive.settings.bit * self._pace
+        if silent_for >= it.silence * self._pace - bit:
+            return True
+        it.counters.early += 1
+        return not it.needs_silence and silent_for >= -bit
 
     # ---- its port ----
 

@@ -6,7 +6,7 @@ import math
 
 from multidrop.core import Message
 from multidrop.register import HOLDING
-from multidrop.sim.drive import Reason
+from multidrop.sim.dialect import Reason
 from multidrop.sim.memory import Cell
 from multidrop.sim.powered import PoweredDrive
 
@@ -25,6 +25,7 @@ class SimulatedYD1000(PoweredDrive):
     """Without bit 15 the panel is in command: it runs the motor when `panel_runs` says so."""
 
     functions = (0x03, 0x06)
+    needs_silence = True  # 4.3
     codes = {  # the notes list no codes; these are the VF-S15's
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 2,
@@ -61,10 +62,11 @@ class SimulatedYD1000(PoweredDrive):
 
     def trip(self, code: int) -> None:
         """A fault: what 1200H to 1205H show is frozen."""
-        for cell in self.memory.cells():
-            if cell.address in HELD:
+        for address in HELD:
+            cell = self.memory.readable(0x03, address)
+            if cell:
                 self.refresh(cell)
-        self.motor.trip(code)
+        super().trip(code)
 
     def refresh(self, cell: Cell) -> None:
         if not (self.motor.fault and cell.address in HELD):
@@ -74,7 +76,8 @@ class SimulatedYD1000(PoweredDrive):
         if word & RESET:
             self._restart()
         elif word & EMERGENCY_STOP:
-            self.trip(EMERGENCY_STOPPED)
+            if not self.motor.fault:
+                self.trip(EMERGENCY_STOPPED)
         elif word & COAST:
             self.motor.coast()
         elif not word & COMMANDED:
