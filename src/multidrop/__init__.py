@@ -1,1 +1,75 @@
-"""x"""
+"""multidrop: poll every drive on an RS-485 line as fast as the wire allows."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multidrop.batch import Batch as Batch
+    from multidrop.bus import Bus as Bus
+    from multidrop.drive import Condition as Condition
+    from multidrop.drive import Direction as Direction
+    from multidrop.drive import Drive as Drive
+    from multidrop.drive import State as State
+    from multidrop.drive import verb as verb
+    from multidrop.drives import YD1000 as YD1000
+    from multidrop.drives import DelixiModbus as DelixiModbus
+    from multidrop.drives import DelixiNative as DelixiNative
+    from multidrop.drives import ErmanERG220 as ErmanERG220
+    from multidrop.drives import InnovertIBD as InnovertIBD
+    from multidrop.drives import InvtCHE as InvtCHE
+    from multidrop.errors import BadReply as BadReply
+    from multidrop.errors import BusError as BusError
+    from multidrop.errors import DriveRefused as DriveRefused
+    from multidrop.errors import LineError as LineError
+    from multidrop.errors import NoReply as NoReply
+    from multidrop.errors import Refused as Refused
+    from multidrop.errors import Unconfirmed as Unconfirmed
+    from multidrop.errors import Unsupported as Unsupported
+    from multidrop.plant import Plant as Plant
+    from multidrop.plant import PlantError as PlantError
+    from multidrop.plant import load_plant as load_plant
+    from multidrop.poller import Poller as Poller
+    from multidrop.recording import convert as convert
+    from multidrop.recording import open_reader as open_reader
+    from multidrop.recording import open_writer as open_writer
+    from multidrop.register import Register as Register
+    from multidrop.register import command as command
+    from multidrop.register import reading as reading
+    from multidrop.register import setting as setting
+
+# Every public name and the module that it comes from, which is loaded when the name is first used.
+_HOMES = {
+    "batch": ("Batch",),
+    "bus": ("Bus",),
+    "drive": ("Condition", "Direction", "Drive", "State", "verb"),
+    "drives": ("DelixiModbus", "DelixiNative", "ErmanERG220", "InnovertIBD", "InvtCHE", "YD1000"),
+    "errors": (
+        "BadReply",
+        "BusError",
+        "DriveRefused",
+        "LineError",
+        "NoReply",
+        "Refused",
+        "Unconfirmed",
+        "Unsupported",
+    ),
+    "plant": ("Plant", "PlantError", "load_plant"),
+    "poller": ("Poller",),
+    "recording": ("convert", "open_reader", "open_writer"),
+    "register": ("Register", "command", "reading", "setting"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [*_HOME_OF]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'multidrop' has no attribute {name!r}")
+    return getattr(import_module(f"multidrop.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME_OF])

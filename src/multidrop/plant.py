@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,33 @@ class Plant:
 
     lines: tuple[Line, ...]
     path: Path
+
+    def metadata(self) -> dict[str, Any]:
+        """What a reader of a recording must know that its rows do not say."""
+        return {
+            "multidrop": version("multidrop"),
+            "plant": str(self.path),
+            "drives": {
+                polled.drive.name: _described(line, polled) for line in self.lines for polled in line.drives
+            },
+        }
+
+
+def _described(line: Line, polled: PolledDrive) -> dict[str, Any]:
+    drive = polled.drive
+    return {
+        "line": line.name,
+        "model": drive.model,
+        "address": drive.address,
+        "settings": str(drive.settings),
+        "framing": str(drive.framing),
+        "registers": {poll.register.name: _meaning(poll.register) for poll in polled.polls},
+    }
+
+
+def _meaning(register: Register[Any]) -> dict[str, Any]:
+    values = {it.name: it.value for it in register.values} if register.values else None
+    return {"unit": register.unit, "step": register.step, "values": values}
 
 
 class PlantError(ValueError):

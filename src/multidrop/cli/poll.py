@@ -58,7 +58,7 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
         interruption = stack.enter_context(Interruption())
         takers: list[Callable[[Rows], None]] = [table.add] if table else []
         if arguments.out:
-            takers.append(stack.enter_context(open_writer(arguments.out, _metadata(plant))).write)
+            takers.append(stack.enter_context(open_writer(arguments.out, plant.metadata())).write)
         with Poller(plant) as poller:
             for _ in _ticks(arguments.seconds, interruption):
                 _hand_out(poller, takers)
@@ -83,28 +83,6 @@ def _hand_out(poller: Poller, takers: list[Callable[[Rows], None]]) -> None:
     while batch := poller.take():
         for take in takers:
             take(batch)
-
-
-def _metadata(plant: Plant) -> dict[str, Any]:
-    """What a reader of the recording must know that its rows do not say."""
-    return {
-        "plant": str(plant.path),
-        "drives": {
-            polled.drive.name: {
-                "line": line.name,
-                "model": polled.drive.model,
-                "address": polled.drive.address,
-                "settings": str(polled.drive.settings),
-                "framing": str(polled.drive.framing),
-                "registers": {
-                    register.name: {"unit": register.unit, "step": register.step}
-                    for register in (poll.register for poll in polled.polls)
-                },
-            }
-            for line in plant.lines
-            for polled in line.drives
-        },
-    }
 
 
 def _text(summary: dict[str, Any]) -> str:
