@@ -82,7 +82,7 @@ def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
 
     The consumer sleeps on the poller's descriptor and takes what there is as soon as it wakes.
     """
-    pyarrow.record_batch(decoder(1)())  # what is imported at the first use would make it late
+    _replied_ns(decoder(1)())  # what is imported at the first use would make it late
     late = [numpy.empty(0)]
     with polling(job) as poller:
         end = time.monotonic() + job.seconds
@@ -90,11 +90,15 @@ def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
             select.select([poller], [], [], left)
             while batch := poller.take():
                 now = time.monotonic_ns()
-                columns = pyarrow.record_batch(batch)
-                replied = pyarrow.compute.add(columns["monotonic_ns"], columns["uncertainty_ns"]).drop_null()
-                late.append(now - replied.to_numpy(zero_copy_only=False))
+                late.append(now - _replied_ns(batch))
         good, _ = counts(poller)
     return good, numpy.concatenate(late) / 1e6
+
+
+def _replied_ns(batch: Batch) -> numpy.ndarray:
+    columns = pyarrow.record_batch(batch)
+    replied = pyarrow.compute.add(columns["monotonic_ns"], columns["uncertainty_ns"]).drop_null()
+    return replied.to_numpy(zero_copy_only=False)
 
 
 def decoder(drives: int) -> Callable[[], Batch]:

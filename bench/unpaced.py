@@ -33,6 +33,12 @@ def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:
         job = Job(line.path, 0, seconds)
         own = rivals.measure_bare(job, 0) if master == "bare C" else rivals.measure(master, job)
     good = max(1, own["exchanges"])
+    if line.report["answered"] < good:
+        raise AssertionError(f"{master} tells of {good} exchanges, the line of {line.report['answered']}")
+    if line.report["answered"] > 1.5 * good:
+        raise AssertionError(
+            f"{master} reads 10 registers {good} times with {line.report['answered']} requests"
+        )
     return own | {"rate": good / own["seconds"], "cpu": own["cpu_seconds"] / good * 1e6}
 
 

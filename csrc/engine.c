@@ -18,7 +18,8 @@
 
 enum {
     EVENTS = 256,           /* taken from epoll at a time */
-    WORTH_BLINDNESS = 200000 /* ns; a shorter wait is not worth the system calls to look away */
+    WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
+    MOST_LATENESS = 60000     /* ns of a wake-up that are reckoned with */
 };
 static const int64_t NEVER = INT64_MAX;
 static const int64_t RETRY_WRITE_NS = 1000000;
@@ -67,6 +68,7 @@ struct md_engine {
     struct md_port **ports;
     int64_t *wakes; /* when each port wants to be looked at, whatever happens */
     unsigned count, room;
+    int64_t lateness_ns; /* of the thread's waking, as is usual */
     int stopping;
 };
 
@@ -261,13 +263,26 @@ static int64_t earliest(const struct md_engine *engine)
     return least;
 }
 
+/* Sleeping processors wake late, and by much the same time again and again: the sleep is shortened
+ * by what is usual, and what is then too early is spun away. */
 static int wait_for_events(struct md_engine *engine, struct epoll_event *events, int64_t until_ns)
 {
-    int64_t left = until_ns == NEVER ? NEVER : until_ns - md_now_ns();
+    if (until_ns == NEVER)
+        return epoll_pwait2(engine->epoll, events, EVENTS, NULL, NULL);
+    int64_t left = until_ns - engine->lateness_ns - md_now_ns();
     struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
     if (left <= 0)
         span = (struct timespec){0};
-    return epoll_pwait2(engine->epoll, events, EVENTS, until_ns == NEVER ? NULL : &span, NULL);
+    int n = epoll_pwait2(engine->epoll, events, EVENTS, &span, NULL);
+    if (n == 0 && left > 0) {
+        int64_t late = md_now_ns() - (until_ns - engine->lateness_ns);
+        engine->lateness_ns += (late - engine->lateness_ns) / 8;
+        if (engine->lateness_ns > MOST_LATENESS)
+            engine->lateness_ns = MOST_LATENESS;
+        while (md_now_ns() < until_ns)
+            ;
+    }
+    return n;
 }
 
 /* Close those ports whose clients wait for it; nobody is on them now. */

@@ -51,7 +51,7 @@ static int64_t clamp(int64_t value, int64_t least, int64_t most)
 static int64_t early_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    return later(0, drive->delay_ns - 2 * drive->deviation_ns - exchange->character_ns);
+    return later(0, drive->delay_ns - 2 * drive->deviation_ns - exchange->character_ns / 2);
 }
 
 /* Longer after each failure: the drive may have become slower, or is slower than most. */

@@ -27,12 +27,12 @@ from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
 
-LOOK_S = 0.02  # the longest that rows wait to be collected
-AHEAD_NS = 150_000_000  # so far ahead the lines are planned
+LOOK_S = 0.05  # the longest that rows wait to be collected
+AHEAD_NS = 300_000_000  # so far ahead the lines are planned
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
-CHUNK_ROWS = 1 << 14
+CHUNK_ROWS = 1 << 12
 MOST_FIELDS = 2000  # of a block: as many bits as one reply holds
-MOST_CHUNKS = 64  # that wait to be taken; further rows are dropped, and counted
+MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
 
 
 class _Codes:
