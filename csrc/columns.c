@@ -90,11 +90,13 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
 }
 
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets,
-                 int32_t *out_offsets, uint8_t *out, size_t room)
+                 size_t names, int32_t *out_offsets, uint8_t *out, size_t room)
 {
     size_t used = 0;
     out_offsets[0] = 0;
     for (size_t i = 0; i < n; i++) {
+        if (codes[i] >= names)
+            return -1;
         int32_t from = offsets[codes[i]];
         size_t len = (size_t)(offsets[codes[i] + 1] - from);
         if (room - used < len || used + len > INT32_MAX)

@@ -491,8 +491,12 @@ int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_m
     int count = 0;
     for (; reaped != done; reaped++, count++) {
         const struct slot *slot = &port->slots[reaped & (port->room - 1)];
-        if (md_columns_add(columns, slot->exchange->block, &slot->completion, utc_minus_monotonic_ns) == 0)
+        const struct md_completion *completion = &slot->completion;
+        struct md_block *block = slot->exchange->block;
+        if (md_columns_add(columns, block, completion, utc_minus_monotonic_ns) == 0)
             break;
+        if (completion->result > 0)
+            block->refusals = completion->reply.exception ? block->refusals + 1 : 0;
     }
     atomic_store(&port->reaped, reaped);
     return count;

@@ -4,7 +4,8 @@
  * The expected reply may begin anywhere in what was received, because driver turn-on junk, local
  * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
- * echoes what it sends shows in the replies that are no copies of their requests. From a drive's
+ * echoes what it sends shows in the replies that are no copies of their requests, and where a copy
+ * is all that comes before a time-out. From a drive's
  * replies its response delay is learnt: how long to wait for it, and when it is worth looking. */
 #include "multidrop.h"
 
@@ -178,6 +179,8 @@ static void time_out(struct md_line *line)
 {
     struct md_message reply;
     size_t begin = is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
+    if (begin > 0 && begin == line->rx_len)
+        line->echoes = 1; /* nobody else says it again and no more */
     int reason = begin == line->rx_len ? MD_NO_REPLY : MD_INCOMPLETE;
     for (size_t at = begin; at < line->rx_len; at++) {
         int why = parse_at(line, at, &reply);
@@ -186,7 +189,8 @@ static void time_out(struct md_line *line)
         if (weight(why) > weight(reason))
             reason = why;
     }
-    if (reason == MD_NO_REPLY || reason == MD_CUT_SHORT)
+    /* Only a damaged frame of its own says that the drive has answered: others' and noise do not. */
+    if (reason != MD_BAD_CHECKSUM && reason != MD_BAD_CHARACTER)
         expect_late_answer(line);
     finish(line, reason, line->rx, line->rx_len);
 }

@@ -128,7 +128,7 @@ struct md_exchange {
     int64_t silence_ns;    /* before the request and after its reply */
     int64_t turnaround_ns; /* after a broadcast */
     struct md_drive *drive;
-    const struct md_block *block; /* what its reply holds; NULL: nobody makes rows of it */
+    struct md_block *block; /* what its reply holds; NULL: nobody makes rows of it */
 };
 
 /* What became of it. Times are of CLOCK_MONOTONIC; first and last are 0 where nothing came. */
@@ -226,6 +226,7 @@ struct md_field {
 struct md_block {
     const struct md_field *fields;
     int count;
+    uint32_t refusals; /* exceptions in a row, among the replies that were reaped */
 };
 
 /* Rows; all arrays have room for the same number. `valid` is a bitmap, least significant bit first. */
@@ -244,9 +245,131 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 
 /* Spell codes out as an Arrow utf8 column: name i is bytes[offsets[i]] to bytes[offsets[i + 1]].
- * Writes n + 1 offsets and the text; the text's length, or -1 when `room` is too small. */
+ * Writes n + 1 offsets and the text; the text's length, or -1 when `room` is too small or a code has no name. */
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets,
-                 int32_t *out_offsets, uint8_t *out, size_t room);
+                 size_t names, int32_t *out_offsets, uint8_t *out, size_t room);
+/* ---- heard.c: bytes that were overheard, in pieces ---- */
+
+enum md_side { MD_EITHER_SIDE, MD_ASKING, MD_ANSWERING };
+
+/* Bytes that came together, from `at` up to the next piece. */
+struct md_piece {
+    size_t at;
+    int64_t time_ns;
+    uint8_t side;           /* enum md_side: who sent them, where that is known */
+    uint8_t is_after_pause; /* the line was silent before them: only a hint */
+};
+
+/* What was heard and not yet forgotten. */
+struct md_heard {
+    uint8_t *bytes;
+    struct md_piece *pieces;
+    size_t len, room, count, most; /* of the bytes, of the pieces */
+    int is_all;                    /* nothing more is to be waited for */
+};
+
+struct md_splitter;
+
+/* Append a piece; 0 when there is no room. */
+int md_hear(struct md_heard *heard, const uint8_t *bytes, size_t len, struct md_piece piece);
+/* Forget what was split. */
+void md_forget(struct md_heard *heard, struct md_splitter *splitter);
+
+/* ---- split.c: what was overheard on a line, cut into frames of both directions ---- */
+
+enum md_kind {
+    MD_JUNK,    /* no frame */
+    MD_REQUEST,
+    MD_EITHER,  /* a request, or its copy that confirms it: what came before was not understood */
+    MD_REPLY,   /* to the request before it */
+    MD_STRAY    /* a reply whose request was not heard */
+};
+
+struct md_span {
+    size_t at, len;
+    int64_t time_ns; /* of the piece in which it begins */
+    int kind, framing;
+    struct md_message message;
+};
+
+/* Zeroed, it is at the beginning. */
+struct md_splitter {
+    size_t at, piece;          /* what comes next */
+    size_t junk;               /* bytes since the last frame */
+    int is_in_step;            /* the last thing was a frame: requests and their copies alternate */
+    int awaited, framing;      /* the reply to `request` */
+    struct md_message request; /* the last one */
+};
+
+/* The next span of what was heard: 1; 0 when more must be heard first. Every byte is part of one
+ * span. How the bytes came in does not matter but for pauses and sides; junk comes in any number of spans. */
+int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct md_span *span);
+
+/* ---- decode.c: what was overheard becomes columns ---- */
+
+/* What a request's reply holds; key 0 where there is none. */
+struct md_known {
+    uint64_t key;
+    const struct md_block *block;
+};
+
+/* Zeroed but for `known`, with a number of places that is a power of two, it is at the beginning. */
+struct md_decoder {
+    struct md_splitter splitter;
+    struct md_span span;
+    struct md_known *known;
+    size_t places, taken;
+    const struct md_block *block; /* of the last request */
+    int64_t asked_ns;
+    int is_due;                   /* `span` is still to be dealt with */
+    uint64_t frames, exchanges, junk, strays;
+    struct md_completion completion;
+};
+
+enum md_decoded {
+    MD_ALL_DECODED, /* but for what needs more to be heard */
+    MD_NO_ROOM,     /* in the columns */
+    MD_UNKNOWN      /* the request in `span`: md_know, and again */
+};
+
+/* Say what replies to this request hold; NULL: nothing that makes rows. 0 when the table is full. */
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
+            const struct md_block *block);
+/* Make rows of every exchange that was heard, also of requests that nobody answered (enum md_decoded). */
+int md_decode(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns);
+
+/* ---- unpack.c: packets out of capture files ---- */
+
+enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* all others: bare bytes */
+
+/* One interface of a capture: a line. */
+struct md_channel {
+    uint32_t link;
+    int has_sides;        /* the packets' directions are to be believed */
+    uint64_t ticks_per_s; /* of the packets' time stamps */
+    int64_t offset_ns;
+    struct md_heard heard;
+};
+
+struct md_capture {
+    const uint8_t *bytes;
+    size_t len, at;
+    int is_pcapng, is_big_endian;
+    struct md_channel *channels;
+    size_t count;
+    uint64_t packets, truncated;
+};
+
+enum md_unpacked {
+    MD_UNPACKED,      /* all of it */
+    MD_CHANNEL_FULL,  /* split what was heard on the channels, and again */
+    MD_OTHER_BLOCK,   /* of a pcapng file, at `at`: the caller's to read */
+    MD_CUT,           /* the file ends within a packet */
+    MD_NONSENSE       /* what begins at `at` is no packet */
+};
+
+/* Append packets to what was heard on their channels (enum md_unpacked). */
+int md_unpack(struct md_capture *capture);
 /* cdef: end */
 
 #endif

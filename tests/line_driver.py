@@ -68,6 +68,11 @@ class LineDriver:
             self.now = max(self.now, self.wake)
         raise AssertionError("the line never wants to write")
 
+    def wait_for_look(self) -> None:
+        """Let time pass until the line wants to read."""
+        while self.want == "wait":
+            self.now = self.wake
+
     def wait_until_done(self) -> None:
         for _ in range(8):
             if self.want == "done":

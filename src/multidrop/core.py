@@ -450,6 +450,11 @@ class Block:
         self.c = ffi.new("struct md_block *", {"fields": self._fields, "count": len(fields)})
         self.count = len(fields)
 
+    @property
+    def refusals(self) -> int:
+        """Exceptions in a row, among the replies that were made rows of."""
+        return int(self.c.refusals)
+
 
 COLUMNS = {
     "time": "int64_t[]",
@@ -514,7 +519,9 @@ def spell(codes: memoryview[Any], names: tuple[str, ...]) -> tuple[memoryview[An
     rows = len(codes)
     room = rows * longest
     offsets, text = ffi.new("int32_t[]", rows + 1), ffi.new("uint8_t[]", max(room, 1))
-    used = lib.md_spell(ffi.from_buffer("uint16_t[]", codes), rows, known, ends, offsets, text, room)
+    used = lib.md_spell(
+        ffi.from_buffer("uint16_t[]", codes), rows, known, ends, len(names), offsets, text, room
+    )
     if used < 0:
-        raise OverflowError("more than 2 GiB of names in one batch")
+        raise ValueError("a code without a name, or more than 2 GiB of names in one batch")
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))

@@ -156,6 +156,8 @@ class Line:
                 self._serial.exclusive = True
             self._serial.open()
             self._core = self._drive(self._serial)
+            with suppress(*_PORT_FAILURES, AttributeError, NotImplementedError):
+                self._serial.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except _PORT_FAILURES as failure:
             raise LineError(self.port, _reason(failure)) from failure
 

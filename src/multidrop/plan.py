@@ -1,10 +1,11 @@
-"""Which registers go into which request, and how long that takes on the wire. Pure."""
+"""Which registers go into which request, in which order, and how long that takes on the wire. Pure."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from multidrop.core import Message, build_request, reply_length
@@ -33,19 +34,93 @@ class Block:
         return register.address - self.start
 
 
-def duration(drive: Drive, block: Block) -> float:
-    """Seconds of the line that a block takes: silence, request, response delay, reply."""
+@dataclass(frozen=True)
+class Planned:
+    """A drive's block that is read every so many seconds; None: as fast as the line allows."""
+
+    drive: Drive
+    block: Block
+    every: float | None = None
+
+
+def silence(drive: Drive) -> float:
+    """Seconds that are kept around its exchanges: a bit more, for the other side's second stop bit."""
+    return drive.needed_silence() + drive.settings.bit
+
+
+def sending(drive: Drive, block: Block) -> float:
+    """Seconds in which characters of the request and of the reply are on the wire."""
     request = block.request(drive.address)
     characters = len(build_request(drive.framing, request)) + reply_length(drive.framing, request)
-    return characters * drive.settings.character + drive.needed_silence() + drive.response_delay
+    return characters * drive.settings.character
+
+
+def duration(drive: Drive, block: Block) -> float:
+    """Seconds of the line that a block takes: silence, request, response delay, reply."""
+    return silence(drive) + sending(drive, block) + drive.response_delay
+
+
+def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
+    """Seconds from one drive's reply to the other's request, on a line that is never idle.
+
+    `switching` is what the port needs to change baud rate or format, once the silence is over.
+    """
+    switched = switching if before.settings != after.settings else 0.0
+    return max(silence(before), silence(after)) + switched
+
+
+def planned(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> list[Planned]:
+    """The blocks that read these registers, each as often as is wanted.
+
+    Registers of different rates never share a block: what is asked for more seldom would be read
+    more often than it is wanted.
+    """
+    rates: dict[float | None, list[Register[Any]]] = {}
+    for register, every in wanted:
+        rates.setdefault(every, []).append(register)
+    return [
+        Planned(drive, block, every)
+        for every, registers in rates.items()
+        for block in blocks(drive, registers)
+    ]
+
+
+def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
+    """The bus cycle with the least silence, and of those as short one with the fewest switches.
+
+    The longer of two neighbours' silences is kept, so drives of like silence and settings stand side
+    by side. They are put into the cycle by rising silence, each kind where it costs least; where
+    switching costs nothing, no order is shorter.
+    """
+    kinds: dict[tuple[float, str], list[Drive]] = {}
+    for drive in drives:
+        kinds.setdefault((silence(drive), str(drive.settings)), []).append(drive)
+    cycle: list[Drive] = []  # one of each kind
+    for kind in sorted(kinds):
+        drive = kinds[kind][0]
+        costs = [_detour(cycle[at - 1], drive, cycle[at], switching) for at in range(len(cycle))]
+        cycle.insert(costs.index(min(costs)) if costs else 0, drive)
+    return [drive for first in cycle for drive in kinds[silence(first), str(first.settings)]]
+
+
+def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
+    """What it costs to visit a drive between two others: ns, which compare well, and switches."""
+    seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
+    switches = sum(one.settings != other.settings for one, other in pairwise((before, drive, after)))
+    return round(seconds * 1e9), switches - (before.settings != after.settings)
+
+
+def alone(register: Register[Any]) -> Block:
+    """The block that reads one register and nothing else."""
+    return _block(register.table, [register])
 
 
 def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:
     """The requests that read these registers in the least time.
 
-    Registers of a table that follow each other are read together up to the family's limit, also
-    across reserved addresses where the family's document allows that and it is the quicker way.
-    Raises ValueError for a register that cannot be read.
+    Registers of a table are read together up to the family's limit, where that is the quicker way
+    also across others that can be read, and across reserved addresses where the family's document
+    allows that. Raises ValueError for a register that cannot be read.
     """
     tables: dict[Table, list[Register[Any]]] = {}
     for register in dict.fromkeys(registers):
@@ -84,13 +159,14 @@ def _allowed(drive: Drive, block: Block) -> bool:
         return True  # a register is read whole, whatever the limit
     if block.count > drive.most_registers.get(block.table, 1):
         return False
-    taken = {
+    known = {
         address
-        for register in block.registers
+        for register in (*block.registers, *drive.registers.values())
+        if register.table == block.table and register.readable
         for address in range(register.address, register.address + register.words)
     }
     gaps = drive.readable_gaps.get(block.table, range(0))
-    return all(it in taken or it in gaps for it in range(block.start, block.start + block.count))
+    return all(it in known or it in gaps for it in range(block.start, block.start + block.count))
 
 
 def write_request(drive: Drive, register: Register[Any], raw: int, address: int | None = None) -> Message:

@@ -22,13 +22,15 @@ from multidrop.core import Columns, Exchange, Field, Port, Result, now_ns
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.line import Wake, await_notice, sleep, utc_minus_monotonic_ns
-from multidrop.plan import Block, blocks, duration
+from multidrop.plan import Block, alone, blocks, duration, in_order
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
 
 LOOK_S = 0.05  # the longest that rows wait to be collected
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
+REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
+SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 CHUNK_ROWS = 1 << 12
 MOST_FIELDS = 2000  # of a block: as many bits as one reply holds
@@ -68,6 +70,8 @@ def _code(names: list[str], name: str) -> int:
 class _Asked(Job):
     """A job with what the core needs to carry it out and to make rows of it."""
 
+    owner: Drive
+    block: Block
     exchange: Exchange
     fields: core.Block
 
@@ -134,37 +138,42 @@ class _PolledLine:
         self.schedule: Schedule[_Asked] = Schedule()
         self.unasked: Counter[tuple[int, Result]] = Counter()  # values, by address and reason
         self.started_ns = self.ended_ns = now_ns()
+        self.set_aside: list[_Asked] = []  # a single register that the drive refuses again and again
         self._rows = rows
-        self._jobs: list[_Asked] = []
+        self._codes = codes
+        self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
         self._average_ns = 0  # of what was queued last
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         for polled in declared.drives:
             self.bus.attach(polled.drive)
-            self._declare(polled, codes)
+            self._declare(polled)
 
-    def _declare(self, polled: plant.PolledDrive, codes: _Codes) -> None:
+    def _declare(self, polled: plant.PolledDrive) -> None:
         drive = polled.drive
-        respondent = self.bus.respondent(drive)
         rates: dict[float | None, list[Register[Any]]] = {}
         for poll in polled.polls:
             rates.setdefault(poll.every, []).append(poll.register)
         for every, registers in rates.items():
-            for block in blocks(drive, registers):
-                fields = codes.fields(drive, block)
-                self._jobs.append(
-                    _Asked(
-                        drive=drive.address,
-                        period_ns=None if every is None else round(every * 1e9),
-                        duration_ns=round(duration(drive, block) * 1e9),
-                        exchange=exchange(drive, block.request(drive.address), respondent, fields),
-                        fields=fields,
-                    )
-                )
+            period_ns = None if every is None else round(every * 1e9)
+            self._jobs += [self._job(drive, block, period_ns) for block in blocks(drive, registers)]
+
+    def _job(self, drive: Drive, block: Block, period_ns: int | None) -> _Asked:
+        fields = self._codes.fields(drive, block)
+        return _Asked(
+            drive=drive.address,
+            period_ns=period_ns,
+            duration_ns=round(duration(drive, block) * 1e9),
+            owner=drive,
+            block=block,
+            exchange=exchange(drive, block.request(drive.address), self.bus.respondent(drive), fields),
+            fields=fields,
+        )
 
     def start(self) -> None:
         self.started_ns = self.ended_ns = now_ns()
-        for job in sorted(self._jobs, key=_kinship):
+        place = {drive: at for at, drive in enumerate(in_order(self.bus.drives))}
+        for job in sorted(self._jobs, key=lambda job: place[job.owner]):
             self.schedule.add(job, self.started_ns)
 
     def tend(self, now: int) -> None:
@@ -181,6 +190,7 @@ class _PolledLine:
             return
         if count or port.pending == 0:
             self._observe(now)
+            self._heed_refusals(now)
             self._top_up(port, now)
 
     def _observe(self, now: int) -> None:
@@ -193,6 +203,24 @@ class _PolledLine:
                 late_until_ns=respondent.late_until_ns,
                 cost_ns=round(drive.response_timeout * 1e9),
             )
+
+    def _heed_refusals(self, now: int) -> None:
+        """Registers that are refused together are asked for singly; a single one is set aside.
+
+        So no register is lost because of its neighbours.
+        """
+        for job in [it for it in self.schedule.jobs if it.fields.refusals >= REFUSALS]:
+            if len(job.block.registers) > 1:
+                parts = [self._job(job.owner, alone(it), job.period_ns) for it in job.block.registers]
+            elif job in self.set_aside:
+                continue
+            else:
+                parts = [self._job(job.owner, job.block, SET_ASIDE_NS)]
+                self.set_aside += parts
+            self.schedule.remove(job)
+            for part in parts:
+                self._jobs.append(part)
+                self.schedule.add(part, now)
 
     def _top_up(self, port: Port, now: int) -> None:
         pending = port.pending
@@ -246,6 +274,7 @@ class _PolledLine:
             "stray_bytes": sum(tally.stray_bytes for tally in tallies),
             "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
             "overrun_slots": sum(job.skipped for job in self._jobs),
+            "set_aside": [f"{job.owner.name}.{job.block.registers[0].name}" for job in self.set_aside],
             "drives": drives,
         }
 
@@ -264,11 +293,6 @@ class _PolledLine:
             "response_delay_ms": round(respondent.response_delay * 1e3, 3),
             "misses": dict(misses),
         }
-
-
-def _kinship(job: _Asked) -> tuple[object, ...]:
-    """Exchanges of like settings and silence stand side by side, so that the line switches seldom."""
-    return (*job.exchange.settings, job.exchange.c.silence_ns)
 
 
 class Poller:

@@ -61,6 +61,13 @@ class Schedule(Generic[J]):
         else:
             self._push(job)
 
+    def remove(self, job: J) -> None:
+        """No longer; what is queued of it is still carried out."""
+        self.jobs.remove(job)
+        self._turn = [it for it in self._turn if it is not job]
+        self._timed = [it for it in self._timed if it[2] is not job]
+        heapq.heapify(self._timed)
+
     def _push(self, job: J) -> None:
         self._number += 1
         heapq.heappush(self._timed, (job.due_ns, self._number, job))

@@ -322,15 +322,15 @@ static void check_columns(void)
         .result = 7, .sent_ns = 100, .first_ns = 130, .reply = {.data_len = 2, .data = {0, 3}}};
     row = "columns";
     *valid = 0xFF;
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2}, &completion, 1000) == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2, 0}, &completion, 1000) == 2);
     CHECK(time[0] == 1100 && sent[0] == 100 && uncertainty[0] == 30 && drive[0] == 7 && reg[1] == 9);
     CHECK(status[0] == 0 && value[0] == 0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
     CHECK((*valid & 3) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2}, &completion, 1000) == 0 && columns.rows == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2, 0}, &completion, 1000) == 0 && columns.rows == 2);
     completion = (struct md_completion){.result = MD_LINE_LOST, .begun_ns = 90};
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1}, &completion, 1000) == 1);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1, 0}, &completion, 1000) == 1);
     CHECK(sent[2] == 90 && status[2] == -MD_LINE_LOST && (*valid & 7) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1}, &completion, 1000) == 0 && columns.rows == ROOM);
+    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1, 0}, &completion, 1000) == 0 && columns.rows == ROOM);
 }
 
 static void check_spelling(void)
@@ -338,14 +338,16 @@ static void check_spelling(void)
     static const uint16_t codes[] = {1, 0, 2, 1};
     static const uint8_t names[] = "pumpfan"; /* "pump", "fan", "" */
     static const int32_t offsets[] = {0, 4, 7, 7};
+    enum { NAMES = 3 };
     int32_t ends[5] = {9, 9, 9, 9, 9};
     row = "spelling";
-    CHECK(md_spell(codes, 4, names, offsets, ends, page_end() - 10, 10) == 10);
+    CHECK(md_spell(codes, 4, names, offsets, NAMES, ends, page_end() - 10, 10) == 10);
     CHECK(memcmp(page_end() - 10, "fanpumpfan", 10) == 0);
     CHECK(ends[0] == 0 && ends[1] == 3 && ends[2] == 7 && ends[3] == 7 && ends[4] == 10);
     for (size_t room = 0; room < 10; room++)
-        CHECK(md_spell(codes, 4, names, offsets, ends, page_end() - room, room) == -1);
-    CHECK(md_spell(codes, 0, names, offsets, ends, page_end(), 0) == 0 && ends[0] == 0);
+        CHECK(md_spell(codes, 4, names, offsets, NAMES, ends, page_end() - room, room) == -1);
+    CHECK(md_spell(codes, 0, names, offsets, NAMES, ends, page_end(), 0) == 0 && ends[0] == 0);
+    CHECK(md_spell(codes, 4, names, offsets, NAMES - 1, ends, page_end() - 10, 10) == -1);
 }
 
 int main(int argc, char **argv)

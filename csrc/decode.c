@@ -1,0 +1,88 @@
+/* What was overheard becomes columns, as fast as a disk delivers it. */
+#include "multidrop.h"
+
+/* Requests with one key have replies that hold the same. A Delixi run command stands where other
+ * requests have their address. */
+static uint64_t key_of(int framing, const struct md_message *request)
+{
+    int is_run_command = framing == MD_DELIXI && request->function == 0x02;
+    uint64_t start = is_run_command ? 0 : request->start;
+    return 1 | (uint64_t)framing << 1 | (uint64_t)request->address << 8 | (uint64_t)request->function << 16 |
+           start << 24 | (uint64_t)request->count << 40;
+}
+
+/* Where the key is, or where it would be. */
+static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
+{
+    size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);
+    while (decoder->known[place &= decoder->places - 1].key && decoder->known[place].key != key)
+        place++;
+    return &decoder->known[place];
+}
+
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
+            const struct md_block *block)
+{
+    if (4 * decoder->taken >= 3 * decoder->places)
+        return 0;
+    uint64_t key = key_of(framing, request);
+    *place_of(decoder, key) = (struct md_known){key, block};
+    decoder->taken++;
+    return 1;
+}
+
+/* What a reply says of what was written is in its request, where the reply does not repeat it. */
+static void put_written(struct md_message *reply, int framing, const struct md_message *request)
+{
+    if (reply->exception)
+        return;
+    if (framing == MD_DELIXI && request->function == 0x02) {
+        reply->data[2] = (uint8_t)(request->start >> 8);
+        reply->data[3] = (uint8_t)request->start;
+    } else if (framing != MD_DELIXI && request->function >= 0x0F)
+        *reply = *request;
+}
+
+static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
+{
+    struct md_completion *completion = &decoder->completion;
+    if (!decoder->block)
+        return 1;
+    completion->result = result;
+    completion->sent_ns = decoder->asked_ns;
+    completion->first_ns = decoder->span.time_ns;
+    if (result > 0) {
+        completion->reply = decoder->span.message;
+        put_written(&completion->reply, decoder->span.framing, &decoder->splitter.request);
+    }
+    if (!md_columns_add(columns, decoder->block, completion, 0))
+        return 0;
+    decoder->block = NULL;
+    return 1;
+}
+
+/* What is to be done about `span`: 0 for enum md_decoded's first, or one of the others. */
+static int deal_with(struct md_decoder *decoder, struct md_columns *columns)
+{
+    const struct md_span *span = &decoder->span;
+    if (span->kind == MD_JUNK)
+        decoder->junk += span->len;
+    if (span->kind == MD_STRAY)
+        decoder->strays++;
+    if (span->kind == MD_REPLY) {
+        if (!add_rows(decoder, (int)span->len, columns))
+            return MD_NO_ROOM;
+        decoder->exchanges++;
+    }
+    decoder->frames += span->kind != MD_JUNK;
+    if (span->kind != MD_REQUEST && span->kind != MD_EITHER)
+        return MD_ALL_DECODED;
+    const struct md_known *known = place_of(decoder, key_of(span->framing, &span->message));
+    if (!known->key || !add_rows(decoder, decoder->result, columns)) {
+        decoder->frames--;
+        return known->key ? MD_NO_ROOM : MD_UNKNOWN;
+    }
+    decoder->block = known->block;
+    decoder->asked_ns = span->time_ns;
+    return MD_ALL_DECODED;
+}

@@ -1,0 +1,174 @@
+/* What was overheard on a line, cut into frames of both directions and every framing.
+ *
+ * Nothing is known beforehand but the table of functions: a frame is what has a good checksum where
+ * a frame may be. What follows a request is first tried as its reply, then as a request, then as a
+ * reply whose request was not heard. At most three frames are tried at a byte, so that garbage costs
+ * no more than its length. */
+#include "multidrop.h"
+
+#include <string.h>
+
+enum {
+    MOST_ADDRESS = 247,
+    MOST_NOISE = 3, /* bytes between a request and its reply; in more of them a request may be lost */
+    LEAST_DELIXI = 2,
+    MOST_DELIXI = 7
+};
+
+/* Bytes that follow `at` in its piece, and in the pieces that came without a pause. */
+static size_t end_of_run(const struct md_heard *heard, size_t piece)
+{
+    while (++piece < heard->count)
+        if (heard->pieces[piece].is_after_pause)
+            return heard->pieces[piece].at;
+    return heard->len;
+}
+
+/* In which framings a frame may be that begins with this byte: in Modbus RTU an address. */
+static int is_start(int framing, uint8_t first)
+{
+    return framing == MD_RTU ? first <= MOST_ADDRESS : first == ':';
+}
+
+/* Requests that a good reply is a copy of, or like one. */
+static int is_echoed(int framing, uint8_t function)
+{
+    return framing == MD_DELIXI || function == 0x05 || function == 0x06 || function == 0x08;
+}
+
+static int find_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
+{
+    int used = md_parse_request(framing, bytes, len, message);
+    if (used <= 0)
+        return used;
+    if (framing == MD_DELIXI && (message->function < LEAST_DELIXI || message->function > MOST_DELIXI))
+        return MD_BAD_FUNCTION;
+    return message->address > MOST_ADDRESS ? MD_BAD_ADDRESS : used;
+}
+
+static int hex_digit(uint8_t character)
+{
+    if (character >= '0' && character <= '9')
+        return character - '0';
+    return character >= 'A' && character <= 'F' ? character - 'A' + 10 : -1;
+}
+
+/* The first bytes of the body, 0 where there are none. */
+static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[6])
+{
+    memset(head, 0, 6);
+    for (size_t i = 0; i < 6; i++) {
+        if (framing == MD_RTU && i < len)
+            head[i] = bytes[i];
+        if (framing == MD_RTU || 2 * i + 2 >= len)
+            continue;
+        int high = hex_digit(bytes[2 * i + 1]), low = hex_digit(bytes[2 * i + 2]);
+        if (high < 0 || low < 0)
+            return;
+        head[i] = (uint8_t)(high << 4 | low);
+    }
+}
+
+/* A reply without its request: it is held against the request that it would be a good answer to. */
+static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
+{
+    uint8_t head[6];
+    read_head(framing, bytes, len, head);
+    struct md_message guess = {.address = head[0], .function = head[1] & 0x7F};
+    if (framing != MD_DELIXI && guess.function > 0x10)
+        return MD_BAD_FUNCTION;
+    if (guess.function <= 0x02)
+        guess.count = (uint16_t)(8 * head[2]);
+    else if (guess.function <= 0x04)
+        guess.count = head[2] / 2;
+    else {
+        guess.start = (uint16_t)(head[2] << 8 | head[3]);
+        guess.count = (uint16_t)(head[4] << 8 | head[5]);
+    }
+    int used = md_parse_reply(framing, bytes, len, &guess, message);
+    if (used > 0 && guess.function <= 0x04)
+        message->count = 0; /* nobody knows what was asked for */
+    return used;
+}
+
+/* The frame that begins here: its length, and its kind, framing and message in `span`. */
+static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len,
+                      struct md_span *span)
+{
+    static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
+    if (splitter->awaited && splitter->junk <= MOST_NOISE && side != MD_ASKING) {
+        int used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, &span->message);
+        span->kind = MD_REPLY;
+        span->framing = splitter->framing;
+        if (used >= 0)
+            return used;
+    }
+    for (int i = 0; i < 3 && side != MD_ANSWERING; i++) {
+        if (!is_start(framings[i], bytes[0]))
+            continue;
+        int used = find_request(framings[i], bytes, len, &span->message);
+        int may_be_copy = !splitter->is_in_step && side != MD_ASKING;
+        span->kind = used > 0 && may_be_copy && is_echoed(framings[i], span->message.function) ? MD_EITHER : MD_REQUEST;
+        span->framing = framings[i];
+        if (used >= 0)
+            return used;
+    }
+    for (int i = 0; i < 3 && side != MD_ASKING; i++) {
+        if (!is_start(framings[i], bytes[0]))
+            continue;
+        int used = find_reply(framings[i], bytes, len, &span->message);
+        span->kind = MD_STRAY;
+        span->framing = framings[i];
+        if (used >= 0)
+            return used;
+    }
+    return MD_NO_START;
+}
+
+static void pass(struct md_splitter *splitter, const struct md_span *span)
+{
+    splitter->at += span->len;
+    splitter->is_in_step = span->kind != MD_JUNK;
+    splitter->junk = span->kind == MD_JUNK ? splitter->junk + span->len : 0;
+    if (span->kind == MD_REPLY)
+        splitter->awaited = 0;
+    if (span->kind != MD_REQUEST && span->kind != MD_EITHER)
+        return;
+    splitter->request = span->message;
+    splitter->framing = span->framing;
+    splitter->awaited = span->message.address != 0;
+}
+
+int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct md_span *span)
+{
+    const struct md_piece *pieces = heard->pieces;
+    size_t at = splitter->at, end = 0;
+    int used = MD_INCOMPLETE;
+    for (; at < heard->len; at++) {
+        while (splitter->piece + 1 < heard->count && pieces[splitter->piece + 1].at <= at)
+            splitter->piece++;
+        if (at == splitter->at)
+            span->time_ns = pieces[splitter->piece].time_ns;
+        if (at >= end)
+            end = end_of_run(heard, splitter->piece);
+        /* A pause ends what begins amid junk: it must not swallow the good frame behind the pause. */
+        const struct md_piece *piece = &pieces[splitter->piece];
+        int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
+        size_t limit = is_due ? heard->len : end;
+        used = find_frame(splitter, piece->side, heard->bytes + at, limit - at, span);
+        if (used == MD_INCOMPLETE && (limit < heard->len || heard->is_all))
+            used = MD_CUT_SHORT;
+        if (used >= 0)
+            break;
+    }
+    span->at = splitter->at;
+    span->len = at - splitter->at;
+    if (span->len)
+        span->kind = MD_JUNK; /* the frame behind it is found again */
+    else if (used <= 0)
+        return 0;
+    else
+        span->len = (size_t)used;
+    pass(splitter, span);
+    return 1;
+}

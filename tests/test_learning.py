@@ -1,0 +1,217 @@
+"""What a line learns of its drives: when to look for a reply, how long to wait, what may come late."""
+
+from __future__ import annotations
+
+import pytest
+from frames import words
+from line_driver import MS, LineDriver
+
+from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply
+
+CHARACTER = 1 * MS
+SILENCE = 4 * MS
+LEAST, MOST = 20 * MS, 300 * MS
+READ, OTHER, LONGER = Message(1, 3, 0, 1), Message(1, 3, 50, 1), Message(1, 3, 0, 2)
+WRITE = Message(1, 6, 2, data=words(7))
+
+
+@pytest.fixture
+def line() -> LineDriver:
+    return LineDriver()
+
+
+@pytest.fixture
+def drive() -> Respondent:
+    return Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+
+
+def exchange(request: Message, drive: Respondent) -> Exchange:
+    return Exchange(
+        Framing.RTU,
+        request,
+        drive,
+        baudrate=9600,
+        format="8N1",
+        character=CHARACTER / 1e9,
+        silence=SILENCE / 1e9,
+    )
+
+
+def reply(value: int = 0) -> bytes:
+    return build_reply(Framing.RTU, Message(1, 3, data=words(value)))
+
+
+def ask(line: LineDriver, drive: Respondent, request: Message = READ) -> int:
+    """Send the request; when its last bit has left."""
+    line.begin(exchange(request, drive))
+    line.wait_until_write()
+    return line.now + 8 * CHARACTER
+
+
+def answer(line: LineDriver, drive: Respondent, delay: int) -> None:
+    """A whole exchange, whose reply comes character by character, the first after `delay`."""
+    left = ask(line, drive)
+    for at, character in enumerate(reply()):
+        line.now = left + delay + (at + 1) * CHARACTER
+        assert line.listens
+        line.receive(bytes([character]))
+    assert line.want == "done"
+
+
+def test_the_response_delay_is_learnt(line: LineDriver, drive: Respondent) -> None:
+    assert drive.response_delay == 0
+    for _ in range(40):
+        answer(line, drive, 15 * MS)
+    assert drive.response_delay == pytest.approx(15e-3, rel=0.01)
+
+
+def test_nothing_is_looked_at_before_a_reply_can_be_whole(line: LineDriver, drive: Respondent) -> None:
+    for _ in range(40):
+        answer(line, drive, 15 * MS)
+    left = ask(line, drive)
+    whole = left + 15 * MS + 7 * CHARACTER
+    assert line.want == "wait"
+    assert whole - 2 * CHARACTER <= line.wake <= whole
+
+
+def test_the_rest_of_a_reply_is_waited_for_by_its_length(line: LineDriver, drive: Respondent) -> None:
+    ask(line, drive)
+    line.now += 60 * MS
+    line.receive(reply()[:3])
+    assert (line.want, line.wake) == ("wait", line.now + 3 * CHARACTER)  # four are missing: look at the last
+    line.now = line.wake
+    line.receive(reply()[3:6])
+    assert line.want == "read"
+    line.receive(reply()[6:])
+    assert line.want == "done"
+
+
+def test_an_exception_is_not_waited_past(line: LineDriver, drive: Respondent) -> None:
+    refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
+    ask(line, drive, Message(1, 3, 0, 100))
+    line.receive(refusal[:2])
+    assert line.want == "read"
+    line.receive(refusal[2:])
+    assert line.want == "done"
+
+
+def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Respondent) -> None:
+    """Its reply is whole long before it is looked at; each look comes a little earlier."""
+    for _ in range(40):
+        answer(line, drive, 40 * MS)
+    for _ in range(80):
+        left = ask(line, drive)
+        assert line.want in ("wait", "read")
+        line.now = max(line.wake if line.want == "wait" else line.now, left + 5 * MS + 7 * CHARACTER)
+        line.wait_for_look()
+        line.receive(reply())
+        assert line.want == "done"
+    assert drive.response_delay < 10e-3
+
+
+def time_out(line: LineDriver, drive: Respondent, request: Message = READ) -> int:
+    """How long after the request's last bit a silent drive is given up, its reply's own time left out."""
+    left = ask(line, drive, request)
+    line.wait_until_done()
+    assert line.completion.result == Result.NO_REPLY
+    return line.now - left - 7 * CHARACTER
+
+
+def test_a_time_out_follows_the_drive_s_own_delay(line: LineDriver, drive: Respondent) -> None:
+    for number in range(200):
+        answer(line, drive, (40 + number % 3) * MS)
+    assert 40 * MS < time_out(line, drive) < 60 * MS
+
+
+def test_a_time_out_is_never_under_its_floor(line: LineDriver, drive: Respondent) -> None:
+    for _ in range(100):
+        answer(line, drive, MS // 10)
+    assert time_out(line, drive) == LEAST
+
+
+def test_each_failure_makes_the_next_time_out_longer_up_to_the_ceiling(
+    line: LineDriver, drive: Respondent
+) -> None:
+    found = []
+    for _ in range(5):
+        line.now = max(line.now, drive.late_until_ns)
+        found.append(time_out(line, drive) // MS)
+    assert found == [80, 160, 300, 300, 300]
+    assert drive.failures == 5
+    line.now = drive.late_until_ns
+    answer(line, drive, 5 * MS)
+    assert drive.failures == 0
+
+
+# ---- answers that come late ----
+
+
+def test_what_a_late_answer_could_be_taken_for_is_not_sent(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive)
+    line.begin(exchange(OTHER, drive))
+    assert line.want == "done"
+    assert (line.completion.result, line.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    assert drive.failures == 1  # nothing was asked, so nothing failed
+
+
+@pytest.mark.parametrize("request_", [LONGER, WRITE], ids=["a longer read", "a write"])
+def test_what_no_late_answer_could_be_taken_for_is_sent(
+    line: LineDriver, drive: Respondent, request_: Message
+) -> None:
+    """A stop is a write: it never waits."""
+    time_out(line, drive)
+    ask(line, drive, request_)
+
+
+def test_other_drives_are_not_concerned(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive)
+    other = Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+    ask(line, other, Message(2, 3, 0, 1))
+
+
+def test_the_ceiling_of_the_document_ends_the_waiting(line: LineDriver, drive: Respondent) -> None:
+    left = line.now + SILENCE + 8 * CHARACTER
+    time_out(line, drive)
+    assert drive.late_until_ns >= left + MOST
+    line.now = drive.late_until_ns
+    ask(line, drive, OTHER)
+
+
+@pytest.mark.parametrize("piece", [7, 1], ids=["whole", "byte by byte"])
+def test_a_late_answer_is_recognised_and_ends_the_waiting(
+    line: LineDriver, drive: Respondent, piece: int
+) -> None:
+    time_out(line, drive)
+    line.receive(reply(1111), piece)
+    assert drive.late_until_ns == 0
+    assert drive.tally().late == 1
+    ask(line, drive, OTHER)
+    line.receive(reply(2222))
+    assert line.want == "done"
+    found = line.completion
+    assert (found.reply.data, found.stale) == (words(2222), 7)
+
+
+def test_a_late_answer_within_another_drive_s_exchange_is_not_its_reply(
+    line: LineDriver, drive: Respondent
+) -> None:
+    time_out(line, drive)
+    other = Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+    ask(line, other, Message(2, 3, 0, 1))
+    line.receive(reply(1111))
+    assert line.listens
+    line.receive(build_reply(Framing.RTU, Message(2, 3, data=words(5))))
+    assert (line.completion.reply.data, line.completion.skipped) == (words(5), 7)
+
+
+def test_everything_is_counted(line: LineDriver, drive: Respondent) -> None:
+    answer(line, drive, 5 * MS)
+    time_out(line, drive)
+    line.begin(exchange(OTHER, drive))
+    line.now = drive.late_until_ns
+    ask(line, drive)
+    line.receive(b"\xff" + build_reply(Framing.RTU, Message(1, 3, exception=2)))
+    tally = drive.tally()
+    assert (tally.exchanges, tally.answered, tally.values, tally.exceptions) == (4, 2, 1, 1)
+    assert tally.missed == {Result.NO_REPLY: 1, Result.LATE_ANSWER_DUE: 1}
+    assert (tally.stray_bytes, tally.late) == (1, 0)
