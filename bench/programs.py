@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -13,6 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 HERE = Path(__file__).parent
+CORE = HERE.parent / "csrc"
+CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that take the core's own checksums
+FRAMES = (*CHECKSUM, str(CORE / "frame.c"))
 
 
 @cache
@@ -49,3 +53,21 @@ def paced_line(**options: Any) -> Iterator[Line]:
         yield line
         told, _ = process.communicate()
     line.report = json.loads(told)
+
+
+@contextmanager
+def talking(command: Sequence[object], **options: Any) -> Iterator[str]:
+    """A program that says where it is to be found, and runs until standard input ends."""
+    words = [str(word) for word in command]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **options) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+
+
+@contextmanager
+def on_one_processor() -> Iterator[None]:
+    """Programs that are started meanwhile stay on the first processor (where the system can do that)."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    yield
+    os.sched_setaffinity(0, allowed)

@@ -7,25 +7,13 @@ are on one processor, which repeats best.
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from statistics import median
 from typing import Any
 
 import rivals
 import tables
 from jobs import Job
-from programs import paced_line
-
-
-@contextmanager
-def on_one_processor() -> Iterator[None]:
-    """Programs that are started meanwhile stay on the first processor (where the system can do that)."""
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})
-    yield
-    os.sched_setaffinity(0, allowed)
+from programs import on_one_processor, paced_line
 
 
 def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:

@@ -1,0 +1,167 @@
+"""What an exchange costs the host when one process polls many lines at once.
+
+A bare epoll loop in C over as many lines runs before every slice, and ratios are to that slice. Both
+ends are on one processor, which repeats best. `python many_lines.py JOB` is the process that polls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from socket import socket, socketpair
+from statistics import median
+from typing import Any
+
+import tables
+from programs import CHECKSUM, compiled, on_one_processor, talking
+
+BAUDRATE = 115200
+DELAY_US = 2000
+SETTLE_S = 0.5
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Ports to poll for `seconds`: paths, or numbers of descriptors that are open already."""
+
+    ports: Sequence[str]
+    baudrate: int
+    seconds: float
+
+
+# ---- the process that polls ----
+
+
+def _thread_seconds() -> dict[int, float]:
+    """What each thread of this process has had of the processors."""
+    tasks = Path("/proc/self/task").iterdir()
+    return {int(task.name): int((task / "schedstat").read_text().split()[0]) / 1e9 for task in tasks}
+
+
+def poll(job: Lines) -> dict[str, Any]:
+    import adapter
+
+    begun = time.monotonic()
+    with adapter.polling_lines(job.ports, job.baudrate) as poller:
+        opened = time.monotonic() - begun
+        for _ in poller.batches(SETTLE_S):
+            pass
+        before, used, begun = adapter.counts(poller), _thread_seconds(), time.monotonic()
+        for _ in poller.batches(job.seconds):
+            pass
+        after, left, seconds = adapter.counts(poller), _thread_seconds(), time.monotonic() - begun
+        in_python = {thread.native_id for thread in threading.enumerate()}
+    spent = {thread: left[thread] - used.get(thread, 0.0) for thread in left}
+    return {
+        "exchanges": after[0] - before[0],
+        "failures": after[1] - before[1],
+        "cpu_seconds": sum(spent.values()),
+        "python_seconds": sum(spent[thread] for thread in spent if thread in in_python),
+        "seconds": seconds,
+        "opened": opened,
+    }
+
+
+# ---- the process that measures ----
+
+
+@contextmanager
+def far_ends(kind: str, count: int, *options: object) -> Iterator[tuple[list[str], list[int]]]:
+    """So many lines whose far ends answer: their ports, and the descriptors to hand down."""
+    program = compiled("far_ends.c", *CHECKSUM)
+    if kind == "pty":
+        with talking([program, "--ptys", count, *options]) as paths:
+            yield paths.split(), []
+        return
+    pairs: list[tuple[socket, socket]] = [socketpair() for _ in range(count)]
+    try:
+        theirs = [far.fileno() for _, far in pairs]
+        ours = [near.fileno() for near, _ in pairs]
+        with talking([program, *options, *theirs], pass_fds=theirs):
+            yield [str(fd) for fd in ours], ours
+    finally:
+        for end in (end for pair in pairs for end in pair):
+            end.close()
+
+
+def measured(master: str, kind: str, count: int, seconds: float, paced: bool) -> dict[str, Any]:
+    baudrate = BAUDRATE if paced else 0
+    with far_ends(kind, count, "--baudrate", baudrate, "--delay-us", DELAY_US if paced else 0) as (ports, fds):
+        if master == "bare C":
+            command = [compiled("bare_lines.c", *CHECKSUM), seconds, *ports]
+        else:
+            command = [sys.executable, __file__, json.dumps(asdict(Lines(ports, baudrate, seconds)))]
+        told = subprocess.check_output([str(word) for word in command], pass_fds=fds)
+    own: dict[str, Any] = json.loads(told)
+    good = max(1, own["exchanges"])
+    return own | {"rate": good / own["seconds"], "cpu": own["cpu_seconds"] / good * 1e6}
+
+
+def row(kind: str, count: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
+    pairs = list(zip(slices, bare, strict=True))
+    python = [it["python_seconds"] / it["exchanges"] * 1e6 for it in slices if "python_seconds" in it]
+    return [
+        kind,
+        str(count),
+        master,
+        f"{median(it['rate'] for it in slices):.0f}",
+        f"{median(it['rate'] / yard['rate'] for it, yard in pairs):.3f}",
+        f"{median(it['cpu'] for it in slices):.2f}",
+        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        f"{median(python):.2f}" if python else "",
+        str(sum(it["failures"] for it in slices)),
+    ]
+
+
+def compared(kind: str, count: int, arguments: argparse.Namespace) -> list[list[str]]:
+    bare, slices = [], []
+    for _ in range(arguments.slices):
+        bare.append(measured("bare C", kind, count, arguments.seconds, paced=False))
+        slices.append(measured("multidrop", kind, count, arguments.seconds, paced=False))
+    return [row(kind, count, "bare C", bare, bare), row(kind, count, "multidrop", slices, bare)]
+
+
+def paced(arguments: argparse.Namespace) -> list[str]:
+    own = measured("multidrop", "socketpair", arguments.paced, arguments.seconds, paced=True)
+    share, python = own["cpu_seconds"] / own["seconds"], own["python_seconds"] / own["seconds"]
+    cells = f"{own['rate']:.0f}", f"{own['cpu']:.1f}", f"{share:.1%}", f"{python:.1%}", str(own["failures"])
+    return [str(arguments.paced), *cells]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--socketpairs", type=int, nargs="*", default=[1, 16, 64, 256, 1024])
+    parser.add_argument("--ptys", type=int, nargs="*", default=[1, 16, 64, 256, 1024])
+    parser.add_argument("--paced", type=int, default=64, help=f"lines at {BAUDRATE} baud")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of a slice")
+    parser.add_argument("--slices", type=int, default=5)
+    arguments = parser.parse_args()
+    tables.heading("Many lines in one process: 16 drives on each, 10 registers each, decoded to columns.")
+
+    kinds = {"socketpair": arguments.socketpairs, "pty": arguments.ptys}
+    with on_one_processor():
+        rows = [row for kind, counts in kinds.items() for count in counts for row in compared(kind, count, arguments)]
+    columns = ("lines", "number", "master", "exchanges/s", "/ bare", "CPU us", "/ bare", "in Python", "failed")
+    tables.show(columns, rows)
+    print(f"\nWith the pace of a wire: {BAUDRATE} baud, response delay {DELAY_US / 1000:g} ms.\n")
+    tables.show(("lines", "exchanges/s", "CPU us", "of a core", "in Python", "failed"), [paced(arguments)])
+    print(
+        "\nCPU us: of all threads of the process, per exchange; in Python: of these, those that run Python."
+        "\nThe lines are polled by Poller; a socket pair stands in for a port that is open already."
+    )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 2 and sys.argv[1].startswith("{"):
+        print(json.dumps(poll(Lines(**json.loads(sys.argv[1])))))
+    else:
+        main()
