@@ -43,6 +43,7 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         *reply = *request;
 }
 
+/* Rows of the last request: what its reply says, or why there is none. 0 when there is no room. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;
@@ -61,28 +62,53 @@ static int add_rows(struct md_decoder *decoder, int result, struct md_columns *c
     return 1;
 }
 
-/* What is to be done about `span`: 0 for enum md_decoded's first, or one of the others. */
-static int deal_with(struct md_decoder *decoder, struct md_columns *columns)
+/* A request: what became of the one before it, then what its own reply will hold. */
+static int take_request(struct md_decoder *decoder, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
-    if (span->kind == MD_JUNK)
-        decoder->junk += span->len;
-    if (span->kind == MD_STRAY)
-        decoder->strays++;
-    if (span->kind == MD_REPLY) {
-        if (!add_rows(decoder, (int)span->len, columns))
-            return MD_NO_ROOM;
-        decoder->exchanges++;
-    }
-    decoder->frames += span->kind != MD_JUNK;
-    if (span->kind != MD_REQUEST && span->kind != MD_EITHER)
-        return MD_ALL_DECODED;
     const struct md_known *known = place_of(decoder, key_of(span->framing, &span->message));
-    if (!known->key || !add_rows(decoder, decoder->result, columns)) {
-        decoder->frames--;
-        return known->key ? MD_NO_ROOM : MD_UNKNOWN;
-    }
+    if (!known->key)
+        return MD_UNKNOWN;
+    if (!add_rows(decoder, decoder->failure, columns))
+        return MD_NO_ROOM;
     decoder->block = known->block;
     decoder->asked_ns = span->time_ns;
+    decoder->failure = MD_NO_REPLY;
+    return MD_ALL_DECODED;
+}
+
+static int take(struct md_decoder *decoder, struct md_columns *columns)
+{
+    const struct md_span *span = &decoder->span;
+    int is_request = span->kind == MD_REQUEST || span->kind == MD_EITHER;
+    if (span->kind == MD_REPLY && !add_rows(decoder, (int)span->len, columns))
+        return MD_NO_ROOM;
+    if (is_request && !decoder->is_sure)
+        decoder->block = NULL; /* it may have been a confirmation: nobody failed to answer it */
+    int undone = is_request ? take_request(decoder, columns) : MD_ALL_DECODED;
+    if (undone)
+        return undone;
+    if (is_request)
+        decoder->is_sure = span->kind == MD_REQUEST;
+    if (span->kind == MD_STRAY)
+        decoder->failure = span->message.address != decoder->splitter.request.address ? MD_BAD_ADDRESS : MD_BAD_LENGTH;
+    if (span->kind == MD_JUNK)
+        decoder->failure = MD_NO_START;
+    decoder->frames += span->kind != MD_JUNK;
+    decoder->exchanges += span->kind == MD_REPLY;
+    decoder->strays += span->kind == MD_STRAY;
+    decoder->junk += span->kind == MD_JUNK ? span->len : 0;
+    return MD_ALL_DECODED;
+}
+
+int md_decode(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns)
+{
+    while (decoder->is_due || md_split(&decoder->splitter, heard, &decoder->span)) {
+        decoder->is_due = 1;
+        int undone = take(decoder, columns);
+        if (undone)
+            return undone;
+        decoder->is_due = 0;
+    }
     return MD_ALL_DECODED;
 }

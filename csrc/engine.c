@@ -48,7 +48,7 @@ struct md_port {
 
     struct slot *slots;
     unsigned room; /* a power of two */
-    atomic_uint submitted, done, reaped;
+    struct md_progress progress; /* its counters have one writer each, and are read atomically */
     atomic_int idle;    /* the thread waits to be told of more */
     struct wish *wishes;
 
@@ -56,7 +56,7 @@ struct md_port {
     struct wish *wish; /* under way */
     int blind;         /* nothing is worth reading before the port's waking time */
     int watched;       /* epoll tells when it can be read */
-    atomic_int lost;   /* errno + 1 of the failure after which nothing can be carried out */
+    int lost_error;
     int closing, closed;
 };
 
@@ -79,6 +79,16 @@ int64_t md_now_ns(void)
     return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
 }
 
+static uint32_t get(const uint32_t *counter)
+{
+    return __atomic_load_n(counter, __ATOMIC_SEQ_CST);
+}
+
+static void put(uint32_t *counter, uint32_t value)
+{
+    __atomic_store_n(counter, value, __ATOMIC_SEQ_CST);
+}
+
 static void ring(int eventfd)
 {
     uint64_t one = 1;
@@ -95,7 +105,7 @@ static void silence(int eventfd)
 
 static void watch(struct md_port *port, int watched)
 {
-    if (port->watched == watched || port->lost)
+    if (port->watched == watched || port->progress.lost)
         return;
     struct epoll_event event = {.events = watched ? EPOLLIN : 0, .data.ptr = port};
     epoll_ctl(port->engine->epoll, EPOLL_CTL_MOD, port->fd, &event);
@@ -104,7 +114,8 @@ static void watch(struct md_port *port, int watched)
 
 static void lose(struct md_port *port, int error)
 {
-    port->lost = error + 1;
+    port->lost_error = error;
+    put(&port->progress.lost, 1);
     epoll_ctl(port->engine->epoll, EPOLL_CTL_DEL, port->fd, NULL); /* a port that hung up is ready for ever */
     md_line_abandon(&port->line, MD_LINE_LOST, error);
 }
@@ -135,7 +146,7 @@ static int pump_out(struct md_port *port, int64_t now_ns)
         md_line_sent(line, (size_t)written, now_ns);
     else if (written < 0 && !is_transient(errno))
         lose(port, errno);
-    return written != 0 && (written > 0 || port->lost);
+    return written != 0 && (written > 0 || port->progress.lost);
 }
 
 static int same_settings(const struct md_settings *a, const struct md_settings *b)
@@ -160,13 +171,13 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
 static void begin(struct md_port *port, const struct md_exchange *exchange, struct md_completion *completion, int64_t now_ns)
 {
     md_line_begin(&port->line, exchange, completion, now_ns);
-    if (port->lost)
-        md_line_abandon(&port->line, MD_LINE_LOST, port->lost - 1);
+    if (port->progress.lost)
+        md_line_abandon(&port->line, MD_LINE_LOST, port->lost_error);
 }
 
 static unsigned pending(struct md_port *port)
 {
-    return atomic_load(&port->submitted) - atomic_load_explicit(&port->done, memory_order_relaxed);
+    return get(&port->progress.submitted) - port->progress.done;
 }
 
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
@@ -188,7 +199,7 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
             return 0;
         atomic_store(&port->idle, 0);
     }
-    struct slot *slot = &port->slots[atomic_load(&port->done) & (port->room - 1)];
+    struct slot *slot = &port->slots[port->progress.done & (port->room - 1)];
     if (now_ns < slot->not_before_ns) {
         if (slot->not_before_ns < *wake_ns)
             *wake_ns = slot->not_before_ns;
@@ -209,7 +220,7 @@ static void finish(struct md_port *port)
         return;
     }
     port->slot = NULL;
-    atomic_fetch_add(&port->done, 1);
+    put(&port->progress.done, port->progress.done + 1);
     unsigned left = pending(port);
     if (left == port->room / 4 || left == 0)
         ring(port->engine->notice);
@@ -292,7 +303,7 @@ static void close_ports(struct md_engine *engine)
         struct md_port *port = engine->ports[i];
         if (!port->closing)
             continue;
-        if (!port->lost)
+        if (!port->progress.lost)
             epoll_ctl(engine->epoll, EPOLL_CTL_DEL, port->fd, NULL);
         struct md_port *last = engine->ports[--engine->count];
         engine->ports[i] = last;
@@ -461,33 +472,28 @@ void md_port_free(struct md_port *port)
 
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns, int n)
 {
-    unsigned submitted = atomic_load(&port->submitted);
-    unsigned free_slots = port->room - (submitted - atomic_load(&port->reaped));
+    unsigned submitted = port->progress.submitted;
+    unsigned free_slots = port->room - (submitted - port->progress.reaped);
     int taken = 0;
     for (; taken < n && (unsigned)taken < free_slots; taken++) {
         struct slot *slot = &port->slots[(submitted + (unsigned)taken) & (port->room - 1)];
         slot->exchange = exchanges[taken];
         slot->not_before_ns = not_before_ns[taken];
     }
-    atomic_store(&port->submitted, submitted + (unsigned)taken);
+    put(&port->progress.submitted, submitted + (unsigned)taken);
     if (taken && atomic_exchange(&port->idle, 0))
         ring(port->engine->bell);
     return taken;
 }
 
-int md_port_lost(struct md_port *port)
+const struct md_progress *md_port_progress(struct md_port *port)
 {
-    return port->lost != 0;
-}
-
-int md_port_pending(struct md_port *port)
-{
-    return (int)pending(port);
+    return &port->progress;
 }
 
 int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns)
 {
-    unsigned reaped = atomic_load(&port->reaped), done = atomic_load(&port->done);
+    unsigned reaped = port->progress.reaped, done = get(&port->progress.done);
     int count = 0;
     for (; reaped != done; reaped++, count++) {
         const struct slot *slot = &port->slots[reaped & (port->room - 1)];
@@ -498,7 +504,7 @@ int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_m
         if (completion->result > 0)
             block->refusals = completion->reply.exception ? block->refusals + 1 : 0;
     }
-    atomic_store(&port->reaped, reaped);
+    put(&port->progress.reaped, reaped);
     return count;
 }
 

@@ -137,7 +137,7 @@ static void measure(struct md_line *line, int reply_len)
     if (line->looks == 1 && line->ready_ns && early_ns(exchange) < delay_ns)
         delay_ns = early_ns(exchange);
     learn_delay(exchange->drive, delay_ns);
-    exchange->drive->tally.ideal_ns += (uint64_t)(exchange->silence_ns + request_ns + delay_ns + reply_ns);
+    exchange->drive->tally.ideal_ns += (uint64_t)(line->silence_ns + request_ns + delay_ns + reply_ns);
 }
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)

@@ -200,13 +200,17 @@ void md_port_free(struct md_port *port); /* a port that was stopped */
 /* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
-int md_port_pending(struct md_port *port); /* how many are not carried out yet */
+/* How far the queue is: each number only grows, and wraps around. */
+struct md_progress {
+    uint32_t submitted, done, reaped;
+    uint32_t lost; /* the descriptor failed: all that comes is MD_LINE_LOST */
+};
+const struct md_progress *md_port_progress(struct md_port *port);
 /* Make rows of what was carried out; how many exchanges, fewer when the columns are full. */
 int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns);
 /* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
-int md_port_lost(struct md_port *port); /* the descriptor failed: all that comes is MD_LINE_LOST */
 
 /* ---- columns.c: completions become columns ---- */
 
@@ -321,6 +325,7 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* of the last request */
     int64_t asked_ns;
+    int is_sure, failure;         /* it was a request; why it has no reply, if that does not come */
     int is_due;                   /* `span` is still to be dealt with */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
@@ -357,7 +362,7 @@ struct md_capture {
     int is_pcapng, is_big_endian;
     struct md_channel *channels;
     size_t count;
-    uint64_t packets, truncated;
+    uint64_t packets;
 };
 
 enum md_unpacked {

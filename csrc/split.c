@@ -91,16 +91,17 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     return used;
 }
 
-/* The frame that begins here: its length, and its kind, framing and message in `span`. */
+/* The frame that begins here: its length, and its kind, framing and message in `span`. `least` is
+ * MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
 static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len,
-                      struct md_span *span)
+                      int least, struct md_span *span)
 {
     static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
     if (splitter->awaited && splitter->junk <= MOST_NOISE && side != MD_ASKING) {
         int used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, &span->message);
         span->kind = MD_REPLY;
         span->framing = splitter->framing;
-        if (used >= 0)
+        if (used >= least)
             return used;
     }
     for (int i = 0; i < 3 && side != MD_ANSWERING; i++) {
@@ -110,7 +111,7 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
         int may_be_copy = !splitter->is_in_step && side != MD_ASKING;
         span->kind = used > 0 && may_be_copy && is_echoed(framings[i], span->message.function) ? MD_EITHER : MD_REQUEST;
         span->framing = framings[i];
-        if (used >= 0)
+        if (used >= least)
             return used;
     }
     for (int i = 0; i < 3 && side != MD_ASKING; i++) {
@@ -119,7 +120,7 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
         int used = find_reply(framings[i], bytes, len, &span->message);
         span->kind = MD_STRAY;
         span->framing = framings[i];
-        if (used >= 0)
+        if (used >= least)
             return used;
     }
     return MD_NO_START;
@@ -155,9 +156,8 @@ int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct 
         const struct md_piece *piece = &pieces[splitter->piece];
         int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
         size_t limit = is_due ? heard->len : end;
-        used = find_frame(splitter, piece->side, heard->bytes + at, limit - at, span);
-        if (used == MD_INCOMPLETE && (limit < heard->len || heard->is_all))
-            used = MD_CUT_SHORT;
+        int least = limit < heard->len || heard->is_all ? 1 : MD_INCOMPLETE;
+        used = find_frame(splitter, piece->side, heard->bytes + at, limit - at, least, span);
         if (used >= 0)
             break;
     }

@@ -12,15 +12,22 @@ import termios
 import threading
 import time
 from contextlib import suppress
+from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, notice_fd, now_ns
+from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, notice_fd
 from multidrop.errors import LineError
 
 __all__ = ["Line", "Wake", "await_notice", "now_ns", "sleep", "utc_minus_monotonic_ns"]
 
 sleep = time.sleep
+
+
+def now_ns() -> int:
+    """CLOCK_MONOTONIC, the core's clock."""
+    return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
 
 _ALL_SETTINGS = sum(REFUSALS)
 _BAUDRATE = min(REFUSALS)
@@ -34,22 +41,32 @@ _OPEN_REASONS = {
     errno.EAGAIN: "it is in use by another program",
     errno.EBUSY: "it is in use by another program",
     errno.ENOTTY: "it is not a serial port",
+    errno.EISDIR: "it is a directory, not a serial port",
     errno.ECONNREFUSED: "nothing listens there",
 }
 
 
 def utc_minus_monotonic_ns() -> int:
     """What to add to CLOCK_MONOTONIC to have UTC, as of now."""
-    return time.time_ns() - int(now_ns())
+    return time.time_ns() - now_ns()
 
 
 def _reason(failure: BaseException) -> str:
     """Why, in words: pyserial hides the system's error in its own, or behind it."""
     for error in (failure, failure.__context__):
+        if isinstance(error, socket.gaierror):
+            return error.strerror or str(error)
         code = error.args[0] if error and error.args else None
         if isinstance(code, int):
             return _OPEN_REASONS.get(code) or os.strerror(code)
     return str(failure)
+
+
+def _check_address(port: str) -> None:
+    """ValueError for a URL of a network port that does not say where it is."""
+    url = urlsplit(port)
+    if url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port):
+        raise ValueError(f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
 
 
 class Wake:
@@ -59,22 +76,27 @@ class Wake:
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._reader, False)
         os.set_blocking(self._writer, False)
+        self._closed = False
 
     def fileno(self) -> int:
         return self._reader
 
     def set(self) -> None:
-        with suppress(BlockingIOError):
-            os.write(self._writer, b"\0")
+        if not self._closed:
+            with suppress(BlockingIOError):
+                os.write(self._writer, b"\0")
 
     def clear(self) -> None:
-        with suppress(BlockingIOError):
-            while os.read(self._reader, 64):
-                pass
+        if not self._closed:
+            with suppress(BlockingIOError):
+                while os.read(self._reader, 64):
+                    pass
 
     def close(self) -> None:
-        os.close(self._reader)
-        os.close(self._writer)
+        if not self._closed:
+            self._closed = True
+            os.close(self._reader)
+            os.close(self._writer)
 
 
 def await_notice(seconds: float) -> None:
@@ -84,13 +106,21 @@ def await_notice(seconds: float) -> None:
         os.read(fd, 8)
 
 
+def _make(port: serial.SerialBase, settings: tuple[int, str]) -> None:
+    """Have pyserial set the port up, which may take it a while."""
+    baudrate, format = settings
+    port.baudrate = baudrate
+    port.bytesize = int(format[0])
+    port.parity = format[1]
+    port.stopbits = int(format[2])
+
+
 class _Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction."""
 
     def __init__(self, port: serial.SerialBase) -> None:
         self._port = port
         self._port.timeout = 0.01
-        self._settings: tuple[int, str] | None = None
         self._ours, self.theirs = socket.socketpair()
         self.theirs.setblocking(False)
         self._closing = threading.Event()
@@ -116,16 +146,6 @@ class _Bridge:
         with suppress(OSError):
             self._ours.shutdown(socket.SHUT_RDWR)
 
-    def takes(self, settings: tuple[int, str]) -> bool:
-        """Make them the port's; False when it has others already, which its queue may still need."""
-        if self._settings is None:
-            baudrate, format = self._settings = settings
-            self._port.baudrate = baudrate
-            self._port.bytesize = int(format[0])
-            self._port.parity = format[1]
-            self._port.stopbits = int(format[2])
-        return self._settings == settings
-
     def close(self) -> None:
         self._closing.set()
         self._hang_up()
@@ -144,21 +164,25 @@ class Line:
     def __init__(self, port: str) -> None:
         self.port = port
         self._bridge: _Bridge | None = None
+        self._settings: tuple[int, str] | None = None  # that a bridged port must have
+        self._serial: serial.SerialBase | None = None
         self._core: Port | None = None
         self._lock = threading.RLock()  # one opens, closes or queues at a time
         self._open()
 
     def _open(self) -> None:
         try:
-            self._serial = serial.serial_for_url(self.port, do_not_open=True)
-            self._serial.timeout = 0
-            if isinstance(self._serial, serial.Serial):
-                self._serial.exclusive = True
-            self._serial.open()
-            self._core = self._drive(self._serial)
+            _check_address(self.port)
+            port = self._serial = serial.serial_for_url(self.port, do_not_open=True)
+            port.timeout = 0
+            if isinstance(port, serial.Serial):
+                port.exclusive = True
+            port.open()
+            self._core = self._drive(port)
             with suppress(*_PORT_FAILURES, AttributeError, NotImplementedError):
-                self._serial.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
+                port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except _PORT_FAILURES as failure:
+            self.close()
             raise LineError(self.port, _reason(failure)) from failure
 
     def _drive(self, port: serial.SerialBase) -> Port:
@@ -172,6 +196,8 @@ class Line:
             with socket.socket(fileno=os.dup(fd)) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return Port(fd, _NO_SETTINGS)
+        if self._settings:
+            _make(port, self._settings)
         self._bridge = _Bridge(port)
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
 
@@ -184,8 +210,9 @@ class Line:
             if self._bridge:
                 self._bridge.close()
                 self._bridge = None
-            with suppress(*_PORT_FAILURES):
-                self._serial.close()
+            if self._serial:
+                with suppress(*_PORT_FAILURES):
+                    self._serial.close()
 
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
@@ -193,11 +220,26 @@ class Line:
             self.close()
             self._open()
 
+    def require(self, settings: tuple[int, str]) -> None:
+        """Exchanges with these settings will come: a port that is bridged can only have one kind of them.
+
+        Raises LineError when it has others already, or does not take these.
+        """
+        with self._lock:
+            if self._serial is None or self._bridge is None or self._settings == settings:
+                return
+            if self._settings:
+                raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
+            try:
+                _make(self._serial, settings)
+            except _PORT_FAILURES as failure:
+                raise LineError(self.port, _reason(failure)) from failure
+            self._settings = settings
+
     def _opened(self, settings: tuple[int, str]) -> Port:
         if self._core is None:
             raise LineError(self.port, "it is closed")
-        if self._bridge and not self._bridge.takes(settings):
-            raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
+        self.require(settings)
         return self._core
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:

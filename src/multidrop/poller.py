@@ -18,10 +18,10 @@ from typing import Any
 from multidrop import core, plant
 from multidrop.batch import Batch
 from multidrop.bus import Bus, exchange
-from multidrop.core import Columns, Exchange, Field, Port, Result, now_ns
+from multidrop.core import Columns, Exchange, Field, Port, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
-from multidrop.line import Wake, await_notice, sleep, utc_minus_monotonic_ns
+from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
 from multidrop.plan import Block, alone, blocks, duration, in_order
 from multidrop.plant import Plant
 from multidrop.register import Register
@@ -128,6 +128,11 @@ class _Rows:
                 self._chunks.append(Columns(CHUNK_ROWS))
         return Batch(oldest, self._codes.drives, self._codes.registers)
 
+    def close(self) -> None:
+        """No more rows will come; those that wait can still be taken."""
+        with self._lock:
+            self.wake.close()
+
 
 class _PolledLine:
     """A line's bus, its schedule, and what is queued on it."""
@@ -145,9 +150,16 @@ class _PolledLine:
         self._average_ns = 0  # of what was queued last
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
-        for polled in declared.drives:
-            self.bus.attach(polled.drive)
-            self._declare(polled)
+        self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has and we have no outcome of
+        try:
+            for polled in declared.drives:
+                self.bus.attach(polled.drive)
+                self._declare(polled)
+            for job in self._jobs:
+                self.bus.line.require(job.exchange.settings)
+        except BaseException:
+            self.bus.close()
+            raise
 
     def _declare(self, polled: plant.PolledDrive) -> None:
         drive = polled.drive
@@ -183,15 +195,29 @@ class _PolledLine:
         if port is None:
             self._regain(now)
             return
-        count = self._rows.collect(port)
+        count = self._collect(port)
         if port.lost:
-            self.bus.line.close()
-            self._reopen_ns = now
+            self._lose(port, now)
             return
         if count or port.pending == 0:
             self._observe(now)
             self._heed_refusals(now)
             self._top_up(port, now)
+
+    def _collect(self, port: Port) -> int:
+        count = self._rows.collect(port)
+        for _ in range(count):
+            self._queued.popleft()
+        return count
+
+    def _lose(self, port: Port, now: int) -> None:
+        """The port failed: what was queued on it is missed."""
+        port.stop()
+        self._collect(port)
+        self._miss(list(self._queued), Result.LINE_LOST)
+        self._queued.clear()
+        self.bus.line.close()
+        self._reopen_ns = now
 
     def _observe(self, now: int) -> None:
         for drive in self.bus.drives:
@@ -228,6 +254,7 @@ class _PolledLine:
         queued = self.schedule.take(now, start_ns, now + AHEAD_NS, port.room - pending)
         if queued:
             port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
+            self._queued += queued
             self._average_ns = sum(job.duration_ns for job, _ in queued) // len(queued)
         if self.schedule.unasked:
             self._miss(self.schedule.unasked, Result.NOT_ASKED)
@@ -257,7 +284,8 @@ class _PolledLine:
         port = self.bus.line.queue
         if port:
             port.stop()
-            self._rows.collect(port)
+            self.ended_ns = now_ns()
+            self._collect(port)
         self.bus.close()
 
     def summary(self) -> dict[str, Any]:
@@ -336,6 +364,7 @@ class Poller:
             self._thread.join()
         for line in self._lines:
             line.close()
+        self._rows.close()
 
     def _poll(self) -> None:
         while not self._closing:

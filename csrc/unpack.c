@@ -1,0 +1,117 @@
+/* Packets out of capture files: pcap and pcapng, as others and we write them.
+ *
+ * The blocks that describe a pcapng file's interfaces are rare, and the caller's to read. */
+#include "multidrop.h"
+
+enum {
+    ENHANCED_PACKET = 6,
+    MOST_PACKET = 1 << 16,
+    RTAC_HEADER = 12,
+    TAG_PORT_OF_SENDER = 25,
+    SERVER_PORT = 502
+};
+
+static uint32_t number(const struct md_capture *capture, const uint8_t *at, int bytes)
+{
+    uint32_t value = 0;
+    for (int i = 0; i < bytes; i++)
+        value = value << 8 | at[capture->is_big_endian ? i : bytes - 1 - i];
+    return value;
+}
+
+static uint32_t big_endian(const uint8_t *at, int bytes)
+{
+    uint32_t value = 0;
+    for (int i = 0; i < bytes; i++)
+        value = value << 8 | at[i];
+    return value;
+}
+
+/* Skip what a link type puts before a frame; its tags tell who sent it. */
+static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint8_t *side)
+{
+    if (link == MD_LINK_RTAC) {
+        if (len > RTAC_HEADER && (packet[8] == 1 || packet[8] == 2)) /* data sent, data received */
+            *side = packet[8] == 1 ? MD_ASKING : MD_ANSWERING;
+        return len < RTAC_HEADER ? len : RTAC_HEADER;
+    }
+    if (link != MD_LINK_EXPORTED)
+        return 0;
+    for (size_t at = 0; at + 4 <= len;) {
+        uint32_t tag = big_endian(packet + at, 2), size = big_endian(packet + at + 2, 2);
+        at += 4;
+        if (tag == 0)
+            return at;
+        if (tag == TAG_PORT_OF_SENDER && size == 4 && at + 4 <= len)
+            *side = big_endian(packet + at, 4) == SERVER_PORT ? MD_ANSWERING : MD_ASKING;
+        at += size;
+    }
+    return len;
+}
+
+/* A packet of this channel: 0 when there is no room for it. */
+static int put(struct md_channel *channel, const uint8_t *packet, size_t len, uint64_t ticks)
+{
+    struct md_piece piece = {.is_after_pause = 1};
+    size_t header = skip_header(channel->link, packet, len, &piece.side);
+    if (header >= len)
+        return 1;
+    if (!channel->has_sides)
+        piece.side = MD_EITHER_SIDE;
+    uint64_t seconds = ticks / channel->ticks_per_s, rest = ticks % channel->ticks_per_s;
+    uint64_t time_ns = seconds * 1000000000u + rest * 1000000000u / channel->ticks_per_s;
+    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* a senseless one may wrap around */
+    return md_hear(&channel->heard, packet + header, len - header, piece);
+}
+
+static int unpack_pcap(struct md_capture *capture)
+{
+    struct md_channel *channel = capture->channels;
+    for (; capture->at < capture->len; capture->packets++) {
+        const uint8_t *record = capture->bytes + capture->at;
+        size_t left = capture->len - capture->at;
+        if (left < 16)
+            return MD_CUT;
+        uint32_t len = number(capture, record + 8, 4);
+        if (len > MOST_PACKET)
+            return MD_NONSENSE;
+        if (left < 16 + len)
+            return MD_CUT;
+        uint64_t ticks = number(capture, record, 4) * channel->ticks_per_s + number(capture, record + 4, 4);
+        if (!put(channel, record + 16, len, ticks))
+            return MD_CHANNEL_FULL;
+        capture->at += 16 + len;
+    }
+    return MD_UNPACKED;
+}
+
+static int unpack_pcapng(struct md_capture *capture)
+{
+    for (; capture->at < capture->len; capture->packets++) {
+        const uint8_t *block = capture->bytes + capture->at;
+        size_t left = capture->len - capture->at;
+        if (left < 12)
+            return MD_CUT;
+        if (number(capture, block, 4) != ENHANCED_PACKET)
+            return MD_OTHER_BLOCK;
+        uint32_t size = number(capture, block + 4, 4);
+        if (size % 4 || size < 32 || size > 2 * MOST_PACKET)
+            return MD_NONSENSE;
+        if (left < size)
+            return MD_CUT;
+        uint32_t interface = number(capture, block + 8, 4), len = number(capture, block + 20, 4);
+        if (interface >= capture->count || len > size - 32 || len > MOST_PACKET ||
+            number(capture, block + size - 4, 4) != size)
+            return MD_NONSENSE;
+        uint64_t ticks = (uint64_t)number(capture, block + 12, 4) << 32 | number(capture, block + 16, 4);
+        if (!put(&capture->channels[interface], block + 28, len, ticks))
+            return MD_CHANNEL_FULL;
+        capture->at += size;
+    }
+    return MD_UNPACKED;
+}
+
+int md_unpack(struct md_capture *capture)
+{
+    return capture->is_pcapng ? unpack_pcapng(capture) : unpack_pcap(capture);
+}
