@@ -1,0 +1,95 @@
+"""Which family an answering drive is of: its readings are asked for what each family's document says.
+
+Only reads are sent. Families without a look of their own are the likelier the more of the documented
+readings are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from multidrop.core import Framing, Message, raw_value
+from multidrop.drive import Drive, Read, Script
+from multidrop.errors import BusError, Refused
+from multidrop.plan import blocks
+from multidrop.register import Register
+from multidrop.scan.sweep import Sweep
+from multidrop.timing import Settings
+
+Ask = Callable[[Drive, Message], Message]  # raises BusError where nothing good comes
+
+MOST_READINGS = 3  # that are looked at where a family has no look of its own
+
+
+def recognise(sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask) -> list[Drive]:
+    """Drives of the families that fit best; several where they fit alike, none where none fits."""
+    scores: list[tuple[int, Drive]] = []
+    for family in families:
+        drive = candidate(family, sweep.settings, sweep.framing, address)
+        if drive is None:
+            continue
+        try:
+            scores.append((_score(drive, ask), drive))
+        except (BusError, ValueError):
+            continue  # what it must have is not there
+    best = max((score for score, _ in scores), default=0)
+    return [drive for score, drive in scores if score == best]
+
+
+def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
+    """A drive of the family that would answer so; None where its document does not allow it.
+
+    A drive with two stop bits, or with a parity that a pseudo-terminal does not show, answers in the
+    format of the sweep too: then it has the family's usual one.
+    """
+    if framing not in family.framings or address not in family.addresses:
+        return None
+    if settings.baudrate not in family.baudrates:
+        return None
+    format = settings.format if settings.format in family.formats[framing] else None
+    return family(address, framing=framing, baudrate=settings.baudrate, format=format)
+
+
+def _score(drive: Drive, ask: Ask) -> int:
+    """How much speaks for the family; raises where something speaks against it."""
+    score = 0
+    if type(drive).identify is not Drive.identify:
+        _perform(drive, drive.identify.script(), ask)
+        score += 1
+    else:
+        for register in drive.readings()[:MOST_READINGS]:
+            _read(drive, register, ask)
+    setting = drive.registers.get("address_setting")
+    if setting is not None and setting.readable:
+        try:
+            held = _read(drive, setting, ask)
+        except BusError:
+            return score  # not every firmware has it
+        if held != drive.address:
+            raise Refused(f"{drive.name} holds {held:g} as its address")
+        score += 1
+    return score
+
+
+def _perform(drive: Drive, script: Script[None], ask: Ask) -> None:
+    """Carry a look out: reads only."""
+    try:
+        step = next(script)
+        while True:
+            if not isinstance(step, Read):
+                raise Refused(f"the look at {drive.title} does more than read")
+            try:
+                value = _read(drive, step.register, ask)
+            except BusError as failure:
+                step = script.throw(failure)
+            else:
+                step = script.send(value)
+    except StopIteration:
+        return
+
+
+def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
+    (block,) = blocks(drive, [register])
+    reply = ask(drive, block.request(drive.address))
+    return register.decode(raw_value(reply.data, block.offset(register), register.wire))
