@@ -1,0 +1,105 @@
+"""What a request asks for: the plant's registers by name where they are known, else raw ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.core import Framing, Message, Wire
+from multidrop.drive import Drive
+from multidrop.plant import Line, Plant
+from multidrop.register import Carrier, Register
+
+_TABLES = {
+    0x01: "coil",
+    0x02: "discrete_input",
+    0x03: "holding_register",
+    0x04: "input_register",
+    0x05: "coil",
+    0x06: "holding_register",
+    0x08: "loopback",
+    0x0F: "coil",
+    0x10: "holding_register",
+}
+_BITS = (0x01, 0x02, 0x05, 0x0F)
+_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # function: a table's
+_DELIXI_READS = (0x03, 0x07)
+_DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
+
+
+@dataclass(frozen=True)
+class Place:
+    """A register, and where it lies in the data of the exchange; None: not one that is known."""
+
+    name: str
+    at: int
+    wire: Wire
+    register: Register[Any] | None = None
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Whom a request asks, and the registers that it reads or writes."""
+
+    drive: str
+    is_write: bool
+    places: tuple[Place, ...]
+
+
+def line_of(plant: Plant | None, name: str) -> Line | None:
+    """The plant's line with this name; its only line has any name."""
+    lines = plant.lines if plant else ()
+    named = [line for line in lines if line.name == name]
+    return named[0] if named else lines[0] if len(lines) == 1 else None
+
+
+class Meanings:
+    """What requests on one line mean."""
+
+    def __init__(self, line: Line | None) -> None:
+        drives = [polled.drive for polled in line.drives] if line else []
+        self._drives = {(drive.address, drive.framing): drive for drive in drives}
+
+    def of(self, framing: Framing, request: Message) -> Meaning:
+        """What this request asks for."""
+        drive = self._drives.get((request.address, framing))
+        name = drive.name if drive else f"address {request.address}"
+        writes = _DELIXI_WRITES if framing is Framing.DELIXI else _WRITES
+        is_write = request.function in writes
+        functions = writes.get(request.function, (request.function,))
+        known = _known(drive, request, functions, is_write) if drive else ()
+        return Meaning(name, is_write, known or _raw(framing, request))
+
+
+def _known(drive: Drive, request: Message, functions: tuple[int, ...], is_write: bool) -> tuple[Place, ...]:
+    found = []
+    for register in drive.registers.values():
+        if (register.table.write if is_write else register.table.read) not in functions:
+            continue
+        if not is_write and not register.readable:
+            continue
+        at = _offset(register, request)
+        if at is not None:
+            found.append(Place(register.name, at, register.wire, register))
+    return tuple(sorted(found, key=lambda place: place.at))
+
+
+def _offset(register: Register[Any], request: Message) -> int | None:
+    """Where in the data it begins, in words or bits; None where it is not wholly in it."""
+    if register.table.carrier is Carrier.NUMBER:
+        return 0
+    end = request.start + max(request.count, 1)
+    for address in (register.address, register.ram_address):
+        if address is not None and request.start <= address and address + register.words <= end:
+            return address - request.start
+    return None
+
+
+def _raw(framing: Framing, request: Message) -> tuple[Place, ...]:
+    if framing is Framing.DELIXI:
+        return (Place(f"k{request.function}_{request.start:04X}", 0, Wire.U32),)
+    if request.function not in _TABLES:
+        return ()
+    table = _TABLES[request.function]
+    wire = Wire.BIT if request.function in _BITS else Wire.U16
+    return tuple(Place(f"{table}_{request.start + at}", at, wire) for at in range(max(request.count, 1)))

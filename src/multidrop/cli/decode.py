@@ -1,0 +1,53 @@
+"""`multidrop decode`: captures as columns, or as text."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from multidrop.capture import Capture, Decoding
+from multidrop.cli.overheard import replay, summary
+from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.target import add_json_argument
+from multidrop.plant import Plant, load_plant
+from multidrop.recording import open_writer
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", metavar="FILE", type=Path, help="a capture: pcap or pcapng")
+    parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="recording, by suffix; without it: text")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.out:
+        refuse_overwriting(arguments.out)
+    plant = load_plant(arguments.plant) if arguments.plant else None
+    with Capture(arguments.capture) as capture:
+        if arguments.out:
+            counts = _record(capture, plant, arguments.out)
+        else:
+            counts = dict(replay(capture, plant, as_json=arguments.json))
+        if capture.torn:
+            print(
+                f"multidrop: {capture.path} is cut: its last {capture.torn} bytes are no whole packet, "
+                "and were left out",
+                file=sys.stderr,
+            )
+    into = f"{counts['rows']} rows in {arguments.out}: " if arguments.out else ""
+    print(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
+    return 0
+
+
+def _record(capture: Capture, plant: Plant | None, out: Path) -> dict[str, Any]:
+    about = plant.metadata() if plant else {"multidrop": version("multidrop")}
+    decoding = Decoding(capture, plant)
+    with open_writer(out, {**about, "capture": str(capture.path)}) as writer:
+        for batch in decoding:
+            writer.write(batch)
+    return {**decoding.counts(), "rows": writer.rows}

@@ -1,0 +1,366 @@
+"""Captures: ours as Wireshark takes them, others' as we take them."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+from frames import PRINTED, Printed
+from peers import require_program
+
+from multidrop.batch import Row
+from multidrop.capture import Capture, CaptureError, CaptureWriter, Decoding, Side
+from multidrop.core import Framing, Kind, Message, Span, Splitter, build_reply, build_request
+from multidrop.plant import Plant, load_plant
+
+RTU = [
+    it
+    for it in PRINTED
+    if it.request is not None and isinstance(it.says, Message) and it.framing is Framing.RTU
+]
+TEXT = [it for it in PRINTED if it.request is not None and it.framing is not Framing.RTU]
+BEGIN = 1_700_000_000_123_456_789
+STEP = 5_000_001  # ns between two frames
+
+
+def write(path: Path, exchanges: Iterable[Printed], line: str = "hall-1") -> Path:
+    with CaptureWriter(path) as capture:
+        time = BEGIN
+        for it in exchanges:
+            capture.write(it.request_frame, Side.ASKING, time, line)
+            capture.write(it.frame, Side.ANSWERING, time + STEP, line)
+            time += 2 * STEP
+    return path
+
+
+def spans(path: Path) -> dict[str, list[Span]]:
+    """What a capture holds, by line."""
+    found: dict[str, list[Span]] = {}
+    splitters: dict[str, Splitter] = {}
+    with Capture(path) as capture:
+        for _ in capture:
+            for name, heard in zip(capture.lines, capture.heard, strict=True):
+                splitter = splitters.setdefault(name, Splitter())
+                found.setdefault(name, []).extend(splitter.spans(heard))
+    return found
+
+
+def rows(path: Path, plant: Plant | None = None) -> list[Row]:
+    with Capture(path) as capture:
+        return [row for batch in Decoding(capture, plant) for row in batch]
+
+
+# ---- Wireshark reads ours ----
+
+FIELDS = (
+    *("frame.interface_name", "frame.time_epoch", "frame.packet_flags_direction"),
+    *("mbrtu.unit_id", "modbus.func_code", "modbus.exception_code", "modbus.reference_num"),
+    *("modbus.word_cnt", "modbus.bit_cnt", "modbus.regval_uint16", "modbus.data", "mbrtu.crc16.status"),
+    *("modbus.request_frame", "data.data"),
+)
+
+
+def tshark(path: Path) -> list[dict[str, str]]:
+    options = ["-o", "mbrtu.tcp.port:502", "-o", "mbrtu.crc_verification:TRUE"]
+    fields = [word for field in FIELDS for word in ("-e", field)]
+    done = subprocess.run(
+        [require_program("tshark"), "-n", "-r", path, *options, "-T", "fields", "-E", "separator=|", *fields],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return [dict(zip(FIELDS, line.split("|"), strict=True)) for line in done.stdout.splitlines()]
+
+
+def decimal(text: str) -> list[int]:
+    return [int(number) for number in text.split(",")]
+
+
+def registers(data: bytes) -> list[int]:
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
+    packets = tshark(write(tmp_path / "a.pcapng", RTU))
+    assert len(packets) == 2 * len(RTU) > 20
+    for number, packet in enumerate(packets):
+        exchange, is_reply = RTU[number // 2], number % 2
+        message = exchange.says if is_reply else exchange.request
+        assert isinstance(message, Message)
+        time = BEGIN + number * STEP
+        assert packet["frame.time_epoch"] == f"{time // 10**9}.{time % 10**9:09}"
+        assert packet["frame.interface_name"] == "hall-1"
+        assert int(packet["frame.packet_flags_direction"], 0) == (1 if is_reply else 2)
+        assert decimal(packet["mbrtu.unit_id"]) == [message.address]
+        raw_function = (exchange.frame if is_reply else exchange.request_frame)[1]
+        assert decimal(packet["modbus.func_code"]) == [raw_function & 0x7F]
+        assert packet["mbrtu.crc16.status"] == "1"
+        if message.exception:
+            assert decimal(packet["modbus.exception_code"]) == [message.exception]
+            continue
+        if message.function in (5, 6) or not is_reply:
+            is_loopback = message.function == 8
+            assert is_loopback or decimal(packet["modbus.reference_num"]) == [message.start]
+        if message.function in (5, 6):
+            assert packet["modbus.data"] == message.data.hex()
+        elif message.function in (3, 4, 16) and (is_reply or message.function == 16) and message.data:
+            assert decimal(packet["modbus.regval_uint16"]) == registers(message.data)
+        elif message.function in (3, 4, 16):
+            assert decimal(packet["modbus.word_cnt"]) == [message.count]
+        if is_reply and message.function != 8 and raw_function < 0x80:
+            assert packet["modbus.request_frame"] == str(number)
+
+
+def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
+    bad = next(it for it in PRINTED if it.verdict == "bad checksum")
+    with CaptureWriter(tmp_path / "a.pcapng") as capture:
+        capture.write(bad.frame, Side.ASKING, BEGIN, "hall-1")
+    assert tshark(tmp_path / "a.pcapng")[0]["mbrtu.crc16.status"] == "0"
+
+
+def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> None:
+    packets = tshark(write(tmp_path / "a.pcapng", TEXT))
+    frames = [frame.hex() for it in TEXT for frame in (it.request_frame, it.frame)]
+    assert [packet["data.data"] for packet in packets] == frames
+    assert {packet["modbus.func_code"] for packet in packets} == {""}
+
+
+def test_a_line_is_an_interface_with_its_name(tmp_path: Path) -> None:
+    with CaptureWriter(tmp_path / "a.pcapng") as capture:
+        for number, line in enumerate(("hall-1", "Halle zwei", "hall-1")):
+            capture.write(RTU[0].frame, Side.ANSWERING, BEGIN + number, line)
+    names = [packet["frame.interface_name"] for packet in tshark(tmp_path / "a.pcapng")]
+    assert names == ["hall-1", "Halle zwei", "hall-1"]
+    assert {line: len(it) for line, it in spans(tmp_path / "a.pcapng").items()} == {
+        "hall-1": 2,
+        "Halle zwei": 1,
+    }
+
+
+# ---- we read ours, and others' ----
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    exchanges = [*RTU, *TEXT]
+    (found,) = spans(write(tmp_path / "a.pcapng", exchanges)).values()
+    assert [(span.kind, span.time_ns, span.raw) for span in found] == [
+        (kind, BEGIN + (2 * number + after) * STEP, frame)
+        for number, it in enumerate(exchanges)
+        for kind, after, frame in ((Kind.REQUEST, 0, it.request_frame), (Kind.REPLY, 1, it.frame))
+    ]
+
+
+def test_junk_is_read_as_junk(tmp_path: Path) -> None:
+    with CaptureWriter(tmp_path / "a.pcapng") as capture:
+        capture.write(b"\xff\x00\xff", Side.EITHER, BEGIN, "hall-1")
+        capture.write(RTU[0].frame[:-1], Side.ANSWERING, BEGIN, "hall-1")
+    (found,) = spans(tmp_path / "a.pcapng").values()
+    assert {span.kind for span in found} == {Kind.JUNK}
+    assert b"".join(span.raw for span in found) == b"\xff\x00\xff" + RTU[0].frame[:-1]
+
+
+def hexdump(packets: Iterable[bytes]) -> str:
+    """What text2pcap reads: one packet a line, each a millisecond after the other."""
+    return "".join(
+        f"2026-11-21T09:30:00.{number:03}Z 0000 {packet.hex(' ')}\n" for number, packet in enumerate(packets)
+    )
+
+
+@pytest.mark.parametrize("format", ["pcap", "pcapng", "nsecpcap"])
+@pytest.mark.parametrize("link", [147, 162, 250])
+def test_captures_that_wireshark_s_tools_wrote_are_read(tmp_path: Path, format: str, link: int) -> None:
+    frames = [frame for it in (*RTU, *TEXT) for frame in (it.request_frame, it.frame)]
+    rtac = struct.pack(">IIBBH", 0, 0, 2, 0, 0) if link == 250 else b""
+    path = tmp_path / f"other.{format}"
+    subprocess.run(
+        [require_program("text2pcap"), "-q", "-F", format, "-l", str(link), "-t", "ISO", "-", path],
+        input=hexdump(rtac + frame for frame in frames),
+        text=True,
+        check=True,
+        capture_output=True,
+    )
+    (found,) = spans(path).values()
+    assert [span.raw for span in found] == frames
+    assert [span.kind for span in found] == [Kind.REQUEST, Kind.REPLY] * (len(frames) // 2)
+    first = 1_795_253_400 * 10**9
+    assert [span.time_ns for span in found] == [first + n * 10**6 for n in range(len(frames))]
+
+
+def test_a_frame_may_lie_in_several_packets_and_several_in_one(tmp_path: Path) -> None:
+    frames = b"".join(it.request_frame + it.frame for it in RTU)
+    packets = [frames[at : at + 7] for at in range(0, len(frames), 7)]
+    header = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 147)  # big-endian, ns
+    path = tmp_path / "a.pcap"
+    path.write_bytes(header + b"".join(struct.pack(">IIII", 1, 5, len(it), len(it)) + it for it in packets))
+    (found,) = spans(path).values()
+    assert b"".join(span.raw for span in found) == frames
+    assert {span.kind for span in found[1:]} <= {Kind.REQUEST, Kind.REPLY, Kind.EITHER}
+    assert {span.time_ns for span in found} == {10**9 + 5}
+
+
+@pytest.mark.parametrize(
+    ("resolution", "time_ns"),
+    [(b"\x09", 5_000_007), (b"\x06", 5_000_007_000), (b"\x03", 5_000_007_000_000), (b"\x94", 4_768_378_257)],
+    ids=["ns", "us", "ms", "2^-20 s"],
+)
+def test_a_clock_of_any_resolution_is_read(tmp_path: Path, resolution: bytes, time_ns: int) -> None:
+    path = tmp_path / "a.pcapng"
+    with CaptureWriter(path) as capture:
+        capture.write(RTU[0].frame, Side.ANSWERING, 5_000_007, "hall-1")
+    option = b"\x09\0\x01\0"
+    path.write_bytes(path.read_bytes().replace(option + b"\x09", option + resolution))
+    (found,) = spans(path).values()
+    assert [span.time_ns for span in found] == [time_ns]
+
+
+# ---- what is no capture ----
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "is not a capture: it is empty"),
+        (b"hello, world", "is not a capture: it does not begin like pcap or pcapng"),
+        (b"\xd4\xc3\xb2\xa1\x02\0", "is not a capture: it ends within its header"),
+        (b"\x0a\x0d\x0d\x0a\x1c\0", "is not a capture: it ends within its header"),
+        (
+            struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1),
+            "a is Ethernet (link type 1), not a serial line",
+        ),
+        (
+            struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 147) + b"\xff" * 40,
+            "is damaged: what begins at byte 24 is no packet",
+        ),
+    ],
+)
+def test_what_is_no_capture_of_a_line_is_told_in_a_sentence(
+    tmp_path: Path, content: bytes, sentence: str
+) -> None:
+    path = tmp_path / "a.pcap"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError) as mistake:
+        spans(path)
+    assert str(mistake.value).startswith(str(path))
+    assert str(mistake.value).endswith(sentence)
+    assert "\n" not in str(mistake.value)
+
+
+@pytest.mark.parametrize("format", ["pcapng", "pcap"])
+def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) -> None:
+    path = write(tmp_path / "a.pcapng", RTU)
+    if format == "pcap":
+        whole = tmp_path / "a.pcap"
+        subprocess.run([require_program("editcap"), "-F", "nsecpcap", path, whole], check=True)
+        path = whole
+    content, read = path.read_bytes(), []
+    for cut in range(1, len(content) - 60, 97):
+        path.write_bytes(content[: len(content) - cut])
+        with Capture(path) as capture:
+            read.append(sum(map(len, Decoding(capture))))
+            assert capture.torn < 300
+    assert read == sorted(read, reverse=True)
+    assert read[0] > read[-1] == 0
+
+
+# ---- columns ----
+
+PLANT = """
+[[line]]
+name = "hall-1"
+port = "/dev/ttyUSB0"
+[[line.drive]]
+name = "pump"
+model = "{}"
+address = 1
+framing = "{}"
+"""
+
+
+def plant(directory: Path, model: str, framing: str) -> Plant:
+    path = directory / "plant.toml"
+    path.write_text(PLANT.format(model, framing))
+    return load_plant(path)
+
+
+EXCHANGES = [  # model, framing, the printed request and its reply, what that says
+    ("innovert-ibd", "rtu", "01 06 20 01 13 88 DE 9C", "frequency", 50),
+    ("innovert-ibd", "rtu", "01 06 00 6B 00 C8 F9 80", "acceleration_time", 20),
+    ("innovert-ibd", "ascii", "0106200113883D", "frequency", 50),
+    ("delixi-modbus", "rtu", "01 03 01 F4 00 01 C4 04", "output_frequency", 50),
+    ("delixi-modbus", "ascii", "010301F4000106", "output_frequency", 50),
+    ("delixi-native", "delixi", "010701F400000000FD", "output_frequency", 50),
+    ("delixi-native", "delixi", "010200020000000005", "control", 2),
+    ("delixi-native", "delixi", "0104000100001388A1", "frequency", 50),
+    ("delixi-native", "delixi", "0106000200001388A4", "stored_frequency", 50),
+]
+
+
+@pytest.mark.parametrize(("model", "framing", "request_", "register", "value"), EXCHANGES)
+def test_an_exchange_is_a_row_in_engineering_units(
+    tmp_path: Path, model: str, framing: str, request_: str, register: str, value: float
+) -> None:
+    texts = (request_, f":{request_}\\r\\n")
+    exchange = next(it for it in (*RTU, *TEXT) if _text(it.request_frame) in texts)
+    path = write(tmp_path / "a.pcapng", [exchange])
+    (row,) = rows(path, plant(tmp_path, model, framing))
+    assert row == Row(BEGIN, BEGIN, STEP, "pump", register, value, "ok")
+
+
+def _text(frame: bytes) -> str:
+    return frame.decode().replace("\r\n", "\\r\\n") if frame[:1] == b":" else frame.hex(" ").upper()
+
+
+def test_several_registers_are_a_row_each(tmp_path: Path) -> None:
+    exchange = next(it for it in RTU if _text(it.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8")
+    found = rows(write(tmp_path / "a.pcapng", [exchange]), plant(tmp_path, "erman-er-g-220", "rtu"))
+    assert [(row.register, row.value) for row in found] == [
+        ("acceleration_time", 20),
+        ("deceleration_time", 40),
+    ]
+
+
+def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
+    exchange = next(it for it in RTU if _text(it.frame) == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4")
+    found = rows(write(tmp_path / "a.pcapng", [exchange]))
+    assert [(row.drive, row.register, row.value) for row in found] == [
+        ("address 1", f"holding_register_{1 + at}", value) for at, value in enumerate((256, 500, 500, 50))
+    ]
+
+
+def test_a_refusal_is_a_miss_with_its_code(tmp_path: Path) -> None:
+    exchange = next(it for it in RTU if _text(it.frame) == "01 83 03 01 31")
+    found = rows(write(tmp_path / "a.pcapng", [exchange]))
+    assert {(row.value, row.status) for row in found} == {(None, "exception 03")}
+
+
+def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> None:
+    exchange = next(it for it in RTU if _text(it.frame) == "01 03 02 13 88 B5 12")
+    with CaptureWriter(tmp_path / "a.pcapng") as capture:
+        capture.write(exchange.request_frame, Side.ASKING, 1, "hall-1")
+        capture.write(exchange.request_frame, Side.ASKING, 2, "hall-1")
+        capture.write(exchange.frame[:-1] + b"\0", Side.ANSWERING, 3, "hall-1")
+        capture.write(exchange.request_frame, Side.ASKING, 4, "hall-1")
+        capture.write(exchange.frame, Side.ANSWERING, 6, "hall-1")
+    assert [(row.time, row.uncertainty_ns, row.value, row.status) for row in rows(tmp_path / "a.pcapng")] == [
+        (1, None, None, "no reply"),
+        (2, None, None, "no frame in what was received"),
+        (4, 2, 5000, "ok"),
+    ]
+
+
+def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> None:
+    """Every register of one table, and then of another."""
+    with CaptureWriter(tmp_path / "a.pcapng") as capture:
+        for function in (3, 4):
+            for start in range(0, 65500, 100):
+                asked = Message(1, function, start, 100)
+                reply = Message(1, function, start, 100, struct.pack(">100H", *range(start, start + 100)))
+                capture.write(build_request(Framing.RTU, asked), Side.ASKING, start, "hall-1")
+                capture.write(build_reply(Framing.RTU, reply), Side.ANSWERING, start + 1, "hall-1")
+    found = rows(tmp_path / "a.pcapng")
+    assert [(row.register, row.value) for row in found] == [
+        (f"{table}_register_{at}", at) for table in ("holding", "input") for at in range(65500)
+    ]

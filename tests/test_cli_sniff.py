@@ -1,0 +1,358 @@
+"""`sniff` and `decode`: a mixed line that others master, while we only listen."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import random
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from frames import PRINTED
+from peers import require_module
+from taps import tapped
+from test_cli import Run, run
+from test_cli_poll import MULTIDROP, multidrop, recorded
+
+from multidrop.bus import Bus
+from multidrop.capture import CaptureWriter, Side
+from multidrop.cli.listening import Listener
+from multidrop.core import Framing
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import EncodedDrive, Simulator, Wire
+from multidrop.timing import Settings
+
+__all__ = ["run"]  # a fixture
+
+EXCHANGES = int(os.environ.get("SNIFFED_EXCHANGES", "300"))
+DRIVES = (InnovertIBD(1), InvtCHE(2), InnovertIBD(3, framing="ascii"), DelixiNative(4))
+PLANT = """
+[[line]]
+name = "hall-1"
+port = "{port}"
+baudrate = 9600
+format = "8N1"
+[[line.drive]]
+name = "fan-1"
+model = "innovert-ibd"
+address = 1
+[[line.drive]]
+name = "fan-2"
+model = "invt-che"
+address = 2
+[[line.drive]]
+name = "pump-3"
+model = "innovert-ibd"
+framing = "ascii"
+address = 3
+[[line.drive]]
+name = "pump-4"
+model = "delixi-native"
+address = 4
+poll = ["output_frequency", "status"]
+"""
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[str, str]]:
+    """The ports of a master and of a listener, on a line with drives of three framings."""
+    drives = [EncodedDrive(drive) for drive in DRIVES]
+    with Simulator([Wire(drives, unpaced=True)]) as simulator:
+        with tapped(simulator.wires[0].path, 9600) as ports:
+            yield ports
+
+
+def plant(directory: Path, port: str) -> Path:
+    path = directory / "plant.toml"
+    path.write_text(PLANT.format(port=port))
+    return path
+
+
+class Sniffer:
+    """`multidrop sniff` under way; its objects are there when the block is left."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.process = process
+
+    @property
+    def exchanges(self) -> list[dict[str, Any]]:
+        return [it for it in self.told if it.get("result") == "ok"]
+
+    @property
+    def summary(self) -> dict[str, int]:
+        return dict(self.told[-1]["summary"])
+
+
+@contextmanager
+def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
+    command = [*MULTIDROP, "sniff", port, "--json", *map(str, words)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"listening on {port}, Ctrl-C ends\n"
+        sniffer = Sniffer(process)
+        out = process.stdout
+        reader = threading.Thread(target=lambda: sniffer.told.extend(map(json.loads, out)))
+        reader.start()
+        try:
+            yield sniffer
+        finally:
+            process.send_signal(signal.SIGINT)
+            reader.join(timeout=20)
+            process.kill()
+
+
+# ---- masters that know nothing of us ----
+
+Said = tuple[int, int, list[float]]  # address, function, values
+
+
+def pymodbus(framer: str, address: int, starts: list[int]) -> Callable[[str, random.Random, int], list[Said]]:
+    """A master that reads and writes with pymodbus."""
+
+    def master(port: str, chance: random.Random, count: int) -> list[Said]:
+        client = require_module("pymodbus.client")
+        kind = require_module("pymodbus").FramerType(framer)
+        said: list[Said] = []
+        with client.ModbusSerialClient(port, framer=kind, baudrate=9600, timeout=5) as it:
+            for _ in range(count):
+                if chance.random() < 0.8:
+                    start = chance.choice(starts)
+                    reply = it.read_holding_registers(start, count=chance.randint(1, 3), device_id=address)
+                    assert not reply.isError()
+                    said.append((address, 3, list(map(float, reply.registers))))
+                else:
+                    assert not it.write_register(
+                        0x2001 if address != 2 else 0x2001, 1000, device_id=address
+                    ).isError()
+                    said.append((address, 6, [1000.0]))
+        return said
+
+    return master
+
+
+def delixi(port: str, chance: random.Random, count: int) -> list[Said]:
+    """pymodbus does not speak it: our own bus does."""
+    said: list[Said] = []
+    with Bus(port, baudrate=9600) as bus:
+        drive = bus.attach(DelixiNative, 4)
+        for _ in range(count):
+            register = chance.choice([drive.register("output_frequency"), drive.register("output_current")])
+            said.append((4, 7, [round(bus.read(drive, register) / register.scale)]))
+    return said
+
+
+MASTERS = (
+    pymodbus("rtu", 1, [0, 1]),
+    pymodbus("rtu", 2, [0x3000, 0x3001]),
+    pymodbus("ascii", 3, [0, 1]),
+    delixi,
+)
+
+
+def test_every_exchange_of_a_mixed_line_is_heard(line: tuple[str, str]) -> None:
+    port, tap = line
+    chance = random.Random(1)
+    said: list[Said] = []
+    with sniffing(tap) as sniffer:
+        while len(said) < EXCHANGES:
+            said += chance.choice(MASTERS)(port, chance, 10)
+    heard = [(it["address"], it["function"], list(it["values"].values())) for it in sniffer.exchanges]
+    assert heard == said
+    assert sniffer.summary == {
+        "exchanges": len(said),
+        "broadcasts": 0,
+        "unanswered": 0,
+        "strays": 0,
+        "unknown_bytes": 0,
+    }
+    assert {it["framing"] for it in sniffer.exchanges} == {"rtu", "ascii", "delixi"}
+
+
+def test_a_poll_s_values_are_heard_captured_and_decoded(
+    line: tuple[str, str], tmp_path: Path, run: Run
+) -> None:
+    port, tap = line
+    file = plant(tmp_path, port)
+    with sniffing(tap, "--plant", file, "--out", tmp_path / "a.pcapng") as sniffer:
+        done = multidrop("poll", file, "--seconds", 2, "--out", tmp_path / "polled.arrows")
+        assert done.returncode == 0, done.stderr
+    assert run("decode", tmp_path / "a.pcapng", "--plant", file, "--out", tmp_path / "decoded.arrows")[0] == 0
+
+    def values(path: Path) -> dict[tuple[str, str], list[float]]:
+        found: dict[tuple[str, str], list[float]] = {}
+        for row in recorded(path):
+            if row.value is not None:
+                found.setdefault((row.drive, row.register), []).append(row.value)
+        return found
+
+    polled, decoded = values(tmp_path / "polled.arrows"), values(tmp_path / "decoded.arrows")
+    assert {drive for drive, _ in polled} == {"fan-1", "fan-2", "pump-3", "pump-4"}
+    assert set(polled) <= set(decoded)
+    for name, column in polled.items():
+        assert decoded[name][: len(column)] == column  # the last one may have come too late for the poll
+        assert len(decoded[name]) <= len(column) + 1
+    assert {it["line"] for it in sniffer.exchanges} == {"hall-1"}
+
+
+def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
+    with Listener(line[1], Settings(9600, "8N1")) as listener, pytest.raises(OSError, match="Bad file"):
+        os.write(listener.fileno(), b"\x01")
+
+
+# ---- replay ----
+
+PAIRS = {it.frame: it for it in PRINTED if it.request is not None}
+READ = PAIRS[bytes.fromhex("01 03 02 13 88 B5 12")]
+WRITE = PAIRS[bytes.fromhex("01 06 00 02 13 88 25 5C")]
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    path = tmp_path / "a.pcapng"
+    with CaptureWriter(path) as it:
+        time = 1_700_000_000_000_000_000
+        for exchange in (READ, WRITE):
+            it.write(exchange.request_frame, Side.ASKING, time, "hall-1")
+            it.write(exchange.frame, Side.ANSWERING, time + 5_300_000, "hall-1")
+        it.write(b"\xff\x00", Side.EITHER, time + 6_000_000, "hall-1")
+        it.write(READ.request_frame, Side.ASKING, time + 7_000_000, "hall-1")
+    return path
+
+
+def delixi_plant(directory: Path) -> Path:
+    path = directory / "plant.toml"
+    drive = 'name = "pump"\nmodel = "delixi-modbus"\naddress = 1\n'
+    path.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
+    return path
+
+
+@pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
+def test_a_capture_is_told_in_engineering_units(run: Run, capture: Path, command: list[str]) -> None:
+    status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
+    assert (status, err) == (0, "")
+    assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
+        "pump  reads output_frequency = 50.00 Hz  (5.3 ms)",
+        "pump  writes stored_frequency = 50.00 Hz  (5.3 ms)",
+        "unknown: FF 00",
+        "pump  reads output_frequency: no reply",
+    ]
+    assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
+
+
+def test_without_a_plant_raw_registers_are_told(run: Run, capture: Path) -> None:
+    out = run("decode", capture)[1]
+    assert "  address 1  reads holding_register_500 = 5000  " in out
+    objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
+    assert objects[0] == {
+        "line": "hall-1",
+        "time": "2023-11-14T22:13:20.000000000Z",
+        "framing": "rtu",
+        "address": 1,
+        "function": 3,
+        "frames": ["01 03 01 F4 00 01 C4 04", "01 03 02 13 88 B5 12"],
+        "drive": "address 1",
+        "access": "read",
+        "result": "ok",
+        "reply_after_ns": 5_300_000,
+        "values": {"holding_register_500": 5000},
+    }
+    assert objects[-1]["summary"]["exchanges"] == 2
+
+
+def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:
+    again = capture.parent / "again.pcapng"
+    first = run("sniff", "--replay", capture, "--out", again)
+    assert first[0] == 0
+    assert run("decode", again) == first
+
+
+def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
+    out = capture.parent / "a.csv"
+    assert run("decode", capture, "--out", out) == (
+        0,
+        f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n",
+        "",
+    )
+    assert [row.value for row in recorded(out)] == [5000, 5000]
+
+
+# ---- what goes wrong gets one sentence ----
+
+
+def test_what_cannot_be_listened_to_is_told_in_a_sentence(run: Run, tmp_path: Path) -> None:
+    ordinary = tmp_path / "file"
+    ordinary.write_text("hello")
+    for port, sentence in (
+        (tmp_path / "none", "there is no such port"),
+        (ordinary, "it is not a serial port"),
+        (tmp_path, "it is not a serial port"),
+        ("socket://127.0.0.1:9", "only a device such as /dev/ttyUSB0 can be opened so that nothing is sent"),
+    ):
+        assert run("sniff", port) == (1, "", f"multidrop: {port}: {sentence}\n")
+
+
+def test_a_port_in_use_is_told_in_a_sentence(run: Run) -> None:
+    master, slave = pty.openpty()
+    fcntl.flock(slave, fcntl.LOCK_EX)
+    port = os.ttyname(slave)
+    assert run("sniff", port) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+    os.close(master)
+    os.close(slave)
+
+
+def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever is root has every permission: the system's refusal is played."""
+
+    def refuse(path: str, flags: int) -> int:
+        raise PermissionError(13, "Permission denied", path)
+
+    monkeypatch.setattr("multidrop.cli.listening.os.open", refuse)
+    assert run("sniff", "/dev/ttyS0") == (
+        1,
+        "",
+        "multidrop: /dev/ttyS0: no permission to open it (is the user in the group that owns it?)\n",
+    )
+
+
+def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture: Path) -> None:
+    none, text = tmp_path / "none.pcapng", tmp_path / "text"
+    text.write_text("hello, world")
+    cut = tmp_path / "cut.pcapng"
+    cut.write_bytes(capture.read_bytes()[:-5])
+    for words, status, sentence in (
+        (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE"),
+        (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
+        (["decode", none], 1, f"{none}: No such file or directory"),
+        (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
+        (
+            ["decode", capture, "--out", capture],
+            2,
+            f"{capture} is there already: name another file, or remove it first",
+        ),
+        (["decode", cut], 0, f"{cut} is cut: its last 115 bytes are no whole packet, and were left out"),
+    ):
+        found, _, err = run(*words)
+        assert (found, err) == (status, f"multidrop: {sentence}\n")
+
+
+def test_a_port_that_vanishes_ends_it_with_a_sentence(run: Run) -> None:
+    master, slave = pty.openpty()
+    threading.Timer(0.3, os.close, [master]).start()
+    port = os.ttyname(slave)
+    status, _, err = run("sniff", port)
+    os.close(slave)
+    assert status == 1
+    assert err.splitlines()[-1].startswith(f"multidrop: {port}: the port was lost (")
