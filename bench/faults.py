@@ -1,21 +1,33 @@
-"""What a stray byte before every reply, and silent drives, cost the others on a paced line.
+"""What faults cost on a paced line: stray bytes, silent drives, requests that are refused.
 
-31 drives at 38400. Each case is held against the same plant without the fault: without the stray
-bytes, or without the silent drives.
+31 drives at 38400. A rate is held against that of the same plant without the fault: without the
+stray bytes, or without the silent drives. `python faults.py MASTER JOB` is the process of one
+master whose requests are refused.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from statistics import median
 from typing import Any
 
 import rivals
 import tables
-from jobs import Job
+from jobs import REGISTERS, TIMEOUT_S, Job
 from programs import paced_line
 
 DRIVES = 31
 BAUDRATE = 38400
+REFUSALS = 20
+CHARACTERS = 8 + 5  # of a request and of the exception that answers it
+WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 
 
 def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: Any) -> tuple[float, float]:
@@ -27,19 +39,53 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
     return line.report["answered"] / max(line.report["seconds"], 1e-9), own["exchanges"] / max(asked, 1)
 
 
+# ---- requests that are refused ----
+
+
+def of_multidrop(job: Job) -> AbstractContextManager[Callable[[int], object]]:
+    import adapter
+
+    return adapter.reading(job)
+
+
+READERS = {"multidrop": of_multidrop, **rivals.READERS}
+
+
+def ask_in_vain(master: str, job: Job) -> None:
+    """Milliseconds until a call has told that the drive refuses, and what it says."""
+    took, said = [], "an empty answer"
+    with READERS[master](job) as read:
+        for at in range(REFUSALS):
+            begun = time.monotonic()
+            try:
+                read(1 + at % job.drives)
+            except Exception as failure:  # each has its own
+                said = str(failure) or type(failure).__name__
+            took.append(1e3 * (time.monotonic() - begun))
+    print(json.dumps({"took": took, "said": said.splitlines()[0]}))
+
+
+def refused(master: str) -> tuple[str, ...]:
+    with paced_line(baudrate=BAUDRATE, registers=REGISTERS - 1) as line:
+        job = json.dumps(asdict(Job(line.path, BAUDRATE, 0)))
+        told = json.loads(subprocess.check_output([sys.executable, __file__, master, job]))
+    took = told["took"]
+    return master, f"{median(took):.1f}", f"{max(took):.1f}", told["said"][:90]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     known = list(rivals.MASTERS)
     parser.add_argument("--masters", nargs="+", choices=known, default=known[:3])
     parser.add_argument("--silent", type=int, nargs="+", default=[0, 1, 5, 10], help="how many of 31")
     parser.add_argument("--settle", type=float, default=10.0, help="seconds before anything is counted")
-    parser.add_argument("--seconds", type=float, default=20.0, help="that are counted")
+    parser.add_argument("--seconds", type=float, default=20.0, help="that are counted; 0: only refusals")
     arguments = parser.parse_args()
-    rivals.insist_on(arguments.masters)
+    rivals.insist_on([*arguments.masters, *READERS])
     tables.heading(f"A paced line of {DRIVES} drives at {BAUDRATE}, 10 registers each, with faults.")
 
     rows = []
-    for master in arguments.masters:
+    for master in arguments.masters if arguments.seconds else ():
         whole, read = measured(master, DRIVES, arguments)
         rows.append((master, "no fault", f"{whole:.1f}", "100.0%", f"{read:.1%}"))
         rate, read = measured(master, DRIVES, arguments, stray=True)
@@ -50,11 +96,19 @@ def main() -> None:
             silent = ",".join(str(address) for address in range(living + 1, DRIVES + 1))
             rate, read = measured(master, DRIVES, arguments, silent=silent)
             rows.append((master, f"{dead} silent", f"{rate:.1f}", f"{rate / alone:.1%}", f"{read:.1%}"))
-    tables.show(("master", "case", "answers/s", "kept", "read"), rows)
-    print(
-        "\nread: good exchanges of all that were asked, from the start on; a silent drive's count as failed."
-    )
+    if rows:
+        tables.show(("master", "case", "answers/s", "kept", "read"), rows)
+        print(
+            "\nread: good exchanges of all that were asked, from the start on; silent drives' are failed.\n"
+        )
+
+    print(f"A drive that answers with an exception; time-out {1e3 * TIMEOUT_S:g} ms.")
+    print(f"On the wire that takes {WIRE_MS:.1f} ms, the silence before it not counted.\n")
+    tables.show(("master", "known after ms p50", "max", "told"), [refused(master) for master in READERS])
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) == 3 and sys.argv[1] in READERS:
+        ask_in_vain(sys.argv[1], Job(**json.loads(sys.argv[2])))
+    else:
+        main()

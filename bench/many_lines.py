@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import threading
@@ -79,8 +78,8 @@ def far_ends(kind: str, count: int, *options: object) -> Iterator[tuple[list[str
     """So many lines whose far ends answer: their ports, and the descriptors to hand down."""
     program = compiled("far_ends.c", *CHECKSUM)
     if kind == "pty":
-        with talking([program, "--ptys", count, *options]) as paths:
-            yield paths.split(), []
+        with talking([program, "--ptys", count, *options]) as talker:
+            yield talker.said.split(), []
         return
     pairs: list[tuple[socket, socket]] = [socketpair() for _ in range(count)]
     try:
@@ -94,8 +93,8 @@ def far_ends(kind: str, count: int, *options: object) -> Iterator[tuple[list[str
 
 
 def measured(master: str, kind: str, count: int, seconds: float, paced: bool) -> dict[str, Any]:
-    baudrate = BAUDRATE if paced else 0
-    with far_ends(kind, count, "--baudrate", baudrate, "--delay-us", DELAY_US if paced else 0) as (ports, fds):
+    baudrate, delay_us = (BAUDRATE, DELAY_US) if paced else (0, 0)
+    with far_ends(kind, count, "--baudrate", baudrate, "--delay-us", delay_us) as (ports, fds):
         if master == "bare C":
             command = [compiled("bare_lines.c", *CHECKSUM), seconds, *ports]
         else:
@@ -106,7 +105,10 @@ def measured(master: str, kind: str, count: int, seconds: float, paced: bool) ->
     return own | {"rate": good / own["seconds"], "cpu": own["cpu_seconds"] / good * 1e6}
 
 
-def row(kind: str, count: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
+Slices = list[dict[str, Any]]
+
+
+def row(kind: str, count: int, master: str, slices: Slices, bare: Slices) -> list[str]:
     pairs = list(zip(slices, bare, strict=True))
     python = [it["python_seconds"] / it["exchanges"] * 1e6 for it in slices if "python_seconds" in it]
     return [
@@ -149,8 +151,10 @@ def main() -> None:
 
     kinds = {"socketpair": arguments.socketpairs, "pty": arguments.ptys}
     with on_one_processor():
-        rows = [row for kind, counts in kinds.items() for count in counts for row in compared(kind, count, arguments)]
-    columns = ("lines", "number", "master", "exchanges/s", "/ bare", "CPU us", "/ bare", "in Python", "failed")
+        asked = [(kind, count) for kind, counts in kinds.items() for count in counts]
+        rows = [line for kind, count in asked for line in compared(kind, count, arguments)]
+    columns = ("lines", "number", "master", "exchanges/s", "/ bare")
+    columns += ("CPU us", "/ bare", "in Python", "failed")
     tables.show(columns, rows)
     print(f"\nWith the pace of a wire: {BAUDRATE} baud, response delay {DELAY_US / 1000:g} ms.\n")
     tables.show(("lines", "exchanges/s", "CPU us", "of a core", "in Python", "failed"), [paced(arguments)])

@@ -1,9 +1,9 @@
-"""The drives that paced_line.c plays, declared as a user declares a family of their own."""
+"""The drives that paced_line.c and far_ends.c play, declared as a user declares a family of their own."""
 
 from typing import Any
 
 from multidrop.drive import Drive
-from multidrop.register import HOLDING, reading
+from multidrop.register import HOLDING, INPUT, reading
 from multidrop.timing import Settings
 
 
@@ -42,3 +42,26 @@ class Unpaced(Played):
 
     def needed_silence(self) -> float:
         return 0.0
+
+
+class Unreliable(Unpaced):
+    """Played by far_ends: four blocks of one length, whose replies only their values tell apart."""
+
+    model = "unreliable"
+    title = "Played by far_ends"
+    most_registers = {HOLDING: 10, INPUT: 10}
+    response_timeout = 5e-3
+
+    def needed_silence(self) -> float:
+        return 3e-4
+
+
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9 = (reading(address) for address in range(20, 30))
+    t0, t1, t2, t3, t4, t5, t6, t7, t8, t9 = (reading(address) for address in range(40, 50))
+    u0, u1, u2, u3, u4, u5, u6, u7, u8, u9 = (reading(address, table=INPUT) for address in range(10))
+
+    @classmethod
+    def held(cls, address: int, name: str) -> int:
+        """What the drive of this address holds there."""
+        register = cls.register(name)
+        return 256 * address + register.address + (128 if register.table is INPUT else 0)

@@ -33,35 +33,39 @@ def compiled(source: str, *flags: str) -> Path:
 
 
 @dataclass
-class Line:
-    """A paced line; its report is there when it has ended."""
+class Talker:
+    """A program that plays a line, or many; its report is there when it has ended."""
 
-    path: str
+    said: str  # first of all: where its lines are to be found
     report: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def path(self) -> str:
+        return self.said
+
 
 @contextmanager
-def paced_line(**options: Any) -> Iterator[Line]:
+def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
+    """A program that runs until its standard input ends, and then prints its report as JSON."""
+    words = [str(word) for word in command]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(words, text=True, **pipes, **details) as process:
+        assert process.stdout is not None
+        talker = Talker(process.stdout.readline().strip())
+        yield talker
+        told, _ = process.communicate()
+    talker.report = json.loads(told)
+
+
+@contextmanager
+def paced_line(**options: Any) -> Iterator[Talker]:
     """paced_line.c with these options, such as baudrate=9600, stray=True, silent="3,7"."""
-    command = [str(compiled("paced_line.c"))]
+    command: list[object] = [compiled("paced_line.c")]
     for name, value in options.items():
         key = f"--{name.replace('_', '-')}"
-        command += [key] if value is True else [key, str(value)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = Line(process.stdout.readline().strip())
+        command += [key] if value is True else [key, value]
+    with talking(command) as line:
         yield line
-        told, _ = process.communicate()
-    line.report = json.loads(told)
-
-
-@contextmanager
-def talking(command: Sequence[object], **options: Any) -> Iterator[str]:
-    """A program that says where it is to be found, and runs until standard input ends."""
-    words = [str(word) for word in command]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **options) as process:
-        assert process.stdout is not None
-        yield process.stdout.readline().strip()
 
 
 @contextmanager

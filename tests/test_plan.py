@@ -1,6 +1,7 @@
 """Plans: never over a limit, never into what the document forbids, never dearer than brute force."""
 
 from collections.abc import Iterator
+from itertools import permutations
 
 import pytest
 from hypothesis import given, settings
@@ -8,8 +9,9 @@ from hypothesis import strategies as st
 
 from multidrop.core import Framing, Message
 from multidrop.drive import Drive
-from multidrop.plan import Block, blocks, duration, write_request
-from multidrop.register import COIL, HOLDING, INPUT, Register, Wire, command, reading, setting
+from multidrop.drives import MODELS
+from multidrop.plan import Block, blocks, duration, gap, in_order, planned, write_request
+from multidrop.register import COIL, HOLDING, INPUT, Register, Table, Wire, command, reading, setting
 
 
 class Example(Drive):
@@ -72,8 +74,33 @@ def test_a_block_takes_its_characters_silence_and_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
-    expected = characters * 10 / 9600 + 3.5 * 10 / 9600 + drive.response_delay
+    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit more, for a second stop bit
+    expected = characters * 10 / 9600 + silence + drive.response_delay
     assert duration(drive, block) == pytest.approx(expected)
+
+
+def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
+    class Sparse(Drive):
+        """Nothing may be read that is not declared."""
+
+        most_registers = {HOLDING: 10}
+        low = reading(1)
+        between = reading(2)
+        high = reading(3)
+        order = command(4)
+        beyond = reading(5)
+
+    assert spans(Sparse(1), "low", "high") == [(1, 3)]
+    assert spans(Sparse(1), "high", "beyond") == [(3, 1), (5, 1)]
+
+
+def test_each_rate_has_blocks_of_its_own() -> None:
+    drive = Example(1)
+    found = planned(drive, [(Example.a, 0.1), (Example.b, None), (Example.c, 0.1)])
+    assert [(it.block.start, it.block.count, it.every) for it in found] == [(1, 4, 0.1), (2, 1, None)]
+
+
+# ---- against all other plans ----
 
 
 def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[float]]]]:
@@ -85,30 +112,40 @@ def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[
 
 
 def cheapest_of_all(drive: Drive, registers: list[Register[float]]) -> float:
-    """By trying every way to cut the sorted registers into requests."""
+    """By trying every way to cut the sorted registers of one table into requests."""
+    table = registers[0].table
+    limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
+    readable = {at for it in drive.registers.values() if it.table == table and it.readable for at in span(it)}
     best = float("inf")
     for cut in partitions(sorted(registers, key=lambda it: it.address)):
         total = 0.0
         for group in cut:
             start, end = group[0].address, max(it.address + it.words for it in group)
-            declared = {at for it in group for at in range(it.address, it.address + it.words)}
-            legal = all(at in declared or at <= 20 for at in range(start, end))
-            if len(group) > 1 and (end - start > 4 or not legal):
+            legal = all(at in readable or at in gaps for at in range(start, end))
+            if len(group) > 1 and (end - start > limit or not legal):
                 break
-            total += duration(drive, Block(HOLDING, start, end - start, tuple(group)))
+            total += duration(drive, Block(table, start, end - start, tuple(group)))
         else:
             best = min(best, total)
     return best
 
 
+def span(register: Register[float]) -> range:
+    return range(register.address, register.address + register.words)
+
+
 @settings(max_examples=150)
 @given(
-    st.sets(st.integers(0, 34), min_size=1, max_size=7),
+    st.dictionaries(st.integers(0, 17).map(lambda half: 2 * half), st.booleans(), min_size=1, max_size=7),
     st.sampled_from([1200, 9600, 38400, 115200]),
     st.sampled_from([Framing.RTU, Framing.ASCII]),
 )
-def test_no_other_plan_is_cheaper(addresses: set[int], baudrate: int, framing: Framing) -> None:
-    registers = {f"r{address}": reading(address) for address in addresses}
+def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
+    """Pairs of words and single ones, some side by side, and reserved addresses between them."""
+    registers = {
+        f"r{address}": reading(address, wire=Wire.U32 if pair else Wire.U16)
+        for address, pair in pairs.items()
+    }
     kind = type(
         "Random",
         (Drive,),
@@ -116,12 +153,103 @@ def test_no_other_plan_is_cheaper(addresses: set[int], baudrate: int, framing: F
             **registers,
             "__doc__": "Drawn by lot.",
             "framings": (framing,),
-            "most_registers": {HOLDING: 4},
+            "most_registers": {HOLDING: 5},
             "readable_gaps": {HOLDING: range(0, 21)},
         },
     )
     drive = kind(1, baudrate=baudrate)
-    planned = blocks(drive, registers.values())
-    assert {it for block in planned for it in block.registers} == set(registers.values())
-    total = sum(duration(drive, block) for block in planned)
+    found = blocks(drive, registers.values())
+    assert sorted(it.name for block in found for it in block.registers) == sorted(registers)
+    assert all(block.start <= it.address for block in found for it in block.registers)
+    assert all(it.address + it.words <= block.start + block.count for block in found for it in block.registers)
+    total = sum(duration(drive, block) for block in found)
     assert total == pytest.approx(cheapest_of_all(drive, list(registers.values())))
+
+
+FORBIDDEN = {  # addresses of which the documents do not say that they can be read, within the tables
+    "erman-er-g-220": {"holding register": (89, 0xFFFF), "input register": (0x1000, 0xFFFF)},
+    "invt-che": {"holding register": (0x1000, 0x1000, 0x3017, 0x4FFF, 0x5002, 0xFFFF)},
+    "innovert-ibd": {"holding register": (0, 2, 5, 21, 0x2000, 0x2001)},
+}
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
+    model = data.draw(st.sampled_from(sorted(MODELS)))
+    family = MODELS[model]
+    tables: dict[Table, list[Register[float]]] = {}
+    for register in family.registers.values():
+        if register.readable:
+            tables.setdefault(register.table, []).append(register)
+    registers = data.draw(st.sampled_from([*tables.values()]))
+    first = data.draw(st.integers(0, len(registers) - 1))
+    near = registers[first : first + 12]  # so that some can share a request
+    wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
+    drive = family(
+        1,
+        framing=data.draw(st.sampled_from(family.framings)),
+        baudrate=data.draw(st.sampled_from(family.baudrates)),
+    )
+    found = blocks(drive, wanted)
+    assert {it.name for block in found for it in block.registers} == {it.name for it in wanted}
+    assert sum(duration(drive, it) for it in found) == pytest.approx(cheapest_of_all(drive, wanted))
+    for block in found:
+        bounds = FORBIDDEN.get(model, {}).get(block.table.name, ())
+        forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
+        asked = range(block.start, block.start + block.count)
+        assert not any(at in part for at in asked for part in forbidden)
+        if model.startswith(("delixi", "yd1000")):  # their documents show reads of one register only
+            assert len(block.registers) == 1
+
+
+# ---- the order of a bus cycle ----
+
+
+def silences(order: list[Drive], switching: float = 0.0) -> float:
+    return sum(gap(order[at - 1], drive, switching) for at, drive in enumerate(order))
+
+
+@st.composite
+def companies(draw: st.DrawFn) -> list[Drive]:
+    """Up to six drives of any families, with any settings."""
+    kinds = draw(st.lists(st.sampled_from(sorted(MODELS)), min_size=1, max_size=6))
+    return [
+        MODELS[kind](
+            address,
+            framing=draw(st.sampled_from(MODELS[kind].framings)),
+            baudrate=draw(st.sampled_from(MODELS[kind].baudrates)),
+        )
+        for address, kind in enumerate(kinds, 1)
+    ]
+
+
+@settings(max_examples=100)
+@given(companies())
+def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
+    order = in_order(drives)
+    assert sorted(it.address for it in order) == [it.address for it in drives]
+    least = min(silences([drives[0], *rest]) for rest in permutations(drives[1:]))
+    assert silences(order) == pytest.approx(least, abs=1e-8)
+
+
+def test_where_switching_takes_time_it_is_done_seldom() -> None:
+    families = ("invt-che", "delixi-modbus", "innovert-ibd")
+    drives = [
+        MODELS[model](address, baudrate=baudrate)
+        for address, (model, baudrate) in enumerate(
+            ((model, baudrate) for baudrate in (9600, 19200, 38400) for model in families), 1
+        )
+    ]
+    order = in_order(drives, switching=0.05)
+    switches = [it.settings != order[at - 1].settings for at, it in enumerate(order)]
+    assert sum(switches) == len({it.settings for it in drives})
+    assert silences(order, 0.05) < silences(drives, 0.05)
+
+
+def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
+    slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
+    longer = 24 * 11 / 9600 + 1 / 9600
+    assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
+    assert gap(fast, slow, switching=0.002) == pytest.approx(longer + 0.002)
+    assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)

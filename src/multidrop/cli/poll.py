@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.batch import Rows
+from multidrop.cli.comparison import compared, comparison_text
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.live import LiveTable
 from multidrop.cli.overwriting import refuse_overwriting
@@ -68,6 +69,8 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
     if table:
         table.draw()
     summary = poller.summary() | {"recording": str(arguments.out) if arguments.out else None}
+    for line in plant.lines:
+        summary["lines"][line.name]["comparison"] = compared(line, summary["lines"][line.name])
     print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
     return 0 if summary["samples"] else 1
 
@@ -98,6 +101,7 @@ def _text(summary: dict[str, Any]) -> str:
             exchanges, samples = told["exchanges_per_second"], told["samples_per_second"]
             rows.append((drive, f"{exchanges:.1f}", f"{samples:.1f}", misses or "none"))
         lines += [f"  {row}" for row in aligned(rows, "<>><")]
+        lines += comparison_text(line["comparison"])
     into = f" in {summary['recording']}" if summary["recording"] else ""
     dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
     lines.append(f"{summary['samples']} samples and {summary['misses']} misses{into}{dropped}")

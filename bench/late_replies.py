@@ -1,0 +1,52 @@
+"""Whether a reply that comes late, twice or never is ever taken for another question's answer.
+
+Several drives on each line, four blocks of one length per drive; a value names its drive and its
+register. Replies are late by up to three times the time-out, lost, or doubled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import tables
+from many_lines import far_ends
+
+TIMEOUT_MS = 5
+LATE_PERMILLE, LOST_PERMILLE, TWICE_PERMILLE = 100, 20, 50
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--exchanges", type=int, default=20_000)
+    parser.add_argument("--lines", type=int, default=16)
+    parser.add_argument("--drives", type=int, default=8, help="on each line")
+    arguments = parser.parse_args()
+    import adapter
+
+    tables.heading(
+        f"{arguments.lines} lines without waits, {arguments.drives} drives each, 4 blocks of 10 registers; "
+        f"time-out {TIMEOUT_MS} ms."
+    )
+    options = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
+    options += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
+    begun = time.monotonic()
+    with far_ends("socketpair", arguments.lines, *options) as (ports, _):
+        judged = adapter.judge(ports, arguments.exchanges, arguments.drives)
+    rows = [
+        ("seconds", f"{time.monotonic() - begun:.0f}"),
+        ("exchanges", judged.exchanges),
+        ("values", judged.samples),
+        ("values that are another register's", judged.wrong),
+        ("late replies that were recognised", judged.late),
+        *((f"missed: {why}", count) for why, count in judged.misses.most_common()),
+    ]
+    tables.show(("what", "number"), rows)
+    print(
+        f"\nOf the replies {LATE_PERMILLE / 10:g} % come up to {3 * TIMEOUT_MS} ms late, "
+        f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
+    )
+
+
+if __name__ == "__main__":
+    main()

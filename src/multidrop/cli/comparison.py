@@ -1,0 +1,63 @@
+"""What was predicted of a polled line, beside what became of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from multidrop.cli.plan import exchanges, shortened
+from multidrop.cli.values import aligned
+from multidrop.plant import Line
+from multidrop.prediction import Prediction, predict
+
+Figures = dict[str, Any]
+
+
+def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
+    """Predictions with the families' response delays and with those in the poller's summary, and what it measured."""
+    wanted = exchanges(line)
+    delays = {
+        polled.drive: summary["drives"][polled.drive.name]["response_delay_ms"] / 1e3
+        for polled in line.drives
+    }
+    known = {drive: delay for drive, delay in delays.items() if delay}
+    asked_for = any(it.every is not None for it in wanted)  # then no cycle follows the other
+    cycles = summary["exchanges"] / len(wanted)
+    return {
+        "predicted": _figures(predict(wanted)),
+        "predicted_with_measured_delays": _figures(predict(wanted, known)),
+        "measured": {
+            "cycle_ms": None if asked_for or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
+            "utilisation": summary["utilisation"],
+            "exchanges_per_second": {
+                name: told["exchanges_per_second"] for name, told in summary["drives"].items()
+            },
+        },
+    }
+
+
+def _figures(prediction: Prediction) -> Figures:
+    drives = dict.fromkeys(rate.drive for rate in prediction.rates)
+    return {
+        "cycle_ms": round(prediction.cycle * 1e3, 3),
+        "utilisation": round(prediction.utilisation, 4),
+        "exchanges_per_second": {
+            drive.name: round(prediction.exchanges_per_second(drive), 2) for drive in drives
+        },
+    }
+
+
+def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
+    """The same as a table."""
+    columns = list(found.values())
+    cycles = ("-" if it["cycle_ms"] is None else f"{it['cycle_ms']:.1f} ms" for it in columns)
+    rows = [
+        ("", "PREDICTED", "BY DELAYS", "MEASURED"),
+        ("bus cycle", *cycles),
+        ("utilisation", *(f"{it['utilisation']:.1%}" for it in columns)),
+    ]
+    for name in found["measured"]["exchanges_per_second"]:
+        rates = (f"{it['exchanges_per_second'][name]:.1f}" for it in columns)
+        rows.append((f"{shortened(name)}, exchanges/s", *rates))
+    yield from (f"  {row}" for row in aligned(rows, "<>>>"))
+    yield "  by delays: predicted with the response delays that were measured"

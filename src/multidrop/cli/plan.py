@@ -1,0 +1,172 @@
+"""`multidrop plan`: what a plant file's lines will reach, what does not fit and what would make it fit.
+
+No port is opened.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.cli.target import add_json_argument
+from multidrop.cli.values import Row, aligned
+from multidrop.plan import Planned, planned
+from multidrop.plant import Line, load_plant
+from multidrop.prediction import Prediction, Rate, predict
+from multidrop.remedies import Remedies, duration_text, remedies
+
+WIDTH = 80
+LONGEST_NAME = 30
+LONG_CYCLE = 1.0  # s; who polls all readings may not have meant to wait for so long
+_NAMES = 3  # of registers that a sentence tells
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    plans = [_plan(line) for line in load_plant(arguments.plant).lines]
+    if arguments.json:
+        print(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
+    else:
+        print("\n\n".join("\n".join(_text(plan)) for plan in plans))
+    return 0 if all(plan.prediction.fits for plan in plans) else 1
+
+
+def exchanges(line: Line) -> list[Planned]:
+    """All that is polled on a line, in blocks."""
+    return [
+        one
+        for polled in line.drives
+        for one in planned(polled.drive, [(it.register, it.every) for it in polled.polls])
+    ]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    line: Line
+    prediction: Prediction
+    remedies: Remedies | None  # None: it fits
+
+
+def _plan(line: Line) -> _Plan:
+    wanted = exchanges(line)
+    prediction = predict(wanted)
+    return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction))
+
+
+def _misfits(plan: _Plan) -> list[str]:
+    """A sentence for each rate that is not kept."""
+    return [_misfit(rate) for rate in plan.prediction.rates if not rate.fits]
+
+
+def _misfit(rate: Rate) -> str:
+    names = [it.name for it in rate.registers]
+    told = ", ".join(names[:_NAMES]) + (f" and {len(names) - _NAMES} more" if len(names) > _NAMES else "")
+    verb = "does" if len(names) == 1 else "do"
+    if rate.every is None:
+        return f"{rate.drive.name}: {told} {verb} not fit: the others leave no time on the line"
+    reached = f"{rate.reached:.3g} of {1 / rate.every:.3g} times per second"
+    return f"{rate.drive.name}: {told} {verb} not fit: {reached}"
+
+
+def _warnings(plan: _Plan) -> list[str]:
+    """Polling all readings, which is what happens when nothing is said, may take long."""
+    whole = [
+        polled.drive
+        for polled in plan.line.drives
+        if tuple(it.register for it in polled.polls) == polled.drive.readings()
+    ]
+    if plan.prediction.cycle <= LONG_CYCLE or not whole:
+        return []
+    costs = ", ".join(
+        f"{drive.name} ({plan.prediction.requests(drive)} requests for {len(drive.readings())})"
+        for drive in whole
+    )
+    return [
+        f"a bus cycle takes longer than {duration_text(LONG_CYCLE)}, and all readings are polled of {costs}; "
+        'name those that are needed, such as poll = ["output_current"]'
+    ]
+
+
+# ---- for a person ----
+
+
+def _text(plan: _Plan) -> Iterator[str]:
+    prediction = plan.prediction
+    yield (
+        f"{shortened(plan.line.name)}: utilisation {prediction.utilisation:.1%}, "
+        f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest"
+    )
+    rows: list[Row] = [("DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED")]
+    rows += [_row(rate) for rate in prediction.rates]
+    yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
+    for sentence in _misfits(plan):
+        yield from _wrapped(f"! {sentence}")
+    if plan.remedies:
+        yield from _wrapped(f"! {plan.remedies}")
+    for sentence in _warnings(plan):
+        yield from _wrapped(f"? {sentence}")
+
+
+def _row(rate: Rate) -> Row:
+    every, asked = (
+        ("-", "-") if rate.every is None else (duration_text(rate.every), f"{1 / rate.every:.4g}/s")
+    )
+    counts = str(rate.requests), str(len(rate.registers))
+    return shortened(rate.drive.name), *counts, every, asked, f"{rate.reached:.4g}/s"
+
+
+def shortened(name: str) -> str:
+    """So that a table stays within the terminal."""
+    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 3]}..."
+
+
+def _wrapped(sentence: str) -> list[str]:
+    return textwrap.wrap(sentence, WIDTH, initial_indent="  ", subsequent_indent="    ")
+
+
+# ---- for a program ----
+
+
+def _as_json(plan: _Plan) -> dict[str, Any]:
+    prediction = plan.prediction
+    return {
+        "fits": prediction.fits,
+        "cycle_ms": round(prediction.cycle * 1e3, 3),
+        "utilisation": round(prediction.utilisation, 4),
+        "drives": {polled.drive.name: _drive_as_json(plan, polled.drive.name) for polled in plan.line.drives},
+        "misfits": _misfits(plan),
+        "remedies": _remedies_as_json(plan.remedies) if plan.remedies else None,
+        "warnings": _warnings(plan),
+    }
+
+
+def _drive_as_json(plan: _Plan, name: str) -> list[dict[str, Any]]:
+    return [
+        {
+            "registers": [it.name for it in rate.registers],
+            "requests": rate.requests,
+            "every_ms": None if rate.every is None else rate.every * 1e3,
+            "asked_per_second": None if rate.every is None else round(1 / rate.every, 3),
+            "reached_per_second": round(rate.reached, 3),
+            "fits": rate.fits,
+        }
+        for rate in plan.prediction.rates
+        if rate.drive.name == name
+    ]
+
+
+def _remedies_as_json(found: Remedies) -> dict[str, Any]:
+    return {
+        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every or ()],
+        "baudrate": found.baudrate and found.baudrate[0],
+        "baudrate_for": [it.name for it in found.baudrate[1]] if found.baudrate else [],
+        "registers": found.registers,
+    }

@@ -1,0 +1,177 @@
+"""Predictions: held against the frames' lengths counted by hand, and against what must be true of any line."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from multidrop.drive import Drive, Framing
+from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.plan import Planned, planned
+from multidrop.prediction import ENOUGH, predict
+from multidrop.register import HOLDING, reading
+from multidrop.remedies import Remedies, duration_text, remedies
+
+BIT = 1 / 9600
+
+
+class Simple(Drive):
+    """Four registers in two requests."""
+
+    title = "SIMPLE"
+    baudrates = (9600, 19200, 38400)
+    most_registers = {HOLDING: 2}
+    response_delay = 4e-3
+    a = reading(1)
+    b = reading(2)
+    c = reading(11)
+    d = reading(12)
+
+
+OWN = (8 + 9) * 10 * BIT + 4e-3  # request and reply of two registers, 8N1
+SILENCE = 3.5 * 10 * BIT + BIT
+
+
+def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned]:
+    registers = [drive.register(name) for name in names] or drive.readings()
+    return planned(drive, [(register, every) for register in registers])
+
+
+def test_a_cycle_is_characters_delays_and_silences() -> None:
+    drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
+    found = predict([it for drive in drives for it in asked(drive)])
+    assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
+    assert found.utilisation == 1
+    assert [(it.requests, len(it.registers)) for it in found.rates] == [(2, 4), (2, 4)]
+    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 2)
+    assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
+
+
+def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
+    """Of three gaps two are the IBD's, whatever t3.5 is at the other drives' baud rate."""
+    che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
+    exchanges = [asked(it, None, "output_current") for it in (che, other, ibd)]
+    found = predict([it for each in exchanges for it in each])
+    own = 3 * (8 + 7) * 10 * BIT + 2 * che.response_delay + ibd.response_delay
+    assert found.cycle == pytest.approx(own + 2 * (10e-3 + BIT) + SILENCE)
+
+
+def test_each_switch_of_settings_adds_its_time() -> None:
+    drives = [ErmanERG220(1), YD1000(2), ErmanERG220(3)]
+    exchanges = [it for drive in drives for it in asked(drive, None, "output_frequency")]
+    free, dear = predict(exchanges), predict(exchanges, switching=0.01)
+    assert dear.cycle - free.cycle == pytest.approx(2 * 0.01)
+
+
+def test_measured_delays_take_the_place_of_the_document_s() -> None:
+    one, two = Simple(1), Simple(2)
+    exchanges = [*asked(one), *asked(two)]
+    assert predict(exchanges, {one: 9e-3}).cycle == pytest.approx(predict(exchanges).cycle + 2 * 5e-3)
+
+
+def test_slow_rates_leave_the_rest_of_the_line_to_the_others() -> None:
+    timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
+    found = predict([*asked(timed, 0.1), *asked(eager)])
+    load = 2 * (OWN + SILENCE) / 0.1
+    assert [it.reached for it in found.rates] == pytest.approx([10, (1 - load) / (2 * (OWN + SILENCE))])
+    assert found.fits
+    assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
+
+
+def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
+    drives = [Simple(address, format="8N1") for address in range(1, 5)]
+    found = predict([it for drive in drives for it in asked(drive, 0.05)])
+    assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
+    assert not found.fits
+    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
+
+
+def test_a_drive_may_be_left_nothing_by_the_others() -> None:
+    hasty, eager = Simple(1, name="hasty"), Simple(2, name="eager")
+    found = predict([*asked(hasty, 0.02), *asked(eager)])
+    assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", False)]
+    assert found.rates[1].reached == 0
+
+
+PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
+def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | None]]) -> None:
+    """What is reached, each exchange with its own characters and delay alone, fits into a second."""
+    exchanges: list[Planned] = []
+    for address, (model, every) in enumerate(wanted, 1):
+        drive = MODELS[model](address)
+        exchanges += planned(drive, [(it, every) for it in drive.readings()[:4]])
+    found = predict(exchanges)
+    alone = {rate: predict([it for it in exchanges if it.drive is rate.drive]).cycle for rate in found.rates}
+    assert sum(rate.reached * cycle for rate, cycle in alone.items()) <= 1.001
+    for rate in found.rates:
+        assert rate.every is None or rate.reached * rate.every <= 1.001
+        assert found.utilisation > ENOUGH or rate.fits
+
+
+# ---- what would make it fit ----
+
+
+def with_remedy(drives: list[Drive], found: Remedies, every: float, which: str) -> list[Planned]:
+    if which == "every":
+        assert found.every is not None
+        ((old, new),) = found.every
+        assert old == every < new
+        return [it for drive in drives for it in asked(drive, new)]
+    if which == "baudrate":
+        assert found.baudrate is not None
+        baudrate, these = found.baudrate
+        assert list(these) == drives
+        faster = [type(it)(it.address, baudrate=baudrate) for it in drives]
+        return [it for drive in faster for it in asked(drive, every)]
+    assert found.registers is not None
+    kept = [it.name for it in drives[0].readings()[: found.registers]]
+    return [it for drive in drives for it in asked(drive, every, *kept)]
+
+
+@pytest.mark.parametrize("which", ["every", "baudrate", "registers"])
+def test_each_remedy_makes_it_fit(which: str) -> None:
+    drives: list[Drive] = [Simple(address, name=f"drive-{address}") for address in range(1, 5)]
+    exchanges = [it for drive in drives for it in asked(drive, 0.15)]
+    prediction = predict(exchanges)
+    assert not prediction.fits
+    found = remedies(exchanges, prediction)
+    assert predict(with_remedy(drives, found, 0.15, which)).fits
+
+
+def test_a_remedy_is_no_larger_than_needed() -> None:
+    drive = Simple(1)
+    exchanges = asked(drive, 0.045)  # two exchanges take 51 ms
+    found = remedies(exchanges, predict(exchanges))
+    assert found.every is not None
+    assert found.every[0][1] <= 0.056
+    assert found.baudrate is not None
+    assert found.baudrate[0] == 19200
+    assert found.registers == 2  # one request
+
+
+def test_where_nothing_helps_that_is_said() -> None:
+    drive = YD1000(1)
+    exchanges = asked(drive, 0.001, "output_frequency")
+    found = remedies(exchanges, predict(exchanges))
+    assert found.baudrate is None
+    assert found.registers is None
+    assert "baudrate" not in str(found)
+    assert "every" in str(found)
+    nothing = "no lower rate, higher baud rate or smaller number of registers makes it fit"
+    assert str(Remedies(None, None, None)) == nothing
+
+
+def test_a_duration_is_told_as_a_plant_file_has_it() -> None:
+    assert [duration_text(it) for it in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
+
+
+def test_framing_counts() -> None:
+    rtu, text = InnovertIBD(1), InnovertIBD(1, framing=Framing.ASCII)
+    ascii_own = (17 + 15) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n", no silence
+    assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
+    assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
