@@ -514,11 +514,16 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
     struct md_engine *engine = port->engine;
     struct wish wish = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns, .completion = completion};
     pthread_mutex_lock(&engine->mutex);
-    struct wish **last = &port->wishes;
-    while (*last)
-        last = &(*last)->next;
-    *last = &wish;
-    ring(engine->bell);
+    if (port->closing) { /* nobody would grant it any more */
+        *completion = (struct md_completion){.result = MD_LINE_LOST};
+        wish.done = 1;
+    } else {
+        struct wish **last = &port->wishes;
+        while (*last)
+            last = &(*last)->next;
+        *last = &wish;
+        ring(engine->bell);
+    }
     while (!wish.done)
         pthread_cond_wait(&engine->changed, &engine->mutex);
     pthread_mutex_unlock(&engine->mutex);

@@ -155,10 +155,24 @@ static void expect_late_answer(struct md_line *line)
     const struct md_exchange *exchange = line->exchange;
     struct md_drive *drive = exchange->drive;
     int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    int64_t until_ns = line->quiet_ns + later(3 * timeout_ns(drive), drive->most_timeout_ns) + reply_ns;
+    drive->late_others = line->quiet_ns < drive->late_until_ns;
     drive->late = exchange->request;
     drive->late_framing = exchange->framing;
-    drive->late_until_ns = line->quiet_ns + later(3 * timeout_ns(drive), drive->most_timeout_ns) + reply_ns;
+    drive->late_until_ns = later(until_ns, drive->late_until_ns);
     line->late = drive;
+}
+
+/* Whether an answer that is still to come could pass for the reply to this request. */
+static int is_ambiguous(const struct md_exchange *exchange, int64_t now_ns)
+{
+    const struct md_drive *drive = exchange->drive;
+    if (now_ns >= drive->late_until_ns)
+        return 0;
+    struct md_message other = exchange->request;
+    other.start ^= 1; /* mistakable, if replies do not say what was asked */
+    return md_is_mistakable(exchange->framing, &drive->late, &exchange->request) ||
+           (drive->late_others && md_is_mistakable(exchange->framing, &other, &exchange->request));
 }
 
 /* What came unasked may be the answer to an earlier request; then it need not be waited for. */
@@ -170,7 +184,8 @@ static void recognise_late_answer(struct md_line *line)
         if (md_parse_reply(drive->late_framing, line->rx + at, line->rx_len - at, &drive->late, &reply) <= 0)
             continue;
         drive->tally.late++;
-        drive->late_until_ns = 0;
+        if (!drive->late_others)
+            drive->late_until_ns = 0;
         drive = line->late = NULL;
     }
 }
@@ -182,6 +197,7 @@ static void time_out(struct md_line *line)
     if (begin > 0 && begin == line->rx_len)
         line->echoes = 1; /* nobody else says it again and no more */
     int reason = begin == line->rx_len ? MD_NO_REPLY : MD_INCOMPLETE;
+    int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
     for (size_t at = begin; at < line->rx_len; at++) {
         int why = parse_at(line, at, &reply);
         if (why == MD_INCOMPLETE)
@@ -189,8 +205,9 @@ static void time_out(struct md_line *line)
         if (weight(why) > weight(reason))
             reason = why;
     }
-    /* Only a damaged frame of its own says that the drive has answered: others' and noise do not. */
-    if (reason != MD_BAD_CHECKSUM && reason != MD_BAD_CHARACTER)
+    /* Only a damaged frame of its own says that the drive has answered: others' and noise do not, and
+     * what looks like one further on may be the inside of another. */
+    if (first != MD_BAD_CHECKSUM && first != MD_BAD_CHARACTER)
         expect_late_answer(line);
     finish(line, reason, line->rx, line->rx_len);
 }
@@ -273,8 +290,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
     line->silence_ns = later(line->silence_ns, exchange->silence_ns);
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     line->state = SILENT;
-    if (now_ns < exchange->drive->late_until_ns &&
-        md_is_mistakable(exchange->framing, &exchange->drive->late, &exchange->request)) {
+    if (is_ambiguous(exchange, now_ns)) {
         finish(line, MD_LATE_ANSWER_DUE, line->rx, 0);
         return;
     }

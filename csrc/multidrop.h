@@ -115,6 +115,7 @@ struct md_drive {
     int64_t late_until_ns;          /* so long the answer to `late` may still come */
     struct md_message late;
     int late_framing;
+    int late_others;                /* and answers to requests before that one, too */
     uint32_t failures;              /* in a row */
     struct md_tally tally;
 };

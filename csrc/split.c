@@ -10,10 +10,11 @@
 
 enum {
     MOST_ADDRESS = 247,
-    MOST_NOISE = 3, /* bytes between a request and its reply; in more of them a request may be lost */
-    LEAST_DELIXI = 2,
-    MOST_DELIXI = 7
+    MOST_NOISE = 3 /* bytes between a request and its reply; in more of them a request may be lost */
 };
+
+/* Delixi's K (part 3). */
+enum { RUN_COMMAND = 2, STATE_QUERY = 3, PARAMETER_QUERY = 7 };
 
 /* Bytes that follow `at` in its piece, and in the pieces that came without a pause. */
 static size_t end_of_run(const struct md_heard *heard, size_t piece)
@@ -36,12 +37,23 @@ static int is_echoed(int framing, uint8_t function)
     return framing == MD_DELIXI || function == 0x05 || function == 0x06 || function == 0x08;
 }
 
+/* Delixi's requests look like replies, but what is asked for is 0 in a query. */
+static int is_delixi_request(const struct md_message *message)
+{
+    static const uint8_t zeros[4];
+    if (message->function == STATE_QUERY)
+        return message->start == 0;
+    if (message->function == PARAMETER_QUERY)
+        return memcmp(message->data, zeros, sizeof zeros) == 0;
+    return message->function >= RUN_COMMAND && message->function < PARAMETER_QUERY;
+}
+
 static int find_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
 {
     int used = md_parse_request(framing, bytes, len, message);
     if (used <= 0)
         return used;
-    if (framing == MD_DELIXI && (message->function < LEAST_DELIXI || message->function > MOST_DELIXI))
+    if (framing == MD_DELIXI && !is_delixi_request(message))
         return MD_BAD_FUNCTION;
     return message->address > MOST_ADDRESS ? MD_BAD_ADDRESS : used;
 }
@@ -97,7 +109,7 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
                       int least, struct md_span *span)
 {
     static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
-    if (splitter->awaited && splitter->junk <= MOST_NOISE && side != MD_ASKING) {
+    if (splitter->awaited && side != MD_ASKING) {
         int used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, &span->message);
         span->kind = MD_REPLY;
         span->framing = splitter->framing;
@@ -131,7 +143,7 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
     splitter->at += span->len;
     splitter->is_in_step = span->kind != MD_JUNK;
     splitter->junk = span->kind == MD_JUNK ? splitter->junk + span->len : 0;
-    if (span->kind == MD_REPLY)
+    if (span->kind == MD_REPLY || splitter->junk > MOST_NOISE)
         splitter->awaited = 0;
     if (span->kind != MD_REQUEST && span->kind != MD_EITHER)
         return;

@@ -21,11 +21,11 @@ from peers import require_module
 from taps import tapped
 from test_cli import Run, run
 from test_cli_poll import MULTIDROP, multidrop, recorded
+from test_sim_lines import opened, receive
 
-from multidrop.bus import Bus
 from multidrop.capture import CaptureWriter, Side
 from multidrop.cli.listening import Listener
-from multidrop.core import Framing
+from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -67,9 +67,9 @@ poll = ["output_frequency", "status"]
 def line() -> Iterator[tuple[str, str]]:
     """The ports of a master and of a listener, on a line with drives of three framings."""
     drives = [EncodedDrive(drive) for drive in DRIVES]
-    with Simulator([Wire(drives, unpaced=True)]) as simulator:
-        with tapped(simulator.wires[0].path, 9600) as ports:
-            yield ports
+    simulator = Simulator([Wire(drives, unpaced=True)])
+    with simulator, tapped(simulator.wires[0].path, 9600) as ports:
+        yield ports
 
 
 def plant(directory: Path, port: str) -> Path:
@@ -116,10 +116,12 @@ def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
 
 # ---- masters that know nothing of us ----
 
-Said = tuple[int, int, list[float]]  # address, function, values
+Said = tuple[int, int, list[int] | int]  # address, function, values or minus the exception code
 
 
-def pymodbus(framer: str, address: int, starts: list[int]) -> Callable[[str, random.Random, int], list[Said]]:
+def pymodbus(
+    framer: str, address: int, starts: list[int], written: int
+) -> Callable[[str, random.Random, int], list[Said]]:
     """A master that reads and writes with pymodbus."""
 
     def master(port: str, chance: random.Random, count: int) -> list[Said]:
@@ -131,35 +133,41 @@ def pymodbus(framer: str, address: int, starts: list[int]) -> Callable[[str, ran
                 if chance.random() < 0.8:
                     start = chance.choice(starts)
                     reply = it.read_holding_registers(start, count=chance.randint(1, 3), device_id=address)
-                    assert not reply.isError()
-                    said.append((address, 3, list(map(float, reply.registers))))
+                    values = -reply.exception_code if reply.isError() else reply.registers
+                    said.append((address, 3, values))
                 else:
-                    assert not it.write_register(
-                        0x2001 if address != 2 else 0x2001, 1000, device_id=address
-                    ).isError()
-                    said.append((address, 6, [1000.0]))
+                    assert not it.write_register(*written, device_id=address).isError()
+                    said.append((address, 6, [written[1]]))
         return said
 
     return master
 
 
 def delixi(port: str, chance: random.Random, count: int) -> list[Said]:
-    """pymodbus does not speak it: our own bus does."""
+    """pymodbus does not speak it."""
     said: list[Said] = []
-    with Bus(port, baudrate=9600) as bus:
-        drive = bus.attach(DelixiNative, 4)
-        for _ in range(count):
-            register = chance.choice([drive.register("output_frequency"), drive.register("output_current")])
-            said.append((4, 7, [round(bus.read(drive, register) / register.scale)]))
+    for _ in range(count):
+        register = chance.choice([DelixiNative.output_frequency, DelixiNative.output_current])
+        request = Message(4, 7, register.address, data=bytes(4))
+        with opened(port) as fd:
+            os.write(fd, build_request(Framing.DELIXI, request))
+            _, reply = parse_reply(Framing.DELIXI, receive(fd, 21), request)
+        assert reply is not None
+        said.append((4, 7, [int.from_bytes(reply.data)]))
     return said
 
 
+FREQUENCY, STOP = (InnovertIBD.frequency.address, 1000), (InvtCHE.control.address, 5)
 MASTERS = (
-    pymodbus("rtu", 1, [0, 1]),
-    pymodbus("rtu", 2, [0x3000, 0x3001]),
-    pymodbus("ascii", 3, [0, 1]),
+    pymodbus("rtu", 1, [0, 1], FREQUENCY),
+    pymodbus("rtu", 2, [0x3000, 0x3001], STOP),
+    pymodbus("ascii", 3, [0, 1], FREQUENCY),
     delixi,
 )
+
+
+def _said(told: dict[str, Any]) -> list[int] | int:
+    return -told["exception"] if told["result"] == "refused" else list(told["values"].values())
 
 
 def test_every_exchange_of_a_mixed_line_is_heard(line: tuple[str, str]) -> None:
@@ -169,7 +177,7 @@ def test_every_exchange_of_a_mixed_line_is_heard(line: tuple[str, str]) -> None:
     with sniffing(tap) as sniffer:
         while len(said) < EXCHANGES:
             said += chance.choice(MASTERS)(port, chance, 10)
-    heard = [(it["address"], it["function"], list(it["values"].values())) for it in sniffer.exchanges]
+    heard = [(it["address"], it["function"], _said(it)) for it in sniffer.told[:-1]]
     assert heard == said
     assert sniffer.summary == {
         "exchanges": len(said),
@@ -245,7 +253,7 @@ def test_a_capture_is_told_in_engineering_units(run: Run, capture: Path, command
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
         "pump  reads output_frequency = 50.00 Hz  (5.3 ms)",
-        "pump  writes stored_frequency = 50.00 Hz  (5.3 ms)",
+        "pump  writes frequency = 50.00 Hz  (5.3 ms)",
         "unknown: FF 00",
         "pump  reads output_frequency: no reply",
     ]
@@ -342,7 +350,7 @@ def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture
             2,
             f"{capture} is there already: name another file, or remove it first",
         ),
-        (["decode", cut], 0, f"{cut} is cut: its last 115 bytes are no whole packet, and were left out"),
+        (["decode", cut], 0, f"{cut} is cut: its last 103 bytes are no whole packet, and were left out"),
     ):
         found, _, err = run(*words)
         assert (found, err) == (status, f"multidrop: {sentence}\n")

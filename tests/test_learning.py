@@ -6,7 +6,7 @@ import pytest
 from frames import words
 from line_driver import MS, LineDriver
 
-from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply
+from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply, build_request
 
 CHARACTER = 1 * MS
 SILENCE = 4 * MS
@@ -161,6 +161,33 @@ def test_what_no_late_answer_could_be_taken_for_is_sent(
     """A stop is a write: it never waits."""
     time_out(line, drive)
     ask(line, drive, request_)
+
+
+def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive)
+    first_until = drive.late_until_ns
+    time_out(line, drive, LONGER)  # no answer to the first could be taken for its reply
+    assert drive.late_until_ns > first_until
+    line.begin(exchange(OTHER, drive))
+    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    line.receive(build_reply(Framing.RTU, Message(1, 3, data=words(1, 2))))
+    assert drive.tally().late == 1
+    line.begin(exchange(OTHER, drive))  # the answer to the first is still to come
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+    line.begin(exchange(WRITE, drive))
+    assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
+
+
+def test_what_looks_like_a_damaged_reply_inside_another_frame_is_none(
+    line: LineDriver, drive: Respondent
+) -> None:
+    ask(line, drive)
+    inside = bytes([1, 3, 2, 0, 0, 0, 0])  # a reply with a wrong checksum
+    line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
+    line.wait_until_done()
+    assert line.completion.result == Result.BAD_CHECKSUM
+    line.begin(exchange(OTHER, drive))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
 
 
 def test_other_drives_are_not_concerned(line: LineDriver, drive: Respondent) -> None:

@@ -161,7 +161,9 @@ def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing
     found = blocks(drive, registers.values())
     assert sorted(it.name for block in found for it in block.registers) == sorted(registers)
     assert all(block.start <= it.address for block in found for it in block.registers)
-    assert all(it.address + it.words <= block.start + block.count for block in found for it in block.registers)
+    assert all(
+        it.address + it.words <= block.start + block.count for block in found for it in block.registers
+    )
     total = sum(duration(drive, block) for block in found)
     assert total == pytest.approx(cheapest_of_all(drive, list(registers.values())))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable
+from itertools import pairwise
 
 import pytest
 from frames import PRINTED, Printed
@@ -87,6 +88,16 @@ def test_a_copy_is_neither_where_its_order_is_lost() -> None:
     ]
 
 
+def test_an_answered_query_is_no_request_though_it_looks_like_one() -> None:
+    (query,) = {it for it in REPLIES if it.request_frame.startswith(b":0107")}
+    assert raw(split(query.request_frame[:-3], query.frame, query.request_frame, query.frame)) == [
+        (Kind.JUNK, query.request_frame[:-3]),
+        (Kind.STRAY, query.frame),
+        (Kind.REQUEST, query.request_frame),
+        (Kind.REPLY, query.frame),
+    ]
+
+
 def test_a_side_that_is_known_tells_a_copy_from_a_request() -> None:
     heard = Heard()
     heard.put(WRITE, 0, side=Side.ANSWERING)
@@ -102,6 +113,18 @@ def test_a_side_that_is_known_tells_a_copy_from_a_request() -> None:
 def test_a_reply_is_not_given_to_an_earlier_request_than_its_own() -> None:
     damaged = bytes([OTHER_READ[0] ^ 1]) + OTHER_READ[1:]
     assert kinds(split(READ, damaged, ALSO_ANSWER)) == [Kind.REQUEST, Kind.JUNK, Kind.STRAY]
+
+
+def test_what_was_lost_is_not_forgotten_when_a_stray_reply_comes() -> None:
+    lost = OTHER_READ[:-1]
+    assert kinds(split(READ, ANSWER, WRITE, lost, ALSO_ANSWER, WRITE, WRITE)) == [
+        *(Kind.REQUEST, Kind.REPLY, Kind.REQUEST, Kind.JUNK, Kind.STRAY, Kind.REQUEST, Kind.REPLY)
+    ]
+
+
+def test_a_stray_reply_does_not_end_an_exchange() -> None:
+    other = bytes.fromhex("02 83 02 30 F1")
+    assert kinds(split(READ, other, ANSWER)) == [Kind.REQUEST, Kind.STRAY, Kind.REPLY]
 
 
 def test_a_request_that_is_repeated_is_answered_once() -> None:
@@ -169,7 +192,8 @@ def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
     line = chance.choices(REPLIES, k=2000)
     sent = [frame for it in line for frame in (it.request_frame, it.frame)]
     came = [damaged(frame, chance) for frame in sent]
-    spans = {(span.kind, span.time_ns, span.raw) for span in split(*came)}
+    found = split(*came)
+    spans = {(span.kind, span.time_ns, span.raw) for span in found}
     whole = [came[i] == sent[i] for i in range(len(sent))]
     expected = range(2, len(sent) - 2, 2)
     expected = [i for i in expected if all(whole[i - 2 : i + 4])]
@@ -177,6 +201,10 @@ def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
     for i in expected:
         assert (Kind.REQUEST, i, sent[i]) in spans
         assert (Kind.REPLY, i + 1, sent[i + 1]) in spans
+    frames = [span for span in found if span.kind is not Kind.JUNK]
+    for asked, answered in pairwise(frames):  # and no reply is given to a request that is not its own
+        if answered.kind is Kind.REPLY:
+            assert answered.time_ns == asked.time_ns + 1 or answered.raw == asked.raw
 
 
 def test_framings_may_change_from_frame_to_frame() -> None:

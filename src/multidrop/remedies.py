@@ -13,7 +13,7 @@ from multidrop.plan import Planned, planned
 from multidrop.prediction import Prediction, Rate, predict
 from multidrop.register import Register
 
-SLOWER = 1.1  # by so much the periods grow
+SLOWER = 1.05  # by so much the periods grow
 MOST_ATTEMPTS = 40
 
 
@@ -53,19 +53,20 @@ def remedies(
     timed = [rate for rate in prediction.rates if rate.every is not None]
     tight = [rate for rate in timed if not rate.fits] or timed  # that leave the others nothing
     return Remedies(
-        _every(exchanges, tight, delays or {}),
+        _every(exchanges, tight, max(1.0, prediction.utilisation), delays or {}),
         _baudrate(exchanges, delays or {}),
         _registers(exchanges, tight, delays or {}),
     )
 
 
 def _every(
-    exchanges: Sequence[Planned], tight: Sequence[Rate], delays: Mapping[Drive, float]
+    exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, delays: Mapping[Drive, float]
 ) -> tuple[tuple[float, float], ...] | None:
+    """Longer by one factor, of which this is the least that can do."""
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})
-    for attempt in range(1, MOST_ATTEMPTS):
-        longer = {every: _rounded_up(every * SLOWER**attempt) for every in wanted}
+    for attempt in range(MOST_ATTEMPTS):
+        longer = {every: _rounded_up(least * every * SLOWER**attempt) for every in wanted}
         changed = [
             replace(it, every=longer[it.every]) if it.every and (it.drive, it.every) in hasty else it
             for it in exchanges

@@ -14,13 +14,14 @@ Figures = dict[str, Any]
 
 
 def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Predictions with the families' response delays and with those in the poller's summary, and what it measured."""
+    """Predictions with the documents' response delays and with those measured, and the poller's summary."""
     wanted = exchanges(line)
-    delays = {
-        polled.drive: summary["drives"][polled.drive.name]["response_delay_ms"] / 1e3
+    told = summary["drives"]
+    known = {
+        polled.drive: told[polled.drive.name]["response_delay_ms"] / 1e3
         for polled in line.drives
+        if told[polled.drive.name]["exchanges_per_second"]  # only those that answer have one
     }
-    known = {drive: delay for drive, delay in delays.items() if delay}
     asked_for = any(it.every is not None for it in wanted)  # then no cycle follows the other
     cycles = summary["exchanges"] / len(wanted)
     return {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -50,9 +51,10 @@ class Ear:
     def _print(self, told: Iterable[Overheard]) -> None:
         for it in told:
             if self._as_json:
-                print(json.dumps({"line": self.name} | self._teller.json(it)), flush=True)
+                print(json.dumps({"line": self.name} | self._teller.json(it)))
             else:
-                print(self._teller.text(it), flush=True)
+                print(self._teller.text(it))
+        sys.stdout.flush()
 
 
 def replay(

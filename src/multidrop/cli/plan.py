@@ -20,7 +20,7 @@ from multidrop.prediction import Prediction, Rate, predict
 from multidrop.remedies import Remedies, duration_text, remedies
 
 WIDTH = 80
-LONGEST_NAME = 30
+LONGEST_NAME = 24
 LONG_CYCLE = 1.0  # s; who polls all readings may not have meant to wait for so long
 _NAMES = 3  # of registers that a sentence tells
 
@@ -72,7 +72,7 @@ def _misfit(rate: Rate) -> str:
     verb = "does" if len(names) == 1 else "do"
     if rate.every is None:
         return f"{rate.drive.name}: {told} {verb} not fit: the others leave no time on the line"
-    reached = f"{rate.reached:.3g} of {1 / rate.every:.3g} times per second"
+    reached = f"{_number(rate.reached)} of {_number(1 / rate.every)} times per second"
     return f"{rate.drive.name}: {told} {verb} not fit: {reached}"
 
 
@@ -100,9 +100,10 @@ def _warnings(plan: _Plan) -> list[str]:
 
 def _text(plan: _Plan) -> Iterator[str]:
     prediction = plan.prediction
-    yield (
-        f"{shortened(plan.line.name)}: utilisation {prediction.utilisation:.1%}, "
-        f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest"
+    yield from textwrap.wrap(
+        f"{plan.line.name}: utilisation {prediction.utilisation:.1%}, "
+        f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest",
+        WIDTH,
     )
     rows: list[Row] = [("DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED")]
     rows += [_row(rate) for rate in prediction.rates]
@@ -117,10 +118,14 @@ def _text(plan: _Plan) -> Iterator[str]:
 
 def _row(rate: Rate) -> Row:
     every, asked = (
-        ("-", "-") if rate.every is None else (duration_text(rate.every), f"{1 / rate.every:.4g}/s")
+        ("-", "-") if rate.every is None else (duration_text(rate.every), f"{_number(1 / rate.every)}/s")
     )
     counts = str(rate.requests), str(len(rate.registers))
-    return shortened(rate.drive.name), *counts, every, asked, f"{rate.reached:.4g}/s"
+    return shortened(rate.drive.name), *counts, every, asked, f"{_number(rate.reached)}/s"
+
+
+def _number(rate: float) -> str:
+    return f"{rate:.0f}" if rate >= 100 else f"{rate:.3g}"
 
 
 def shortened(name: str) -> str:

@@ -1,0 +1,183 @@
+"""`plan`: what it tells of a plant file, without a port; and prediction beside measurement after `poll`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from test_cli import TOY, Run, run
+from test_cli_poll import multidrop, plant
+
+__all__ = ["plant", "run"]  # fixtures
+
+LINE = '[[line]]\nname = "{}"\nport = "/dev/there-is-no-such-port-{}"\n'
+DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
+
+
+@pytest.fixture
+def fitting(tmp_path: Path) -> Path:
+    """Two drives that are asked for little."""
+    path = tmp_path / "fitting.toml"
+    path.write_text(
+        LINE.format("hall-1", 1)
+        + DRIVE.format("pump-1", TOY, 1)
+        + 'every = "1 s"\n'
+        + DRIVE.format("pump-2", TOY, 2)
+        + 'poll = ["output_current", { register = "output_frequency", every = "500 ms" }]\n'
+    )
+    return path
+
+
+@pytest.fixture
+def crowded(tmp_path: Path) -> Path:
+    """Four drives on 9600 bit/s that are wanted 50 times a second, on the second of two lines."""
+    path = tmp_path / "crowded.toml"
+    path.write_text(
+        LINE.format("hall-1", 1)
+        + DRIVE.format("fan", TOY, 1)
+        + LINE.format("hall-2", 2)
+        + "".join(DRIVE.format(f"pump-{n}", TOY, n) + 'every = "20 ms"\n' for n in range(1, 5))
+    )
+    return path
+
+
+def test_what_fits_is_status_0_and_its_rates_are_told(run: Run, fitting: Path) -> None:
+    status, out, err = run("plan", fitting)
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].startswith("hall-1: utilisation 100.0%, bus cycle ")
+    assert lines[1].split() == ["DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED"]
+    assert lines[2].split() == ["pump-1", "1", "5", "1", "s", "1/s", "1/s"]
+    assert lines[3].split()[:5] == ["pump-2", "1", "1", "-", "-"]
+    assert lines[4].split() == ["pump-2", "1", "1", "500", "ms", "2/s", "2/s"]
+    assert len(lines) == 5
+
+
+def test_json_has_the_figures(run: Run, fitting: Path) -> None:
+    status, out, _ = run("plan", fitting, "--json")
+    line = json.loads(out)["lines"]["hall-1"]
+    assert (status, line["fits"], line["misfits"], line["remedies"], line["warnings"]) == (
+        0,
+        True,
+        [],
+        None,
+        [],
+    )
+    # Five registers and twice one, 8N1: characters, 5 ms of delay, 3.5 characters and a bit of silence.
+    characters = (8 + 15) + 2 * (8 + 7)
+    assert line["cycle_ms"] == pytest.approx(characters * 10 / 9.6 + 3 * 5 + 3 * 36 / 9.6, abs=0.001)
+    (pump,) = line["drives"]["pump-1"]
+    assert pump == {
+        "registers": ["output_frequency", "output_current", "mystery", "fault", "status"],
+        "requests": 1,
+        "every_ms": 1000.0,
+        "asked_per_second": 1.0,
+        "reached_per_second": 1.0,
+        "fits": True,
+    }
+
+
+def test_what_does_not_fit_is_status_1_and_says_what_would_help(run: Run, crowded: Path) -> None:
+    status, out, err = run("plan", crowded)
+    assert (status, err) == (1, "")
+    assert max(map(len, out.splitlines())) <= 80
+    told = " ".join(out.split())
+    first = "output_frequency, output_current, mystery and 2 more do not fit"
+    for drive in ("pump-1", "pump-2", "pump-3", "pump-4"):
+        assert f"! {drive}: {first}: " in told
+    assert " of 50 times per second" in told
+    assert '! it would fit with every = "' in told
+    assert "fan:" not in told
+    *_, second = json.loads(run("plan", crowded, "--json")[1])["lines"].items()
+    assert (second[0], second[1]["fits"]) == ("hall-2", False)
+    (remedy,) = second[1]["remedies"]["every_ms"]
+    assert remedy["asked"] == 20
+    again = crowded.read_text().replace("20 ms", f"{remedy['fits']:g} ms")
+    crowded.write_text(again)
+    assert run("plan", crowded)[0] == 0
+
+
+def test_a_drive_left_without_time_is_told(run: Run, crowded: Path) -> None:
+    crowded.write_text(crowded.read_text() + DRIVE.format("eager", TOY, 9) + 'poll = ["fault"]\n')
+    status, out, _ = run("plan", crowded)
+    assert status == 1
+    assert "! eager: fault does not fit: the others leave no time on the line" in out
+
+
+@pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
+def test_polling_all_readings_in_single_requests_is_warned_of(run: Run, tmp_path: Path, model: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(LINE.format("hall-1", 1) + DRIVE.format("p", model, 1) + DRIVE.format("q", model, 2))
+    status, out, _ = run("plan", path)
+    assert status == 0
+    told = " ".join(out.split())
+    assert "? a bus cycle takes longer than 1 s, and all readings are polled of p (" in told
+    assert "name those that are needed, such as poll" in told
+    path.write_text(path.read_text().replace("address = 1\n", 'address = 1\npoll = ["output_current"]\n'))
+    path.write_text(path.read_text().replace("address = 2\n", 'address = 2\npoll = ["output_current"]\n'))
+    assert "?" not in run("plan", path)[1]
+
+
+def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    name = "the pump behind the second door on the left of the hall with the blue floor"
+    path.write_text(LINE.format(name, 1) + DRIVE.format(name, TOY, 1) + 'every = "1 ms"\n')
+    status, out, _ = run("plan", path)
+    assert status == 1
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_mistakes_in_the_file_are_status_2_and_all_told(run: Run, fitting: Path) -> None:
+    text = fitting.read_text().replace("port =", "prot =").replace('"1 s"', '"soon"')
+    fitting.write_text(text)
+    status, out, err = run("plan", fitting)
+    assert (status, out) == (2, "")
+    assert [line.removeprefix(f'multidrop: {fitting}: line "hall-1"') for line in err.splitlines()] == [
+        ": unknown key 'prot'; did you mean 'port'?",
+        ', drive "pump-1": \'soon\' is not a duration above 0, such as "50 ms", "2 s" or "1 min"',
+    ]
+
+
+def test_a_file_that_is_not_there_is_status_2(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "none.toml"
+    sentence = f"multidrop: {path}: the plant file cannot be read: No such file or directory\n"
+    assert run("plan", path) == (2, "", sentence)
+
+
+# ---- after a poll ----
+
+
+def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
+    done = multidrop("poll", plant, "--seconds", 1, "--json")
+    found = json.loads(done.stdout)["lines"]["hall-1"]["comparison"]
+    summary = json.loads(done.stdout)["lines"]["hall-1"]
+    planned = json.loads(run("plan", plant, "--json")[1])["lines"]["hall-1"]
+    assert list(found) == ["predicted", "predicted_with_measured_delays", "measured"]
+    assert found["predicted"]["cycle_ms"] == planned["cycle_ms"]
+    assert found["predicted"]["utilisation"] == planned["utilisation"]
+    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers: it keeps its 5 ms
+    known = found["predicted_with_measured_delays"]["cycle_ms"]
+    assert known == pytest.approx(planned["cycle_ms"] + delay - 5, abs=0.01)
+    assert found["measured"]["utilisation"] == summary["utilisation"]
+    assert found["measured"]["exchanges_per_second"]["pump-9"] == 0
+    assert found["measured"]["cycle_ms"] > 0
+
+
+def test_poll_shows_them_to_a_person(plant: Path) -> None:
+    lines = multidrop("poll", plant, "--seconds", 1).stdout.splitlines()
+    heading = next(
+        at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "BY", "DELAYS", "MEASURED"]
+    )
+    told = lines[heading + 1 : heading + 5]
+    assert [line.split()[0] for line in told] == ["bus", "utilisation", "pump-1,", "pump-9,"]
+    assert told[3].split()[-1] == "0.0"
+    assert max(map(len, lines)) <= 80
+
+
+def test_where_drives_wait_to_be_due_no_cycle_is_measured(plant: Path) -> None:
+    plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
+    done = multidrop("poll", plant, "--seconds", 1, "--json")
+    found = json.loads(done.stdout)["lines"]["hall-1"]["comparison"]
+    assert found["measured"]["cycle_ms"] is None
+    assert found["predicted"]["exchanges_per_second"]["pump-1"] == 5
