@@ -56,6 +56,7 @@ struct md_port {
     struct wish *wish; /* under way */
     int blind;         /* nothing is worth reading before the port's waking time */
     int watched;       /* epoll tells when it can be read */
+    int emptied;       /* it was read empty a moment ago: nothing is there yet */
     int lost_error;
     int closing, closed;
 };
@@ -129,6 +130,7 @@ static void pump_in(struct md_port *port)
 {
     uint8_t bytes[1024];
     ssize_t got = read(port->fd, bytes, sizeof bytes);
+    port->emptied = got < (ssize_t)sizeof bytes;
     if (got > 0)
         md_line_received(&port->line, bytes, (size_t)got, md_now_ns());
     else if (got == 0)
@@ -250,12 +252,14 @@ static void advance(struct md_port *port)
         }
         if (want == MD_READ && (port->blind || now_ns >= wake_ns)) {
             port->blind = 0;
-            pump_in(port);
+            if (!port->emptied)
+                pump_in(port);
             continue;
         }
         port->blind = want == MD_WAIT;
         break;
     }
+    port->emptied = 0;
     if (port->blind && wake_ns - md_now_ns() > WORTH_BLINDNESS)
         watch(port, 0);
     else if (!port->blind)

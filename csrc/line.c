@@ -76,10 +76,19 @@ static void learn_delay(struct md_drive *drive, int64_t delay_ns)
     drive->delay_ns = later(drive->delay_ns + off / 8, 1);
 }
 
-/* Whether this says that the drive does not answer, or cannot be reached. */
+/* Whether this says that the drive does not answer, or cannot be reached. Damage says that it does. */
 static int is_failure(int result)
 {
-    return result < 0 && result != MD_LATE_ANSWER_DUE && result != MD_EXPIRED && result != MD_LINE_LOST;
+    switch (result) {
+    case MD_BAD_CHECKSUM:
+    case MD_BAD_CHARACTER:
+    case MD_LATE_ANSWER_DUE:
+    case MD_EXPIRED:
+    case MD_LINE_LOST:
+        return 0;
+    default:
+        return result < 0;
+    }
 }
 
 static void count(const struct md_exchange *exchange, const struct md_completion *completion)

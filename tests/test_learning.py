@@ -231,6 +231,15 @@ def test_a_late_answer_within_another_drive_s_exchange_is_not_its_reply(
     assert (line.completion.reply.data, line.completion.skipped) == (words(5), 7)
 
 
+def test_damage_is_not_silence(line: LineDriver, drive: Respondent) -> None:
+    for _ in range(5):
+        ask(line, drive)
+        line.receive(reply(1)[:-1] + b"\x00")
+        line.wait_until_done()
+        assert line.completion.result == Result.BAD_CHECKSUM
+    assert drive.failures == 0
+
+
 def test_everything_is_counted(line: LineDriver, drive: Respondent) -> None:
     answer(line, drive, 5 * MS)
     time_out(line, drive)

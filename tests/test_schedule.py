@@ -143,6 +143,13 @@ def test_slots_of_a_resting_drive_are_reported_with_the_time_they_were_due() -> 
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
+def test_each_rest_is_told_once_for_jobs_in_turn() -> None:
+    made = schedule(poll := job(1), job(2))
+    fail(made, 1, 2, now_ms=7)
+    take(made, 8, 300)
+    assert made.unasked == [(poll, 7 * MS)]
+
+
 def test_while_the_port_is_gone_every_slot_passes() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]

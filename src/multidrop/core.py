@@ -393,6 +393,7 @@ class Port:
         # Read in place: a call of the core would let go of the interpreter, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
         self._stopped = False
+        self._respondents: set[Respondent] = set()
 
     def stop(self) -> None:
         """Nothing more is carried out, and the descriptor is the caller's; what was can be reaped."""
@@ -428,6 +429,7 @@ class Port:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
+        self._respondents.add(exchange.respondent)  # the core still looks at it when a late answer comes
         found = ffi.new("struct md_completion *")
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
         return completion(found)

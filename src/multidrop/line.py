@@ -167,7 +167,9 @@ class Line:
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
         self._serial: serial.SerialBase | None = None
         self._core: Port | None = None
-        self._lock = threading.RLock()  # one opens, closes or queues at a time
+        self._lock = threading.RLock()  # one opens or closes at a time
+        self._waiting = 0  # callers that wait for an exchange
+        self._left = threading.Condition(self._lock)  # one of them has left
         self._open()
 
     def _open(self) -> None:
@@ -204,9 +206,11 @@ class Line:
     def close(self) -> None:
         """Close the port; what is queued and not yet sent never will be."""
         with self._lock:
-            if self._core:
-                self._core.close()
-                self._core = None
+            core, self._core = self._core, None
+            if core:
+                core.stop()
+                if self._left.wait_for(lambda: not self._waiting, timeout=1.0):
+                    core.close()  # nobody looks at it any more
             if self._bridge:
                 self._bridge.close()
                 self._bridge = None
@@ -244,14 +248,25 @@ class Line:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
-        core = self._opened(exchange.settings)
-        found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
+        if self._core is None:  # at once, also while it is being opened again
+            raise LineError(self.port, "it is closed")
+        with self._lock:
+            core = self._opened(exchange.settings)
+            self._waiting += 1
+        try:
+            found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
+        finally:
+            with self._lock:
+                self._waiting -= 1
+                self._left.notify_all()
         failure = self._failure(found.result, found.error)
         if failure:
             raise failure
         return found
 
     def _failure(self, result: int, error: int) -> LineError | None:
+        if result == Result.LINE_LOST and self._core is None:
+            return LineError(self.port, "it is closed")
         if result == Result.LINE_LOST:
             return LineError(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
         if result == Result.SETTINGS_REFUSED:

@@ -18,7 +18,7 @@ from typing import Any
 from multidrop import core, plant
 from multidrop.batch import Batch
 from multidrop.bus import Bus, exchange
-from multidrop.core import Columns, Exchange, Field, Port, Result
+from multidrop.core import Columns, Exchange, Field, Port, Respondent, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
@@ -148,12 +148,15 @@ class _PolledLine:
         self._codes = codes
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
         self._average_ns = 0  # of what was queued last
+        self._asked_of: list[tuple[Drive, Respondent]] = []
+        self._failures: list[int] = []  # of each of them, in a row, when they were looked at last
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has and we have no outcome of
         try:
             for polled in declared.drives:
                 self.bus.attach(polled.drive)
+                self._asked_of.append((polled.drive, self.bus.respondent(polled.drive)))
                 self._declare(polled)
             for job in self._jobs:
                 self.bus.line.require(job.exchange.settings)
@@ -220,8 +223,11 @@ class _PolledLine:
         self._reopen_ns = now
 
     def _observe(self, now: int) -> None:
-        for drive in self.bus.drives:
-            respondent = self.bus.respondent(drive)
+        failures = [respondent.failures for _, respondent in self._asked_of]
+        if failures == self._failures:
+            return
+        self._failures = failures
+        for drive, respondent in self._asked_of:
             self.schedule.observe(
                 drive.address,
                 respondent.failures,
@@ -251,7 +257,8 @@ class _PolledLine:
     def _top_up(self, port: Port, now: int) -> None:
         pending = port.pending
         start_ns = now + pending * self._average_ns
-        queued = self.schedule.take(now, start_ns, now + AHEAD_NS, port.room - pending)
+        room = port.room - len(self._queued)  # what is carried out keeps its place until it is collected
+        queued = self.schedule.take(now, start_ns, now + AHEAD_NS, room)
         if queued:
             port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
             self._queued += queued

@@ -158,6 +158,8 @@ class Schedule(Generic[J]):
                 health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
             rest_ns = max(health.rest_ns, self._fair_rest_ns(cost_ns) if health.rest_ns else 0)
             health.asleep_until_ns = max(late_until_ns, now_ns + rest_ns)
+            if rest_ns:  # jobs in turn have no slots: one row for each rest says why there is none
+                self.unasked += [(job, now_ns) for job in self._turn if job.drive == drive]
         self._ill = any(it.failures for it in self._health.values())
 
     def _fair_rest_ns(self, cost_ns: int) -> int:

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,12 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
         _hand_out(poller, takers)  # what came while it closed
     if table:
         table.draw()
-    summary = poller.summary() | {"recording": str(arguments.out) if arguments.out else None}
+    return conclude(plant, poller.summary(), arguments)
+
+
+def conclude(plant: Plant, told: Mapping[str, Any], arguments: argparse.Namespace) -> int:
+    """Tell what became of the polling; the exit status."""
+    summary = {**told, "recording": str(arguments.out) if arguments.out else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compared(line, summary["lines"][line.name])
     print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
@@ -97,9 +102,10 @@ def _text(summary: dict[str, Any]) -> str:
         )
         rows = [("DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES")]
         for drive, told in line["drives"].items():
-            misses = ", ".join(f"{reason} {count}" for reason, count in told["misses"].items())
             exchanges, samples = told["exchanges_per_second"], told["samples_per_second"]
-            rows.append((drive, f"{exchanges:.1f}", f"{samples:.1f}", misses or "none"))
+            first, *more = [f"{reason} {count}" for reason, count in told["misses"].items()] or ["none"]
+            rows.append((drive, f"{exchanges:.1f}", f"{samples:.1f}", first))
+            rows += [("", "", "", reason) for reason in more]
         lines += [f"  {row}" for row in aligned(rows, "<>><")]
         lines += comparison_text(line["comparison"])
     into = f" in {summary['recording']}" if summary["recording"] else ""
