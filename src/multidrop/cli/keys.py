@@ -1,0 +1,56 @@
+"""Keys of a terminal, one at a time, as they are pressed."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
+KEYS = {  # as terminals send them
+    b"\x1b[A": UP,
+    b"\x1bOA": UP,
+    b"k": UP,
+    b"\x1b[B": DOWN,
+    b"\x1bOB": DOWN,
+    b"j": DOWN,
+    b"\x1b[5~": PAGE_UP,
+    b"\x1b[6~": PAGE_DOWN,
+    b" ": PAGE_DOWN,
+    b"\r": ENTER,
+    b"\n": ENTER,
+    b"\x1b": ESCAPE,
+}
+
+
+@contextmanager
+def keys() -> Iterator[Callable[[float], str]]:
+    """A function that waits so many seconds for a key; its name or letter, or nothing."""
+    fd = sys.stdin.fileno()
+    before = termios.tcgetattr(fd)
+    tty.setcbreak(fd)
+    pressed = b""  # and not told yet
+
+    def wait_for_key(seconds: float) -> str:
+        nonlocal pressed
+        if not pressed and select.select([fd], [], [], seconds)[0]:
+            pressed = os.read(fd, 64)
+        key, pressed = next_key(pressed)
+        return key
+
+    try:
+        yield wait_for_key
+    finally:
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def next_key(pressed: bytes) -> tuple[str, bytes]:
+    """The first key of what a terminal sent, by its name or letter, and the rest."""
+    for code in sorted(KEYS, key=len, reverse=True):
+        if pressed.startswith(code):
+            return KEYS[code], pressed[len(code) :]
+    return pressed[:1].decode("ascii", "replace"), pressed[1:]

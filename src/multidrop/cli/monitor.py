@@ -1,0 +1,243 @@
+"""`multidrop monitor`: a plant's drives live on a terminal; its keys stop motors, and none starts one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from multidrop.batch import Rows
+from multidrop.cli.extra import need
+from multidrop.cli.interruption import Interruption
+from multidrop.cli.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
+from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.watched import Watched, WatchedPlant, told
+from multidrop.errors import BusError
+from multidrop.plant import Plant, load_plant
+from multidrop.poller import Poller
+from multidrop.recording import open_writer
+
+DRAW_S = 0.25
+SIDE_S = 0.1  # between two reads of registers that are not polled
+PAGE = 10  # lines
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="record what is polled as well")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    need("rich", "monitor", "monitor")
+    if not is_possible():
+        raise ValueError("`multidrop monitor` needs a terminal; `multidrop poll` works without one")
+    if arguments.out:
+        refuse_overwriting(arguments.out)
+    summary = watch(load_plant(arguments.plant), out=arguments.out)
+    return 0 if summary["samples"] else 1
+
+
+def is_possible() -> bool:
+    """Whether there is a terminal to draw on and to take keys from."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
+    """Poll the plant and show it until the user has seen enough; the poller's summary."""
+    with ExitStack() as stack:
+        interruption = stack.enter_context(Interruption())
+        takers: list[Callable[[Rows], None]] = []
+        if out:
+            takers.append(stack.enter_context(open_writer(out, plant.metadata())).write)
+        with Poller(plant) as poller:
+            _Monitor(plant, poller, takers).show(interruption, seconds)
+        while batch := poller.take():  # what came while it closed
+            for take in takers:
+                take(batch)
+    return poller.summary()
+
+
+class _Monitor:
+    def __init__(self, plant: Plant, poller: Poller, takers: list[Callable[[Rows], None]]) -> None:
+        from rich.console import Console
+
+        from multidrop.cli.screen import BLOCKS, LEAST_HEIGHT, LEAST_WIDTH, PLAIN_BLOCKS, Position
+
+        self._console = Console()
+        self._poller = poller
+        self._plant = WatchedPlant(plant)
+        self._takers = [self._plant.add, *takers]
+        self._at = Position()
+        self._answer: Callable[[], None] | None = None  # what a y does
+        self._side = _SideReader(poller)
+        self._blocks = BLOCKS if "utf" in self._console.encoding else PLAIN_BLOCKS
+        if self._console.width < LEAST_WIDTH or self._console.height < LEAST_HEIGHT:
+            raise ValueError(
+                f"the terminal is too small: it has {self._console.width} x {self._console.height} "
+                f"characters, and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
+            )
+
+    def show(self, interruption: Interruption, seconds: float | None) -> None:
+        begun = next_draw = next_tick = time.monotonic()
+        with self._console.screen(hide_cursor=True) as screen, keys() as wait_for_key:
+            while not interruption.came:
+                now = time.monotonic()
+                if seconds is not None and now - begun >= seconds:
+                    return
+                if now >= next_tick:
+                    next_tick += 1.0
+                    self._take()
+                    self._plant.tick(now, self._poller.summary())
+                if now >= next_draw:
+                    next_draw = max(next_draw + DRAW_S, now)
+                    self._take()
+                    screen.update(self._drawn())
+                key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
+                if key == "q":
+                    return
+                if key:
+                    self._obey(key)
+                    next_draw = 0.0
+
+    def _take(self) -> None:
+        while batch := self._poller.take():
+            for take in self._takers:
+                take(batch)
+
+    def _drawn(self) -> Any:
+        from rich.text import Text
+
+        from multidrop.cli.screen import overview, page
+
+        size = self._console.width, self._console.height
+        now_ns = time.time_ns()
+        if self._at.page:
+            others = self._side.read(self._chosen)
+            lines = page(self._chosen, others, self._at, size, now_ns)
+        else:
+            lines = overview(self._plant, self._at, size, now_ns, self._blocks)
+        return Text("\n", no_wrap=True, end="").join(lines)
+
+    @property
+    def _chosen(self) -> Watched:
+        return self._plant.drives[self._at.chosen]
+
+    # ---- keys ----
+
+    def _obey(self, key: str) -> None:
+        if self._answer:
+            answer, self._answer, self._at.question = self._answer, None, ""
+            if key == "y":
+                answer()
+            else:
+                self._at.message = "nothing was sent"
+            return
+        self._at.message = ""
+        actions: dict[str, Callable[[], None]] = {
+            UP: lambda: self._move(-1),
+            DOWN: lambda: self._move(1),
+            PAGE_UP: lambda: self._scroll(-PAGE),
+            PAGE_DOWN: lambda: self._scroll(PAGE),
+            ENTER: self._turn_page,
+            ESCAPE: self._leave_page,
+            "s": self._ask_to_stop,
+            "S": self._ask_to_stop_all,
+        }
+        if key in actions:
+            actions[key]()
+
+    def _move(self, by: int) -> None:
+        self._at.chosen = max(0, min(self._at.chosen + by, len(self._plant.drives) - 1))
+        self._at.scrolled = 0
+
+    def _scroll(self, by: int) -> None:
+        if self._at.page:
+            self._at.scrolled = max(0, self._at.scrolled + by)
+        else:
+            self._move(by)
+
+    def _turn_page(self) -> None:
+        self._at.page = not self._at.page
+        self._at.scrolled = 0
+        if not self._at.page:
+            self._side.rest()
+
+    def _leave_page(self) -> None:
+        if self._at.page:
+            self._turn_page()
+
+    def _ask_to_stop(self) -> None:
+        chosen = self._chosen
+        self._at.question = f"Stop {chosen.name}? y stops it, any other key does not"
+        self._answer = lambda: self._in_background(f"stopping {chosen.name}", lambda: self._stop(chosen))
+
+    def _ask_to_stop_all(self) -> None:
+        count = len(self._plant.drives)
+        self._at.question = f"Stop ALL {count} drives? y stops them, any other key does not"
+        self._answer = self._stop_lines
+
+    def _stop_lines(self) -> None:
+        """All lines at the same time: none waits for another's ramps."""
+        for line in self._plant.plant.lines:
+            self._in_background("stopping all drives", partial(self._stop_all, line.name))
+
+    def _in_background(self, what: str, work: Callable[[], str]) -> None:
+        """A stop waits until the motor stands: meanwhile the screen goes on."""
+        self._at.message = what
+
+        def carry_out() -> None:
+            try:
+                self._at.message = work()
+            except (BusError, ValueError) as failure:
+                self._at.message = str(failure)
+
+        threading.Thread(target=carry_out, daemon=True).start()
+
+    def _stop(self, it: Watched) -> str:
+        it.polled.drive.stop()
+        return f"{it.name} has stopped"
+
+    def _stop_all(self, line: str) -> str:
+        return "; ".join(str(stopped) for stopped in self._poller.bus(line).stop_all().values())
+
+
+class _SideReader:
+    """Reads what is not polled of one drive, one register after another, for as long as it is looked at."""
+
+    def __init__(self, poller: Poller) -> None:
+        self._poller = poller
+        self._drive: Watched | None = None
+        self._found: dict[str, str] = {}
+        self._thread: threading.Thread | None = None
+
+    def read(self, it: Watched) -> dict[str, str]:
+        """What was found so far; goes on reading."""
+        if self._drive is not it:
+            self._drive, self._found = it, {}
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._go_on, args=(it, self._found), daemon=True)
+            self._thread.start()
+        return self._found
+
+    def rest(self) -> None:
+        self._drive = None
+
+    def _go_on(self, it: Watched, found: dict[str, str]) -> None:
+        drive = it.polled.drive
+        polled = {poll.register.name for poll in it.polled.polls}
+        others = [reg for name, reg in drive.registers.items() if reg.readable and name not in polled]
+        bus = self._poller.bus(it.line.name)
+        for register in others:
+            if self._drive is not it:
+                return
+            try:
+                found[register.name] = told(register, bus.read(drive, register))
+            except BusError as failure:
+                found[register.name] = type(failure).__name__
+            time.sleep(SIDE_S)

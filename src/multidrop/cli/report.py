@@ -1,0 +1,29 @@
+"""`multidrop report`: all that a recording tells of itself, as one HTML page."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from multidrop.cli.extra import need
+from multidrop.cli.overwriting import refuse_overwriting
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="of `multidrop poll --out`")
+    parser.add_argument(
+        "--out", metavar="PAGE.html", type=Path, help="without it RECORDING with .html in place of its suffix"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    out = arguments.out or arguments.recording.with_suffix(".html")
+    if out.suffix.lower() != ".html":
+        raise ValueError(f"{out}: a report's name ends in .html")
+    need("matplotlib", "plot", "report")
+    refuse_overwriting(out)
+    from multidrop.look import load, report_page
+
+    out.write_text(report_page(load(arguments.recording)), "utf-8")
+    print(out)
+    return 0

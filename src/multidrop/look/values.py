@@ -1,0 +1,160 @@
+"""The picture of a recording's values: a panel a quantity, misses marked, faults as spans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from multidrop.look.recorded import RAW, Array, Look, Series
+from multidrop.look.style import FAULT, GRID, MISS, day, days, line_style, new_figure, tell_time
+
+FIRST = (  # shown before others when there are more than fit
+    "output_frequency",
+    "output_current",
+    "motor_speed",
+    "output_torque",
+    "output_power",
+    "dc_bus_voltage",
+    "output_voltage",
+    "heatsink_temperature",
+)
+MOST_PANELS = 8
+MOST_POINTS = 4000  # of a line: more cannot be seen
+FEW_POINTS = 200  # each has a dot of its own
+MOST_NAMED = 12  # values of an enumeration that are named beside the axis
+FAULTS = "fault"
+
+Panel = tuple[str, str]  # register, unit
+
+
+def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) -> tuple[Figure, list[str]]:
+    """The picture, and the registers that had no room in it. Raises ValueError for unknown names."""
+    _check("drive", drives, look.drives)
+    chosen = [it for it in look.series if not drives or it.drive in drives]
+    _check("register", registers, tuple(dict.fromkeys(it.register for it in chosen)))
+    faults = [it for it in chosen if it.register == FAULTS]
+    panels = _panels([it for it in chosen if it not in faults], registers)
+    shown, left = panels[:MOST_PANELS], panels[MOST_PANELS:]
+    if registers:
+        shown, left = panels, []
+    names = sorted({it.drive for it in chosen}, key=look.drives.index)
+    strip = [0.35 + 0.22 * len(faults)] if faults else []
+    figure, axes = new_figure([*strip, *([1.9] * len(shown))], sharex=True)
+    spans = [(it, span) for it in faults for span in it.faults()]
+    if faults:
+        _draw_faults(axes[0], faults, look)
+    for panel, one in zip(shown, axes[len(strip) :], strict=True):
+        _draw_panel(one, panel, [it for it in chosen if (it.register, it.unit) == panel], look)
+        for _, span in spans:
+            one.axvspan(day(span.begin), day(span.end), color=FAULT, alpha=0.08, lw=0)
+    tell_time(axes[-1])
+    axes[-1].set_xlim(day(look.begin), day(max(look.end, look.begin + 1_000_000)))
+    handles = [Line2D([], [], label=name, **line_style(look.drives.index(name))) for name in names]
+    if any(it.missed.any() for it in chosen):
+        handles.append(Line2D([], [], color=MISS, marker="|", linestyle="", label="missed"))
+    figure.legend(handles=handles, loc="outside upper left", ncols=min(6, len(handles)), frameon=False)
+    return figure, [_title(panel) for panel in left]
+
+
+def _check(what: str, given: Sequence[str], known: Sequence[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise ValueError(f"the recording has no {what} {name!r}; it has {', '.join(known)}")
+
+
+def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
+    """One for each register and unit: amperes and per cent do not share an axis."""
+    found = dict.fromkeys(
+        (it.register, it.unit) for it in chosen if not registers or it.register in registers
+    )
+    order = {name: at for at, name in enumerate(registers or FIRST)}
+    return sorted(found, key=lambda panel: (order.get(panel[0], len(order)), panel[1] == RAW))
+
+
+def _title(panel: Panel) -> str:
+    return f"{panel[0]}, {panel[1]}" if panel[1] else panel[0]
+
+
+def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], look: Look) -> None:
+    axes.set_title(_title(panel), loc="left", fontsize=10)
+    for it in series:
+        time, value = thinned(it.time, it.value)
+        style = line_style(look.drives.index(it.drive))
+        drawstyle = "steps-post" if it.names else "default"
+        marker = "." if len(time) < FEW_POINTS else ""
+        axes.plot(days(time), value, linewidth=1.3, drawstyle=drawstyle, marker=marker, markersize=3, **style)
+    _mark_misses(axes, series)
+    _name_values(axes, series)
+    if not any(it.names for it in series):
+        low, high = axes.get_ylim()
+        if 0 < low < 0.6 * high:
+            axes.set_ylim(bottom=0)
+
+
+def _mark_misses(axes: Axes, series: Sequence[Series]) -> None:
+    """A tick at the foot of the panel for every value that was due and is not there."""
+    for it in series:
+        time = it.time[it.missed]
+        if len(time):
+            apart = max(1, (time[-1] - time[0]) // MOST_POINTS)
+            time = np.unique(time // apart) * apart  # ticks that would lie on each other are one
+            foot = np.full(len(time), 0.025)
+            axes.plot(
+                days(time),
+                foot,
+                "|",
+                color=MISS,
+                markersize=6,
+                alpha=0.7,
+                transform=axes.get_xaxis_transform(),
+            )
+
+
+def _name_values(axes: Axes, series: Sequence[Series]) -> None:
+    names = {number: name for it in series for number, name in it.names.items()}
+    seen = {float(value) for it in series for value in np.unique(it.value[~it.missed])}
+    named = sorted(number for number in seen if number in names)
+    if named and len(named) <= MOST_NAMED:
+        axes.set_yticks(named, [names[int(number)].lower() for number in named], fontsize=8)
+        axes.set_ylim(named[0] - 0.5, named[-1] + 0.5)
+
+
+def _draw_faults(axes: Axes, series: Sequence[Series], look: Look) -> None:
+    """A row for each drive that has a fault register; a bar with its name while there is a fault."""
+    axes.set_title("faults", loc="left", fontsize=10)
+    for row, it in enumerate(series):
+        for span in it.faults():
+            begin, end = day(span.begin), day(span.end)
+            axes.barh(row, end - begin, left=begin, height=0.7, color=FAULT, alpha=0.85)
+            axes.annotate(
+                span.what.lower(),
+                (begin, row),
+                xytext=(3, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=7.5,
+                color="white",
+                clip_on=True,
+            )
+    axes.set_yticks(range(len(series)), [it.drive for it in series], fontsize=8)
+    axes.set_ylim(len(series) - 0.5, -0.5)
+    axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
+
+
+def thinned(time: Array, value: Array) -> tuple[Array, Array]:
+    """At most MOST_POINTS points: of each stretch the smallest and the largest, and whether one is missed."""
+    pieces = MOST_POINTS // 2
+    if len(time) <= MOST_POINTS:
+        return time, value
+    length = len(time) // pieces
+    whole = length * pieces
+    rows = value[:whole].reshape(pieces, length)
+    lows = np.where(np.isnan(rows), np.inf, rows).argmin(axis=1)
+    highs = np.where(np.isnan(rows), -np.inf, rows).argmax(axis=1)
+    at = np.sort(np.stack([lows, highs], axis=1), axis=1) + np.arange(pieces)[:, None] * length
+    kept = np.unique(np.concatenate([at.ravel(), np.arange(whole, len(time))]))
+    return time[kept], value[kept]

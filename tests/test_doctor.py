@@ -1,0 +1,232 @@
+"""`multidrop doctor`: what it reads out of the system, and what it says of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from test_cli import Run, run
+
+from multidrop.cli.adapter import (
+    RS485_ENABLED,
+    RS485_RX_DURING_TX,
+    Adapter,
+    RS485Mode,
+    decoded_rs485,
+    find_adapter,
+    low_latency,
+    rs485_mode,
+)
+from multidrop.cli.doctor import (
+    ROUNDS,
+    adapter_finding,
+    echo_finding,
+    latency_finding,
+    low_latency_finding,
+    round_trip_finding,
+    rs485_finding,
+)
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.timing import Settings
+
+__all__ = ["run"]  # a fixture
+
+USUAL = Settings(9600, "8N1")
+SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path) -> Path:
+    """As Linux shows an FTDI adapter: links from classes to the tree of devices."""
+    usb = tmp_path / "devices/pci0000:00/usb1/1-2"
+    port = usb / "1-2:1.0/ttyUSB0"
+    (port / "tty/ttyUSB0").mkdir(parents=True)
+    for name, text in {
+        "idVendor": "0403",
+        "idProduct": "6001",
+        "manufacturer": "FTDI",
+        "product": "FT232R USB UART",
+    }.items():
+        (usb / name).write_text(text + "\n")
+    (port / "latency_timer").write_text("16\n")
+    driver = tmp_path / "bus/usb-serial/drivers/ftdi_sio"
+    driver.mkdir(parents=True)
+    (port / "driver").symlink_to(driver)
+    devices = tmp_path / "bus/usb-serial/devices"
+    devices.mkdir()
+    (devices / "ttyUSB0").symlink_to(port)
+    tty = tmp_path / "class/tty/ttyUSB0"
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(port)
+    return tmp_path
+
+
+@pytest.fixture
+def port(request: pytest.FixtureRequest) -> Iterator[str]:
+    drives = [simulated(InvtCHE(1)), simulated(InnovertIBD(2, framing="ascii"))]
+    with Simulator([Wire(drives, unpaced=True, port=getattr(request, "param", "pty"))]) as sim:
+        yield sim.wires[0].path
+
+
+# ---- what the system says ----
+
+
+def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
+    it = find_adapter("/dev/ttyUSB0", sysfs)
+    assert (it.name, it.driver, it.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
+    assert (it.usb_id, it.latency_timer) == ("0403:6001", 16)
+
+
+def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
+    link = sysfs / "by-id"
+    link.symlink_to("/dev/ttyUSB0")
+    assert find_adapter(str(link), sysfs).driver == "ftdi_sio"
+
+
+def test_a_port_of_which_nothing_is_known(sysfs: Path) -> None:
+    assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
+
+
+def test_the_rs485_struct_is_linux_s() -> None:
+    # linux/serial.h: flags, two delays in ms, five words of padding
+    assert decoded_rs485(struct.pack("=8I", 0x01, 0, 0, 0, 0, 0, 0, 0)) == RS485Mode(True, False)
+    assert decoded_rs485(struct.pack("=8I", 0x13, 5, 5, 0, 0, 0, 0, 0)) == RS485Mode(True, True)
+    assert decoded_rs485(bytes(32)) == RS485Mode(False, False)
+    assert (RS485_ENABLED, RS485_RX_DURING_TX) == (1, 16)
+
+
+def test_a_pty_has_neither_flag_nor_mode() -> None:
+    master, slave = os.openpty()
+    try:
+        assert low_latency(slave) is None
+        assert rs485_mode(slave) is None
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+# ---- what is said of it ----
+
+
+def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
+    finding = latency_finding(find_adapter("/dev/ttyUSB0", sysfs))
+    assert finding.what == "16 ms: every reply may wait for so long in the adapter"
+    assert f"echo 1 | sudo tee {sysfs}/bus/usb-serial/devices/ttyUSB0/latency_timer" in finding.advice
+    assert 'ATTR{latency_timer}="1"' in finding.advice
+
+
+@pytest.mark.parametrize(
+    ("finding", "what", "advised"),
+    [
+        (latency_finding(Adapter("ttyUSB0", latency_timer=1)), "1 ms: the shortest there is", False),
+        (latency_finding(Adapter("ttyS0")), "the driver has none that can be seen", False),
+        (adapter_finding(Adapter("ttyS0")), "not on USB; the system names no driver for it", False),
+        (
+            adapter_finding(Adapter("ttyUSB0", "ch341", "QinHeng", "1a86:7523")),
+            "QinHeng (1a86:7523); its driver is ch341",
+            False,
+        ),
+        (low_latency_finding(None), "the driver has no such flag", False),
+        (
+            low_latency_finding(True),
+            "the flag is set: multidrop sets it whenever it opens the port",
+            False,
+        ),
+        (low_latency_finding(False), "the flag is not set: the driver did not take it from multidrop", True),
+        (
+            rs485_finding(None),
+            "the driver has none: the adapter itself must switch between sending and receiving",
+            False,
+        ),
+        (rs485_finding(RS485Mode(False, False)), "the driver has it, and it is off", True),
+        (rs485_finding(RS485Mode(True, False)), "on: the driver switches the direction", False),
+        (
+            rs485_finding(RS485Mode(True, True)),
+            "on: the driver switches the direction, and hears what it sends: multidrop takes the echo out",
+            False,
+        ),
+        (echo_finding(b"", SENT, USUAL), "none at 9600 8N1: nothing came back of what was sent", False),
+        (
+            echo_finding(SENT, SENT, USUAL),
+            "the adapter hears what it sends at 9600 8N1; multidrop takes it out",
+            False,
+        ),
+        (echo_finding(b"\x00\xff", SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+    ],
+)
+def test_each_is_a_sentence_and_advice_only_where_there_is_something_to_do(
+    finding: object, what: str, advised: bool
+) -> None:
+    assert finding.what == what
+    assert bool(finding.advice) == advised
+
+
+def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
+    drive = InvtCHE(1)
+    usual = round_trip_finding(drive, [0.005] * ROUNDS)
+    assert usual.what.endswith("after 5.0 ms at least, 5.0 in the middle, 5.0 at most")
+    assert usual.advice == ""
+    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10)
+    assert "20.1 in the middle" in slow.what
+    assert slow.what.endswith("7 of 20 requests stayed without a good reply")
+    assert "usually takes 5.0 ms" in slow.advice
+    assert "did not answer once in 20 requests" in round_trip_finding(drive, []).what
+
+
+# ---- the command ----
+
+
+def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    status, out, err = run("doctor", port)
+    assert (status, err) == (0, "")
+    told = " ".join(out.split())
+    assert f"{port} is a pseudo-terminal" in told
+    assert "there is none, and so no driver" in told
+    assert "none at 9600 8N1: nothing came back" in told
+    assert "not measured: a drive must answer -> name one with --model and --address" in told
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
+def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    status, out, _ = run("doctor", port)
+    told = " ".join(out.split())
+    assert status == 0
+    assert "is a TCP connection" in told
+    assert "at the far end" in told
+
+
+def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
+    words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
+    status, out, _ = run("doctor", port, *words)
+    assert status == 0
+    findings = {it["topic"]: it for it in json.loads(out)["findings"]}
+    assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
+
+
+def test_a_drive_that_is_not_there_is_told(run: Run, port: str) -> None:
+    _, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert "invt-che@9 did not answer once in 20 requests -> check its address" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "sentence"),
+    [
+        (("/dev/nowhere",), 1, "/dev/nowhere: there is no such port"),
+        (("/dev/null",), 1, "/dev/null: it is not a serial port"),
+        (("/dev/nowhere", "--model", "invt-che"), 2, "--model and --address belong together"),
+        (("/dev/nowhere", "--model", "invt", "--address", "1"), 2, "did you mean invt-che"),
+    ],
+)
+def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
+    found, out, err = run("doctor", *words)
+    assert (found, out) == (status, "")
+    assert sentence in err
+    assert len(err.splitlines()) == 1

@@ -1,0 +1,347 @@
+"""The monitor: what it knows, how it looks at any size, and that its keys do nothing but stop."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import string
+import struct
+import subprocess
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_cli import Run, run
+from test_cli_poll import MULTIDROP, plant, plant_file
+
+import multidrop.cli.extra
+from multidrop.batch import Row
+from multidrop.cli.keys import DOWN, ENTER, KEYS, UP, next_key
+from multidrop.cli.monitor import _Monitor
+from multidrop.cli.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
+from multidrop.cli.watched import WatchedPlant
+from multidrop.plant import Plant, load_plant
+from multidrop.recording.recorded import from_rows
+
+__all__ = ["plant", "run"]  # fixtures
+
+SECOND = 1_000_000_000
+NOW = 1_795_253_400 * SECOND
+CHE = ("output_frequency", "output_current", "status", "fault")
+MISSES = {"no reply": 3, "bad checksum": 9}
+
+
+def a_plant(tmp_path: Path, drives: int = 3) -> Plant:
+    path = tmp_path / "hall.toml"
+    text = '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
+    for at in range(1, drives + 1):
+        text += (
+            f'[[line.drive]]\nname = "drive-{at}"\nmodel = "invt-che"\naddress = {at}\npoll = {list(CHE)}\n'
+        )
+    path.write_text(text)
+    return load_plant(path)
+
+
+def row(drive: str, register: str, value: float | None, status: str = "ok", ago: float = 0.5) -> Row:
+    at = NOW - round(ago * SECOND)
+    return Row(at, at, None if value is None else 1000, drive, register, value, status)
+
+
+def summary(seconds: float, exchanges: int, utilisation: float) -> dict[str, Any]:
+    told = {"seconds": seconds, "exchanges": exchanges, "utilisation": utilisation, "misses": MISSES}
+    return {"lines": {"hall-1": told}}
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> WatchedPlant:
+    """One drive that runs, one with a fault, one that never answered."""
+    it = WatchedPlant(a_plant(tmp_path))
+    rows = [
+        row("drive-1", "output_frequency", 42.5),
+        row("drive-1", "output_current", 2.5),
+        row("drive-1", "status", 1.0),
+        row("drive-1", "fault", 0.0),
+        row("drive-2", "output_frequency", 0.0, ago=9),
+        row("drive-2", "fault", 4.0, ago=9),
+        row("drive-2", "output_frequency", None, "bad checksum"),
+        *(row("drive-3", register, None, "no reply") for register in CHE),
+    ]
+    it.add(from_rows(rows))
+    it.tick(100.0, summary(10, 1000, 0.9))
+    it.tick(101.0, summary(11, 1050, 0.9))
+    return it
+
+
+def texts(lines: list[Any]) -> list[str]:
+    return [line.plain for line in lines]
+
+
+# ---- what it knows ----
+
+
+def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
+    assert [(it.state, it.fault, it.why_silent) for it in watched.drives] == [
+        ("forward", "", ""),
+        ("fault", "oc1_overcurrent_accelerating", ""),
+        ("silent", "", "no reply"),
+    ]
+    assert [it.age(NOW) for it in watched.drives] == [0.5, 9.0, None]
+    assert [it.misses.total() for it in watched.drives] == [0, 1, 4]
+
+
+def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
+    it = WatchedPlant(a_plant(tmp_path, 1))
+    it.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
+    assert it.drives[0].state == ""
+    it.add(from_rows([row("drive-1", "output_frequency", 3.0)]))
+    assert it.drives[0].state == "turns"
+
+
+def test_rates_are_those_of_the_last_seconds(watched: WatchedPlant) -> None:
+    rates = watched.rates["hall-1"]
+    assert rates.exchanges == pytest.approx(50)
+    assert rates.utilisation == pytest.approx(0.9)
+    assert rates.misses == MISSES
+    for second in range(2, 12):
+        watched.tick(100.0 + second, summary(10 + second, 1050, 0.0))
+    assert watched.rates["hall-1"].exchanges == 0
+
+
+def test_history_has_a_gap_where_a_value_was_missed(watched: WatchedPlant) -> None:
+    assert [list(it.history) for it in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
+    assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
+    assert sparkline([50, 50, 50], 2) == "██"
+    assert sparkline([0, 0], 5) == "▁▁"
+    assert sparkline([0, 7], 5, PLAIN_BLOCKS) == "_@"
+    assert sparkline([1, 2], 0) == ""
+
+
+# ---- how it looks ----
+
+
+def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
+    lines = texts(overview(watched, Position(), (80, 24), NOW, BLOCKS))
+    assert lines[0].startswith(" multidrop monitor  hall.toml")
+    assert lines[0].endswith("09:30:00 UTC ")
+    assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
+    assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "██"]
+    assert lines[4].startswith("!drive-2 fault")
+    assert "oc1_overc" in lines[4]
+    assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
+    assert lines[-1].startswith(" up/down choose")
+    assert "start" not in " ".join(lines).lower()
+
+
+@pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
+@pytest.mark.parametrize("drives", [1, 31, 247])
+def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+    it = WatchedPlant(a_plant(tmp_path, min(drives, 247)))
+    it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
+    it.tick(1.0, summary(1, 1, 1.0))
+    for chosen in (0, drives - 1):
+        for at in (Position(chosen), Position(chosen, question="Stop?"), Position(chosen, message="m" * 300)):
+            for lines in (
+                overview(it, at, size, NOW, BLOCKS),
+                page(it.drives[chosen], {}, at, size, NOW),
+            ):
+                assert len(lines) == size[1]
+                assert max(len(line) for line in texts(lines)) <= size[0]
+        shown = texts(overview(it, Position(chosen), size, NOW, BLOCKS))
+        assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
+
+
+def test_the_page_has_every_register(watched: WatchedPlant) -> None:
+    it = watched.drives[1]
+    others = {"motor_speed": "0 rpm"}
+    lines = texts(page(it, others, Position(1, page=True), (80, 40), NOW))
+    assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
+    rows = {line.split()[0]: line for line in lines[2:-2] if line.strip()}
+    readable = {name for name, register in it.polled.drive.registers.items() if register.readable}
+    assert set(rows) == readable
+    assert rows["output_frequency"].split()[1:] == ["0.00", "Hz", "9.0", "s", "bad", "checksum"]
+    assert rows["status"].split()[1:3] == ["not", "yet"]
+    assert rows["motor_speed"].split()[1:] == ["0", "rpm", "not", "polled"]
+    assert rows["device"].split()[1] == "..."
+
+
+def test_the_page_scrolls_as_far_as_there_is_something(watched: WatchedPlant) -> None:
+    at = Position(0, page=True, scrolled=1000)
+    lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
+    assert lines[9].strip()
+    assert (
+        f"of {len([it for it in watched.drives[0].polled.drive.registers.values() if it.readable])}"
+        in lines[-2]
+    )
+
+
+# ---- its keys ----
+
+
+@pytest.mark.parametrize(
+    ("pressed", "keys"),
+    [
+        (b"q", ["q"]),
+        (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
+        (b"\x1bOBsy", [DOWN, "s", "y"]),
+        (b"\x1b[5~\x1b", ["page up", "escape"]),
+    ],
+)
+def test_keys_that_come_together_are_told_apart(pressed: bytes, keys: list[str]) -> None:
+    found = []
+    while pressed:
+        key, pressed = next_key(pressed)
+        found.append(key)
+    assert found == keys
+
+
+class Poller:
+    """Notes what is asked of its bus."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def bus(self, line: str) -> Poller:
+        return self
+
+    def stop_all(self) -> dict[str, str]:
+        self.asked.append("stop all")
+        return {"drive-1": "drive-1: stopped after 0.1 s"}
+
+    def perform(self, name: str, script: Any) -> None:
+        step = next(script)
+        self.asked.append(f"{name} {step.register.name} {step.value.name}")
+
+
+def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Poller]:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", "24")
+    poller = Poller()
+    plant = a_plant(tmp_path)
+    for polled in plant.lines[0].drives:
+        polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
+    anyone: Any = poller
+    monitor: Any = _Monitor(plant, anyone, [])
+    monitor._in_background = lambda what, work: work()
+    return monitor, poller
+
+
+def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    for keys, asked in (
+        (["s", "n"], []),
+        (["s", ENTER], []),
+        (["s", "Y"], []),
+        (["y"], []),
+        ([DOWN, "s", "y"], ["drive-2 control STOP"]),
+        (["S", "n"], []),
+        (["S", "y"], ["stop all"]),
+    ):
+        poller.asked.clear()
+        for key in keys:
+            monitor._obey(key)
+        assert poller.asked == asked
+
+
+def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    for key in [*string.printable, *KEYS.values()]:
+        for answer in "yY\r ":
+            monitor._obey(key)
+            monitor._obey(answer)
+    assert set(poller.asked) <= {"stop all", *(f"drive-{at} control STOP" for at in (1, 2, 3))}
+
+
+# ---- on a terminal ----
+
+
+class Terminal:
+    """A pty on which a command runs, and all that it wrote."""
+
+    def __init__(self, words: list[str], size: tuple[int, int], **environment: str) -> None:
+        self.fd, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", size[1], size[0], 0, 0))
+        self.before = termios.tcgetattr(slave)
+        self.slave = slave
+        clean = {name: text for name, text in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        self.process = subprocess.Popen(
+            words, stdin=slave, stdout=slave, stderr=slave, env=clean | {"TERM": "xterm"} | environment
+        )
+        self.written = b""
+
+    def wait_for(self, text: str, seconds: float = 20) -> None:
+        end = time.monotonic() + seconds
+        while text not in self.text:
+            assert time.monotonic() < end, self.text[-3000:]
+            if select.select([self.fd], [], [], 0.1)[0]:
+                self.written += os.read(self.fd, 65536)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", self.written.decode(errors="replace"))
+
+    def press(self, keys: bytes) -> None:
+        self.written = b""
+        os.write(self.fd, keys)
+
+
+@contextmanager
+def on_terminal(*words: object, size: tuple[int, int] = (80, 24), **environment: str) -> Iterator[Terminal]:
+    it = Terminal([*MULTIDROP, *map(str, words)], size, **environment)
+    try:
+        yield it
+    finally:
+        it.process.kill()
+        it.process.wait()
+        os.close(it.fd)
+        os.close(it.slave)
+
+
+def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"\r")
+        terminal.wait_for("TOY T1  address 1")
+        terminal.wait_for("acceleration_time")
+        terminal.press(b"\x1bs")
+        terminal.wait_for("Stop pump-1? y stops it")
+        terminal.press(b"n")
+        terminal.wait_for("nothing was sent")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+        assert termios.tcgetattr(terminal.slave) == terminal.before
+
+
+def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
+    environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
+    with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:
+        terminal.wait_for(">pump-1")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+        assert not re.search(rb"\x1b\[[0-9;]*3[0-9]m", terminal.written)
+        assert terminal.written.isascii()
+
+
+def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
+    with on_terminal("monitor", plant, size=(40, 10)) as terminal:
+        terminal.wait_for("too small: it has 40 x 10")
+        assert terminal.process.wait(timeout=20) == 2
+
+
+def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None:
+    status, _, err = run("monitor", plant_file(tmp_path))
+    assert status == 2
+    assert err == "multidrop: `multidrop monitor` needs a terminal; `multidrop poll` works without one\n"
+
+
+def test_without_the_extra_it_is_named(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multidrop.cli.extra.importlib.util, "find_spec", lambda name: None)
+    status, _, err = run("monitor", plant_file(tmp_path))
+    assert status == 2
+    assert "pip install 'multidrop[monitor]'" in err

@@ -1,0 +1,302 @@
+"""Pictures and pages of a recording: what is in them, by their numbers; how they look, people must see."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from batches import METADATA, SECOND, UTC_0, example
+from test_cli import Run, run
+
+import multidrop.cli.extra
+from multidrop.batch import Row
+from multidrop.look import Look, load, plot, plot_page, png, report_page
+from multidrop.look.health import delays, miss_shares, reasons_of
+from multidrop.look.values import MOST_PANELS, MOST_POINTS, thinned
+from multidrop.recording import open_writer
+from multidrop.recording.recorded import from_rows
+
+__all__ = ["run"]  # a fixture
+
+PNG = b"\x89PNG\r\n\x1a\n"
+FAULTS = {"NONE": 0, "OVERHEAT": 8, "OVERLOAD": 9}
+ABOUT: dict[str, Any] = {
+    "plant": "hall.toml",
+    "drives": {
+        "pump": {
+            "line": "hall-1",
+            "model": "invt-che",
+            "address": 1,
+            "settings": "9600 8N1",
+            "framing": "rtu",
+            "registers": {
+                "output_frequency": {"unit": "Hz", "step": 0.01},
+                "fault": {"unit": "", "step": 1, "values": FAULTS},
+            },
+        },
+        "fan": {"registers": {"output_current": {"unit": "A", "step": None}}},
+    },
+}
+REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
+
+
+def row(
+    second: float, drive: str, register: str, value: float | None, status: str = "ok", ms: float = 20.0
+) -> Row:
+    at = round(second * SECOND)
+    uncertainty = None if value is None else round(ms * 1e6)
+    return Row(UTC_0 + at, at, uncertainty, drive, register, value, status)
+
+
+def noisy_ramp() -> list[Row]:
+    """A pump that runs up for 100 s; from 30 Hz on every second value of its fault register is damaged."""
+    rows = []
+    for tick in range(1000):
+        second, hz = tick / 10, tick / 20
+        damaged = hz >= 30 and tick % 2
+        fault = 8 if 400 <= tick < 500 else 0
+        rows.append(row(second, "pump", "output_frequency", hz))
+        rows.append(
+            row(second, "pump", "fault", None, "bad checksum")
+            if damaged
+            else row(second, "pump", "fault", fault)
+        )
+        rows.append(row(second, "fan", "output_current", 5.0, ms=12.0 + tick % 10))
+    rows.append(row(100, "fan", "output_current", None, "no reply"))
+    return rows
+
+
+def record(path: Path, rows: list[Row], about: dict[str, Any] = ABOUT, pieces: int = 7) -> Path:
+    with open_writer(path, about) as writer:
+        for at in range(0, len(rows), len(rows) // pieces + 1):
+            writer.write(from_rows(rows[at : at + len(rows) // pieces + 1]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("ramp") / "ramp.arrows", noisy_ramp())
+
+
+@pytest.fixture(scope="module")
+def look(ramp: Path) -> Look:
+    return load(ramp)
+
+
+# ---- what is read ----
+
+
+def test_series_have_every_value_and_every_miss(look: Look) -> None:
+    assert [(it.drive, it.register, it.unit, len(it.time)) for it in look.series] == [
+        ("pump", "output_frequency", "Hz", 1000),
+        ("pump", "fault", "", 1000),
+        ("fan", "output_current", "raw count", 1001),
+    ]
+    frequency, fault, current = look.series
+    assert frequency.value.tolist() == [tick / 20 for tick in range(1000)]
+    assert not frequency.missed.any()
+    assert fault.missed.sum() == 200
+    assert fault.reasons() == {"bad checksum": 200}
+    assert current.reasons() == {"no reply": 1}
+    assert look.drives == ("pump", "fan")
+    assert look.seconds == 100
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
+def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
+    with open_writer(tmp_path / f"it{suffix}", METADATA) as writer:
+        writer.write(example())
+    it = load(tmp_path / f"it{suffix}")
+    assert [(series.drive, series.register) for series in it.series] == [
+        ("pump-1", "output_frequency"),
+        ("pump-1", "motor_speed"),
+        ('fan, the "old" one', "output_frequency"),
+        ("насос", "motor_speed"),
+        ('fan, the "old" one', "motor_speed"),
+    ]
+    assert it.series[0].value.tolist() == [49.99]
+    assert [dict(series.reasons()) for series in it.series[2:]] == [
+        {"exception 12": 1},
+        {"no reply": 1},
+        {"not asked: drive is silent": 1},
+    ]
+    assert png(plot(it)[0]).startswith(PNG)
+    assert "насос" in report_page(it)
+
+
+def test_a_fault_is_a_span_that_misses_do_not_end(look: Look) -> None:
+    (span,) = look.of("pump", "fault")[0].faults()
+    assert span.what == "OVERHEAT"
+    assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
+
+
+def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> None:
+    flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
+    about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "step": 1, "values": flags}}}}}
+    rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
+    (series,) = load(record(tmp_path / "it.arrows", rows, about)).series
+    assert [(it.what, it.end - it.begin) for it in series.faults()] == [
+        ("HIGH HOT", 2 * SECOND),
+        ("code 128", SECOND),
+    ]
+
+
+# ---- what is worked out ----
+
+
+def test_the_response_delay_is_without_the_request(look: Look) -> None:
+    pump, fan = delays(look)
+    assert pump.exact
+    assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
+    assert not fan.exact  # nothing tells its settings
+    assert fan.quantile(0.5) == pytest.approx(0.0165)
+    assert fan.quantile(1.0) == pytest.approx(0.021)
+
+
+def test_noise_that_comes_with_speed_is_seen(look: Look) -> None:
+    shares = miss_shares(look, "pump")
+    assert shares is not None
+    slow = shares[1][shares[0] < 28]
+    fast = shares[1][shares[0] > 32]
+    assert slow.max() == 0
+    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of one register of two
+    assert miss_shares(look, "fan") is None
+
+
+def test_misses_are_told_by_reason(look: Look) -> None:
+    assert reasons_of(look, "pump") == {"bad checksum": 200}
+    assert reasons_of(look, "fan") == {"no reply": 1}
+
+
+def test_thinning_keeps_every_extreme() -> None:
+    time = np.arange(1_000_000)
+    value = np.sin(time / 1e5)
+    value[123_456], value[777_777] = 9.0, -9.0
+    value[500_000:510_000] = np.nan
+    few, kept = thinned(time, value)
+    assert len(few) <= MOST_POINTS + 500
+    assert (np.nanmax(kept), np.nanmin(kept)) == (9.0, -9.0)
+    assert np.isnan(kept[(few >= 501_000) & (few < 509_000)]).all()
+    assert np.all(np.diff(few) > 0)
+
+
+# ---- pictures and pages ----
+
+
+def test_there_is_a_panel_for_every_quantity_and_unit(look: Look) -> None:
+    figure, left = plot(look)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["faults", "output_frequency, Hz", "output_current, raw count"]
+    assert left == []
+    assert png(figure).startswith(PNG)
+
+
+def test_drives_and_registers_can_be_chosen(look: Look) -> None:
+    figure, _ = plot(look, ["fan"])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["output_current, raw count"]
+    figure, _ = plot(look, [], ["output_frequency"])
+    assert "output_frequency, Hz" in [axes.get_title(loc="left") for axes in figure.axes]
+
+
+def test_what_has_no_room_is_named(tmp_path: Path) -> None:
+    rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    figure, left = plot(look)
+    assert len(figure.axes) == MOST_PANELS
+    assert left == [f"r{MOST_PANELS}", f"r{MOST_PANELS + 1}"]
+    assert plot(look, [], left)[1] == []
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(look: Look) -> None:
+    page = report_page(look)
+    assert page.startswith("<!DOCTYPE html>")
+    images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(images) == 4
+    assert all(base64.b64decode(image).startswith(PNG) for image in images)
+    assert "http" not in re.sub(r'src="data:[^"]+"', "", page)
+    for text in ("OVERHEAT", "bad checksum", "no reply", "invt-che", "9600 8N1 rtu", "Response delays"):
+        assert text in page
+    assert re.search(r"<td[^>]*>pump</td><td[^>]*>1000</td><td[^>]*>10\.6</td>", page)  # least delay, ms
+
+
+def test_names_cannot_break_the_page(tmp_path: Path) -> None:
+    rows = [row(at, "<script>&", "output_frequency", at) for at in range(3)]
+    look = load(record(tmp_path / "<b>.arrows", rows))
+    for page in (report_page(look), plot_page(look, plot(look)[0])):
+        assert "<script>" not in page
+        assert "<b>" not in page
+
+
+def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
+    page = report_page(load(record(tmp_path / "it.arrows", rows)))
+    assert "No drive ever answered." in page
+    assert "100.00%" in page
+
+
+def test_a_single_row_has_a_report(tmp_path: Path) -> None:
+    look = load(record(tmp_path / "it.arrows", [row(1, "pump", "output_frequency", 50.0)], pieces=1))
+    assert "Report on it.arrows" in report_page(look)
+
+
+# ---- the commands ----
+
+
+def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
+    here = tmp_path / "ramp.arrows"
+    here.write_bytes(ramp.read_bytes())
+    assert run("plot", here) == (0, f"{tmp_path}/ramp.png\n", "")
+    assert (tmp_path / "ramp.png").read_bytes().startswith(PNG)
+    assert run("report", here) == (0, f"{tmp_path}/ramp.html\n", "")
+    assert "Report on ramp.arrows" in (tmp_path / "ramp.html").read_text()
+    status, _, err = run("plot", here)
+    assert status == 2
+    assert "is there already" in err
+    assert run("plot", here, "--drive", "fan", "--out", tmp_path / "fan.html")[0] == 0
+    assert "data:image/png" in (tmp_path / "fan.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--drive", "punp"), "the recording has no drive 'punp'; it has pump, fan"),
+        (("--register", "speed"), "the recording has no register 'speed'; it has output_frequency, "),
+        (("--drive", "fan", "--register", "fault"), "has no register 'fault'; it has output_current"),
+        (("--out", "picture.jpg"), "picture.jpg: a plot's name ends in .png or .html"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    run: Run, ramp: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    out = () if "--out" in words else ("--out", tmp_path / "it.png")
+    status, text, err = run("plot", ramp, *words, *out)
+    assert (status, text) == (2, "")
+    assert sentence in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+    text = tmp_path / "letter.arrows"
+    text.write_text("Dear Sir")
+    assert "is not a recording" in run(command, text)[2]
+    empty = tmp_path / "empty.arrows"
+    with open_writer(empty, {}):
+        pass
+    status, _, err = run(command, empty)
+    assert status == 2
+    assert "holds no rows" in err
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_without_the_extra_it_is_named(
+    run: Run, ramp: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multidrop.cli.extra.importlib.util, "find_spec", lambda name: None)
+    status, _, err = run(command, ramp)
+    assert status == 2
+    assert "pip install 'multidrop[plot]'" in err
