@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from fractions import Fraction
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive, Read, Script, Wait
 from multidrop.register import COIL, Carrier, Register
+from multidrop.rules import conditions, raw_count
 
 
 def frame(drive: Drive, register: Register[Any], value: Any) -> str:
@@ -37,7 +38,8 @@ class Wire:
 
     `says` has a value for each register's name, or a list of them for one read after another (the
     last one stays); an exception is raised instead. `loses` has the exceptions of the first writes of
-    a frame. What is written is held, unless `says` has another value.
+    a frame, and `turns` what it says after a frame. What is written is held, unless `says` has another
+    value. The rules of registers hold as on a bus; what they look at is not counted in `reads`.
     """
 
     def __init__(
@@ -45,21 +47,32 @@ class Wire:
         drive: Drive,
         says: Mapping[str, Any] | None = None,
         loses: Mapping[str, Sequence[Exception]] | None = None,
+        turns: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         self.drive = drive
-        self.says = {name: it if isinstance(it, list) else [it] for name, it in (says or {}).items()}
+        self.says: dict[str, list[Any]] = {}
+        self.say(says or {})
+        self.turns = turns or {}
         self.loses = {text: list(it) for text, it in (loses or {}).items()}
+        self.held: dict[str, Any] = {}
         self.sent: list[str] = []
         self.reads: list[str] = []
         self.seconds = 0.0
         drive.perform = self.run
 
+    def say(self, says: Mapping[str, Any]) -> None:
+        """From now on."""
+        self.says |= {name: list(it) if isinstance(it, list) else [it] for name, it in says.items()}
+
     def run(self, script: Script[Any]) -> Any:
+        return self._run(script, self._step)
+
+    def _run(self, script: Script[Any], carry_out: Callable[[Any], Any]) -> Any:
         try:
             step = next(script)
             while True:
                 try:
-                    result = self._step(step)
+                    result = carry_out(step)
                 except Exception as failure:
                     step = script.throw(failure)
                 else:
@@ -75,15 +88,22 @@ class Wire:
             self.reads.append(step.register.name)
             assert step.register.readable
             return self._said(step.register)
-        step.register.encode(step.value)  # as a bus does, before anything is sent
-        assert step.register.writable
+        raw_count(self.drive, step.register, step.value)
+        self._run(
+            conditions(self.drive, step.register, step.value), lambda look: self.says[look.register.name][0]
+        )
         text = frame(self.drive, step.register, step.value)
         self.sent.append(text)
         if self.loses.get(text):
             raise self.loses[text].pop(0)
-        return self._said(step.register) if step.register.name in self.says else step.value
+        self.say(self.turns.get(text, {}))
+        if step.register.name not in self.says:
+            self.held[step.register.name] = step.value
+        return self._said(step.register)
 
     def _said(self, register: Register[Any]) -> Any:
+        if register.name in self.held:
+            return self.held[register.name]
         values = self.says[register.name]
         value = values.pop(0) if len(values) > 1 else values[0]
         if isinstance(value, Exception):

@@ -103,7 +103,7 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         ),
         (
             ["write", "/dev/ttyX", TOY, "1", "frequency", "60"],
-            "frequency = 60 is outside 0 to 50 Hz",
+            "toy@1: frequency = 60 is outside 0 to 50 Hz",
         ),
         (
             ["write", "/dev/ttyX", TOY, "1", "frequency", "fast"],
@@ -111,10 +111,22 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         ),
         (
             ["write", "/dev/ttyX", TOY, "1", "output_current", "1"],
-            "output_current is not written: it is a reading",
+            "output_current of toy@1 is not written: it is a reading",
         ),
-        (["write", "/dev/ttyX", TOY, "1", "sealed", "1"], "sealed is not written: it is the maker's"),
-        (["write", "/dev/ttyX", TOY, "1", "frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "sealed", "1"],
+            "sealed of toy@1 is not written: it is the maker's",
+        ),
+        (["write", "/dev/ttyX", TOY, "1", "frequency", "-5"], "toy@1: frequency = -5 is outside 0 to 50 Hz"),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "frequency", "5"],
+            "Write frequency = 5.00 Hz to toy@1 on /dev/ttyX? There is no terminal to ask on: "
+            "add --yes if it is meant",
+        ),
+        (
+            ["start", "/dev/ttyX", TOY, "1"],
+            "Start the motor of toy@1 on /dev/ttyX? There is no terminal to ask on: add --yes if it is meant",
+        ),
         (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
         (

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from test_cli import TOY, Run, run
@@ -99,37 +101,112 @@ def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str
     assert err == ""
 
 
-def test_write_prints_what_the_drive_then_holds(run: Run, port: str, toy: SimulatedDrive) -> None:
-    assert run("write", port, TOY, 1, "acceleration_time", "12.5") == (0, "acceleration_time = 12.5 s\n", "")
+def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: SimulatedDrive) -> None:
+    toy["status"] = Status(0)
+    assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes") == (
+        0,
+        "toy@1: acceleration_time = 12.5 s: done (read back)\n",
+        "",
+    )
     assert toy["acceleration_time"] == 12.5
-    assert run("write", port, TOY, 1, "control", "running|reverse") == (0, "control = RUNNING|REVERSE\n", "")
-    assert toy["control"] == 3
+    assert run("write", port, TOY, 1, "frequency", "25", "--yes") == (
+        0,
+        "toy@1: frequency = 25.00 Hz: done (cannot be read back)\n",
+        "",
+    )
+    assert toy["frequency"] == 25
+
+
+def test_what_changes_only_while_the_motor_stands_is_refused_while_it_runs(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
+    status, out, err = run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")
+    assert (status, out) == (2, "")
+    assert "acceleration_time of toy@1 is not written: it changes only while the motor stands" in err
+    assert toy["acceleration_time"] == 10.0
 
 
 def test_write_as_json(run: Run, port: str) -> None:
-    _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json")
-    assert json.loads(out) == {"drive": "toy@1", "register": "frequency", "value": 25.0, "unit": "Hz"}
+    _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json", "--yes")
+    assert json.loads(out) == {
+        "drive": "toy@1",
+        "register": "frequency",
+        "value": 25.0,
+        "unit": "Hz",
+        "outcome": "done",
+    }
 
 
 def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
-    assert run("write", port, TOY, 2, "acceleration_time", "30") == (
+    assert run("write", port, TOY, 2, "acceleration_time", "30", "--yes") == (
         1,
-        "acceleration_time = 20.0 s\n",
-        "multidrop: toy@2 holds 20.0 s, not 30.0 s as it was told\n",
+        "",
+        "toy@2: acceleration_time = 30.0 s: taken as 20.0 s\n",
     )
 
 
 def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None:
-    assert run("start", port, TOY, 1, "--direction", "reverse") == (
+    assert run("start", port, TOY, 1, "--direction", "reverse", "--yes") == (
         0,
         "toy@1: start done; state: running\n",
         "",
     )
     assert toy["control"] == 3
-    assert run("set-frequency", port, TOY, 1, "33.5")[0] == 0
+    assert run("set-frequency", port, TOY, 1, "33.5", "--yes")[0] == 0
     assert toy["frequency"] == 33.5
-    assert run("stop", port, TOY, 1)[0] == 0
+    assert run("stop", port, TOY, 1)[0] == 0  # is never asked for
     assert toy["control"] == 0
+
+
+def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
+    assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
+    assert [it.name for it in toy.counters.writes] == ["frequency", "control"]
+
+
+@pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
+def test_a_person_at_a_terminal_is_asked(
+    run: Run,
+    port: str,
+    toy: SimulatedDrive,
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    writes: int,
+) -> None:
+    terminal = io.StringIO(answer + "\n")
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stdin", terminal)
+    status, _, err = run("start", port, TOY, 1)
+    assert err.startswith(f"Start the motor of toy@1 on {port}? [y/N] ")
+    assert (status == 0) == bool(writes)
+    assert len(toy.counters.writes) == writes
+
+
+def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Path) -> None:
+    log = tmp_path / "audit.jsonl"
+    run("set-frequency", port, TOY, 1, 20, "--yes", "--audit", log)
+    run("start", port, TOY, 1, "--yes", "--audit", log)
+    run("stop", port, TOY, 1, "--audit", log)
+    records = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [(it["drive"], it["write"], it["sent"][:17], it["outcome"]) for it in records] == [
+        ("toy@1", "frequency = 20.00 Hz", "01 06 00 15 07 D0", "done"),
+        ("toy@1", "control = RUNNING", "01 06 00 14 00 01", "done"),
+        ("toy@1", "control = none", "01 06 00 14 00 00", "done"),
+    ]
+
+
+def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None:
+    status, out, _ = run("wear")
+    assert (status, out.endswith("no register that may be in EEPROM was written yet\n")) == (0, True)
+    toy["status"] = Status(0)
+    assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")[0] == 0
+    status, out, err = run("write", port, TOY, 1, "acceleration_time", "13", "--yes")
+    assert (status, out) == (2, "")
+    assert "is written once in 60 s at most" in err
+    head, row, *_ = run("wear")[1].splitlines()
+    assert head.split() == ["PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS", "YEAR", "LEFT", "LAST"]
+    assert row.split()[:7] == [port, "1", "toy", "acceleration_time", "1", "1", "999"]
+    (wear,) = json.loads(run("wear", "--json")[1])
+    assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
 
 
 def test_nothing_but_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
@@ -139,7 +216,8 @@ def test_nothing_but_start_writes_to_a_drive(run: Run, port: str, toy: Simulated
 
 
 def test_state_in_words_and_as_json(run: Run, port: str) -> None:
-    assert run("state", port, TOY, 1) == (0, "running\n", "")
+    dog = "watchdog: The document names no watchdog: the motor runs on when the master dies."
+    assert run("state", port, TOY, 1) == (0, f"running\n{dog}\n", "")
     _, out, _ = run("state", port, TOY, 1, "--json")
     assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}
 

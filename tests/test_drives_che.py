@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 from scripts import Wire, rows, typed
 
-from multidrop.drive import Condition, Direction, DriveRefused, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    DriveRefused,
+    NotDone,
+    Refused,
+    State,
+    Unconfirmed,
+    Unsupported,
+)
 from multidrop.drives.invt_che import CommunicationFault, Control, Fault, InvtCHE, Status, parameter
 from multidrop.register import HOLDING, Kept
 from multidrop.register import Wire as Lie
@@ -17,7 +26,13 @@ RESET = "01 06 10 00 00 07 CC C8"
 HALF = "01 06 20 00 13 88 8F 5C"
 ZERO = "01 06 20 00 00 00 82 0A"
 
-STANDBY = {"status": Status.STANDBY, "fault": Fault.NONE}
+STANDBY = {"status": Status.STANDBY, "fault": Fault.NONE, "setpoint": 40.0}
+
+TURNS = {
+    FORWARD: {"status": Status.FORWARD},
+    "01 06 10 00 00 02 0C CB": {"status": Status.REVERSE},
+    RESET: {"status": Status.STANDBY},
+}
 
 TABLE = """
 03/06 1000 control                - Control
@@ -80,7 +95,7 @@ def test_the_line_and_its_limits() -> None:
 
 
 def test_start() -> None:
-    wire = Wire(InvtCHE(1), STANDBY)
+    wire = Wire(InvtCHE(1), STANDBY, turns=TURNS)
     wire.drive.start(Direction.FORWARD)
     wire.drive.start()
     assert wire.sent == [FORWARD, FORWARD]
@@ -89,7 +104,7 @@ def test_start() -> None:
 
 
 def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
-    wire = Wire(InvtCHE(1), {"status": Status.REVERSE})
+    wire = Wire(InvtCHE(1), {"status": Status.REVERSE, "setpoint": 40.0})
     wire.drive.start()
     wire.drive.jog()
     assert [it[:17] for it in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
@@ -130,6 +145,31 @@ def test_coast_and_reset() -> None:
     assert wire.sent == [RESET]
 
 
+def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
+    says = {**STANDBY, "status": Status.FAULT, "fault": Fault.OC1_OVERCURRENT_ACCELERATING}
+    wire = Wire(InvtCHE(1), says, turns=TURNS)
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match=r"OC1.*reset_fault"):
+            verb()
+    assert wire.sent == []
+    wire.drive.reset_fault()
+    assert wire.sent == [RESET]
+    stubborn = Wire(InvtCHE(1), says)
+    with pytest.raises(NotDone, match="OC1"):
+        stubborn.drive.reset_fault()
+    assert stubborn.sent == [RESET]
+    with pytest.raises(Refused, match="runs"):
+        Wire(InvtCHE(1), {"status": Status.FORWARD}).drive.reset_fault()
+
+
+def test_a_trip_while_starting_is_told() -> None:
+    tripped = {"status": Status.FAULT, "fault": Fault.OC1_OVERCURRENT_ACCELERATING}
+    wire = Wire(InvtCHE(1), STANDBY, turns={FORWARD: tripped})
+    with pytest.raises(NotDone, match="tripped: OC1"):
+        wire.drive.start()
+    assert wire.sent == [FORWARD]
+
+
 def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
     wire = Wire(InvtCHE(1, maximum_frequency=80))
     wire.drive.set_frequency(40)
@@ -138,8 +178,9 @@ def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
     for wrong in (-0.1, 80.1, float("nan")):
         with pytest.raises(ValueError, match="0 to 80 Hz"):
             wire.drive.set_frequency(wrong)
+    wire.held.clear()
     wire.says["setpoint"] = [30.0]
-    with pytest.raises(Unconfirmed, match=r"30\.00 %"):
+    with pytest.raises(NotDone, match=r"30\.00 %"):
         wire.drive.set_frequency(40)
     with pytest.raises(Refused, match="maximum_frequency"):
         Wire(InvtCHE(1)).drive.set_frequency(40)

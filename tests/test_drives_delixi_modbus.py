@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from scripts import Wire, rows, typed
+from scripts import Wire, frame, rows, typed
 
-from multidrop.drive import Condition, Direction, Framing, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
 from multidrop.drives.delixi_modbus import Control, DelixiModbus
-from multidrop.drives.delixi_parameters import Fault
+from multidrop.drives.delixi_parameters import Baudrate, Fault, RunSource
 from multidrop.register import Kept
 
 FORWARD = {Framing.RTU: "01 06 20 00 00 12 02 07", Framing.ASCII: ":010620000012C7"}  # printed
@@ -15,7 +15,19 @@ FIFTY = {Framing.RTU: "01 06 00 02 13 88 25 5C", Framing.ASCII: ":0106000213885C
 STOP = {Framing.RTU: "01 06 20 00 00 01 43 CA", Framing.ASCII: ":010620000001D8"}
 REVERSE = {Framing.RTU: "01 06 20 00 00 22 02 13", Framing.ASCII: ":010620000022B7"}
 
-STANDING = {"output_frequency": 0.0, "fault": Fault.NONE}
+STANDING = {
+    "output_frequency": 0.0,
+    "fault": Fault.NONE,
+    "run_source": RunSource.LINE,
+    "frequency_source": 1,
+    "frequency": 50.0,
+    "address_setting": 1,
+    "baudrate_setting": Baudrate.B9600,
+}
+TURNING = {"output_frequency": 12.0}
+TURNS = {it: TURNING for frames in (FORWARD, REVERSE) for it in frames.values()} | {
+    it: {"output_frequency": 0.0} for it in STOP.values()
+}
 
 MONITORS = """
 01F4 output_frequency     0.01 Hz
@@ -91,7 +103,7 @@ def test_faults() -> None:
 
 @pytest.mark.parametrize("framing", DelixiModbus.framings)
 def test_commands(framing: Framing) -> None:
-    wire = Wire(DelixiModbus(1, framing=framing), STANDING)
+    wire = Wire(DelixiModbus(1, framing=framing), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
@@ -102,14 +114,15 @@ def test_commands(framing: Framing) -> None:
 
 
 def test_jog_has_its_direction_too() -> None:
-    wire = Wire(DelixiModbus(1), STANDING)
+    jog = frame(DelixiModbus(1), DelixiModbus.control, Control.JOG_FORWARD)
+    wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING})
     wire.drive.jog()
     wire.drive.jog(Direction.REVERSE)
     assert [it[:17] for it in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
 
 
 def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:
-    wire = Wire(DelixiModbus(1), {"output_frequency": 12.0})
+    wire = Wire(DelixiModbus(1), {**STANDING, **TURNING})
     with pytest.raises(Refused, match="name the direction"):
         wire.drive.start()
     assert wire.sent == []
@@ -131,7 +144,7 @@ def test_the_only_setpoint_wears_the_eeprom() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})
-    with pytest.raises(Unconfirmed, match=r"holds 40\.00 Hz"):
+    with pytest.raises(NotDone, match=r"holds 40\.00 Hz"):
         wire.drive.set_frequency(50)
 
 
@@ -153,8 +166,29 @@ def test_at_rest_the_state_is_unknown() -> None:
 
 def test_identify() -> None:
     Wire(DelixiModbus(1), STANDING).drive.identify()
-    with pytest.raises(Refused, match="0063H"):
-        Wire(DelixiModbus(1), {"fault": 99}).drive.identify()
+    for name, other, sentence in (
+        ("fault", 99, "0063H"),
+        ("address_setting", 2, r"P04\.30"),
+        ("baudrate_setting", Baudrate.B1200, r"P04\.28"),
+    ):
+        with pytest.raises(Refused, match=sentence):
+            Wire(DelixiModbus(1), {**STANDING, name: other}).drive.identify()
+
+
+@pytest.mark.parametrize(
+    ("name", "held", "sentence"),
+    [
+        ("run_source", RunSource.KEYPAD, r"P00\.00 must be 2"),
+        ("frequency_source", 0, r"P00\.01"),
+        ("fault", Fault.OH_OVERHEAT, "OH_OVERHEAT"),
+        ("frequency", 0.0, "set_frequency"),
+    ],
+)
+def test_start_is_refused(name: str, held: float, sentence: str) -> None:
+    wire = Wire(DelixiModbus(1), {**STANDING, name: held})
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == []
 
 
 @pytest.mark.parametrize("name", ["coast", "emergency_stop", "reset_fault"])

@@ -6,9 +6,9 @@ import pytest
 from scripts import Wire, frame, rows, typed
 from test_drives_delixi_modbus import MONITORS
 
-from multidrop.drive import Condition, Direction, Framing, State, Unconfirmed, Unsupported
+from multidrop.drive import Condition, Direction, Framing, Refused, State, Unconfirmed, Unsupported
 from multidrop.drives.delixi_native import PARAMETER_RAM, DelixiNative, Status
-from multidrop.drives.delixi_parameters import Fault, parameter
+from multidrop.drives.delixi_parameters import Baudrate, Fault, RunSource, parameter
 from multidrop.errors import NoReply
 from multidrop.register import Carrier, Kept, setting
 
@@ -19,7 +19,19 @@ STOP = ":010200010000000004"
 REVERSE = ":010200030000000006"
 RESET = ":010200040000000007"
 
-STANDING = {"status": Status.STOPPED, "output_frequency": 0.0}
+STANDING = {
+    "status": Status.STOPPED,
+    "output_frequency": 0.0,
+    "fault": Fault.NONE,
+    "run_source": RunSource.LINE,
+    "address_setting": 1,
+    "baudrate_setting": Baudrate.B9600,
+}
+TURNS = {
+    FORWARD: {"status": Status.FORWARD, "output_frequency": 9.0},
+    REVERSE: {"status": Status.REVERSE, "output_frequency": 9.0},
+    STOP: {"status": Status.STOPPED, "output_frequency": 0.0},
+}
 
 TABLE = """
 00/02 0000 control             - Control
@@ -54,20 +66,28 @@ def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
 
 
 def test_commands() -> None:
-    wire = Wire(DelixiNative(1), STANDING)
+    wire = Wire(DelixiNative(1), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.REVERSE)
-    wire.drive.reset_fault()
     wire.drive.stop()
-    assert wire.sent == [FIFTY, FORWARD, REVERSE, RESET, STOP]
+    wire.drive.reset_fault()
+    assert wire.sent == [FIFTY, FORWARD, REVERSE, STOP, RESET]
 
 
 def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
-    wire = Wire(DelixiNative(1), {"status": Status.REVERSE})
+    wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]})
+    wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
-    assert wire.sent == [REVERSE, FORWARD]
+    assert wire.sent == [FIFTY, REVERSE, FORWARD]
+
+
+def test_start_without_a_known_setpoint_is_refused() -> None:
+    wire = Wire(DelixiNative(1), STANDING)
+    with pytest.raises(Refused, match="set_frequency"):
+        wire.drive.start()
+    assert wire.sent == []
 
 
 def test_the_stored_setpoint() -> None:
@@ -136,9 +156,11 @@ def test_state(says: dict[str, object], state: State) -> None:
 def test_identify_is_a_read() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     wire.drive.identify()
-    assert (wire.reads, wire.sent) == (["output_frequency"], [])
+    assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
     with pytest.raises(NoReply):
-        Wire(DelixiNative(1), {"output_frequency": NoReply("drive")}).drive.identify()
+        Wire(DelixiNative(1), {"address_setting": NoReply("drive")}).drive.identify()
+    with pytest.raises(Refused, match=r"P04\.30"):
+        Wire(DelixiNative(2), STANDING).drive.identify()
 
 
 def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:

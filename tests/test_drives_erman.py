@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scripts import Wire, frame, rows, typed
 
-from multidrop.drive import Condition, Direction, DriveRefused, Refused, Unconfirmed, Unsupported
+from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 from multidrop.drives.erman_er_g_220 import Coil, ErmanERG220, Fault, Modes, Status
 from multidrop.errors import NoReply
 from multidrop.register import HOLDING, INPUT, Kept
@@ -21,11 +21,14 @@ RESET_OFF = "01 05 00 09 00 00 1D C8"
 FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the right address
 
 STOPPED = {
+    "frequency": 25.0,
     "status": Status.STOPPED,
     "output_frequency": 0.0,
     "last_fault": Fault(0),
     "deceleration_time": 10.0,
 }
+
+TURNS = {START_ON: {"status": Status.ACCELERATING}, STOP_ON: {"status": Status.STOPPED}}
 
 TABLE = """
 01/05 0000 start_coil                - Coil
@@ -85,13 +88,13 @@ def test_0001h_is_read_and_never_written() -> None:
 
 
 def test_start_clears_both_stops_and_leaves_the_setpoint_alone() -> None:
-    wire = Wire(ErmanERG220(1), STOPPED)
+    wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     wire.drive.start()
     assert wire.sent == [STOP_OFF, frame(wire.drive, ErmanERG220.emergency_stop_coil, Coil.OFF), START_ON]
 
 
 def test_there_is_no_reverse() -> None:
-    wire = Wire(ErmanERG220(1), STOPPED)
+    wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     with pytest.raises(Unsupported, match="reverse"):
         wire.drive.start(Direction.REVERSE)
     assert wire.sent == []
@@ -100,7 +103,7 @@ def test_there_is_no_reverse() -> None:
 
 
 def test_start_is_refused_while_a_fault_may_stand() -> None:
-    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": Fault.OVERHEAT})
+    wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": Fault.OVERHEAT}, turns=TURNS)
     with pytest.raises(Refused, match=r"OVERHEAT.*reset_fault.*acknowledged_fault=64"):
         wire.drive.start()
     assert wire.sent == []
@@ -114,7 +117,7 @@ def test_start_is_refused_while_a_fault_may_stand() -> None:
 
 
 def test_a_fault_that_its_owner_has_dealt_with() -> None:
-    wire = Wire(ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": Fault.OVERHEAT})
+    wire = Wire(ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": Fault.OVERHEAT}, turns=TURNS)
     wire.drive.start()
     assert wire.sent[-1] == START_ON
 
@@ -158,6 +161,28 @@ def test_start_is_sent_once() -> None:
     assert wire.sent.count(START_ON) == 1
 
 
+def test_start_needs_a_setpoint_that_is_still_there() -> None:
+    wire = Wire(
+        ErmanERG220(1), {**STOPPED, "frequency": 0.0, "maximum_frequency": 50.0, "minimum_frequency": 0.0}
+    )
+    with pytest.raises(Refused, match="set_frequency"):
+        wire.drive.start()
+    del wire.says["frequency"]
+    wire.drive.set_frequency(20)
+    wire.held["frequency"] = 30.0
+    sent = list(wire.sent)
+    with pytest.raises(Refused, match=r"holds 30\.0 Hz and not 20\.0 Hz"):
+        wire.drive.start()
+    assert wire.sent == sent
+
+
+def test_a_start_that_has_no_effect_is_unconfirmed_and_says_what_to_set() -> None:
+    wire = Wire(ErmanERG220(1), STOPPED)
+    with pytest.raises(Unconfirmed, match=r"not seen to run; b\.001 must be 2"):
+        wire.drive.start()
+    assert wire.sent.count(START_ON) == 1
+
+
 def test_emergency_stop() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.emergency_stop()
@@ -182,16 +207,19 @@ def test_reset_cannot_start_and_leaves_its_coil_off() -> None:
 
 
 def test_the_setpoint_is_0002h_and_below_the_maximum() -> None:
-    wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0})
+    wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0, "minimum_frequency": 5.0})
     wire.drive.set_frequency(28.5)
     assert wire.sent == [FREQUENCY_28_5]
-    with pytest.raises(ValueError, match=r"50\.1 Hz is above .* 50 Hz"):
+    with pytest.raises(Refused, match=r"50\.1 Hz is above maximum_frequency, which is 50 Hz .*b\.007"):
         wire.drive.set_frequency(50.1)
+    with pytest.raises(Refused, match=r"4\.9 Hz is below minimum_frequency, which is 5 Hz"):
+        wire.drive.set_frequency(4.9)
     with pytest.raises(ValueError, match="frequency"):
         wire.drive.set_frequency(-1)
     assert wire.sent == [FREQUENCY_28_5]
+    del wire.held["frequency"]
     wire.says["frequency"] = [20.0]
-    with pytest.raises(Unconfirmed, match=r"the drive holds 20\.0 Hz"):
+    with pytest.raises(NotDone, match=r"the drive holds 20\.0 Hz"):
         wire.drive.set_frequency(28.5)
 
 

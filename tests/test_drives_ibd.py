@@ -6,7 +6,16 @@ import pytest
 from scripts import Wire, rows, typed
 
 from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
-from multidrop.drives.innovert_ibd import Control, InnovertIBD, Output, Terminals, parameter
+from multidrop.drives.innovert_ibd import (
+    Baudrate,
+    Control,
+    FrequencySource,
+    InnovertIBD,
+    Output,
+    RunSource,
+    Terminals,
+    parameter,
+)
 from multidrop.register import HOLDING
 
 RUN = {Framing.RTU: "01 06 20 00 00 02 03 CB", Framing.ASCII: ":010620000002D7"}
@@ -15,12 +24,17 @@ FIFTY = {Framing.RTU: "01 06 20 01 13 88 DE 9C", Framing.ASCII: ":0106200113883D
 RESET = "01 06 20 00 00 10 83 C6"
 ZERO = "01 06 20 01 00 00 D3 CA"
 
-STANDING = {"motor_speed": 0.0, "output_current": 0.0, "deceleration_time": 8.0, "output_m01": 0}
+BY_LINE = {"frequency_source": FrequencySource.LINE, "run_source": RunSource.LINE}
+STANDING = {"motor_speed": 0.0, "output_current": 0.0, "deceleration_time": 8.0, "output_m01": 0, **BY_LINE}
 PROGRAMMED = {
     "output_m01": Output.RUNNING,
     "output_m02": Output.ACCELERATING,
     "output_yabc": Output.DECELERATING,
     "output_virtual": Output.FAULT,
+}
+
+TURNS = {it: {"output_current": 1.2} for it in RUN.values()} | {
+    it: {"output_current": 0.0} for it in STOP.values()
 }
 
 TABLE = """
@@ -67,8 +81,8 @@ def test_the_line_and_its_limits() -> None:
     assert InnovertIBD(1).exception(2) == "a code that the document does not explain"
 
 
-def test_the_words_have_no_direction_no_toggle_and_no_reserved_bit() -> None:
-    assert {it.value for it in Control} == {0, 1, 2, 3, 0x10}
+def test_the_words_have_no_toggle_and_no_reserved_bit() -> None:
+    assert {it.value for it in Control} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
 
 
 def test_terminals() -> None:
@@ -77,7 +91,7 @@ def test_terminals() -> None:
 
 @pytest.mark.parametrize("framing", InnovertIBD.framings)
 def test_printed_commands(framing: Framing) -> None:
-    wire = Wire(InnovertIBD(1, framing=framing), STANDING)
+    wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.stop()
@@ -100,10 +114,50 @@ def test_a_direction_is_refused(direction: Direction) -> None:
     assert wire.sent == []
 
 
+@pytest.mark.parametrize(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
+def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reverse: str) -> None:
+    says = {**STANDING, "terminals": Terminals(0), "output_current": 0.4}
+    wire = Wire(InnovertIBD(1, forward_bit=forward_bit), says)
+    wire.drive.set_frequency(50)
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)
+    wire.drive.start()
+    assert [it[:17] for it in wire.sent[1:]] == [f"01 06 20 00 00 {it}" for it in (forward, reverse, "02")]
+
+
 def test_jog() -> None:
-    wire = Wire(InnovertIBD(1))
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), "output_current": 0.4})
     wire.drive.jog()
     assert [it[:17] for it in wire.sent] == ["01 06 20 00 00 03"]
+
+
+@pytest.mark.parametrize(
+    ("says", "sentence"),
+    [
+        ({"frequency_source": FrequencySource.PARAMETER}, r"Prb\.01 to 5"),
+        ({"run_source": 1}, r"Prb\.02 to 2"),
+        ({**PROGRAMMED, "terminals": Terminals.VIRTUAL}, "fault"),
+        ({}, "set_frequency"),
+    ],
+)
+def test_start_is_refused(says: dict[str, object], sentence: str) -> None:
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+def test_identity_is_its_own_address_or_its_owner_s_word() -> None:
+    says = {"baudrate_setting": Baudrate.B9600, "address_setting": 1}
+    Wire(InnovertIBD(1), says).drive.identify()
+    for other in (
+        {"address_setting": 0},
+        {"baudrate_setting": 3},
+        {"address_setting": DriveRefused("it", 2, "")},
+    ):
+        with pytest.raises(Refused, match="confirmed = 1"):
+            Wire(InnovertIBD(1), {**says, **other}).drive.identify()
+        Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
 def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
@@ -128,7 +182,7 @@ def test_stop_goes_by_the_outputs_where_they_are_programmed() -> None:
 
 def test_the_setpoint_is_limited_by_the_owner() -> None:
     wire = Wire(InnovertIBD(1, maximum_frequency=50))
-    with pytest.raises(ValueError, match="0 to 50 Hz"):
+    with pytest.raises(Refused, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
         wire.drive.set_frequency(50.5)
     with pytest.raises(ValueError, match="0 to 400 Hz"):
         Wire(InnovertIBD(1)).drive.set_frequency(400.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scripts import Wire, frame, rows, typed
 
-from multidrop.drive import Condition, Direction, DriveRefused, Refused, State, Unconfirmed
+from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
 from multidrop.drives.yd1000 import YD1000, Control, Inputs, Outputs, Status
 from multidrop.register import Kept
 
@@ -20,8 +20,15 @@ STANDING = {
     "fault_record_1": 0.0,
     "maximum_frequency": 80.0,
 }
+AT_30_HZ = {**STANDING, "frequency": 30.0}
 
 # address, name, step and unit; default; changeable while running
+TURNS = {
+    FORWARD: {"output_frequency": 12.0, "status": Status.RUN},
+    REVERSE: {"output_frequency": 12.0, "status": Status.RUN | Status.REVERSE},
+    STOP: {"output_frequency": 0.0, "status": Status(0)},
+}
+
 PARAMETERS = """
 0000 automatic_ramp            1            0    Y
 0001 automatic_torque_boost    1            0    N
@@ -190,7 +197,7 @@ def test_words_without_bit_14(word: Control, printed: str) -> None:
 
 
 def test_start() -> None:
-    wire = Wire(YD1000(1), STANDING)
+    wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
     wire.drive.start(Direction.REVERSE)
@@ -198,13 +205,14 @@ def test_start() -> None:
 
 
 def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
-    wire = Wire(YD1000(1), {"output_frequency": 20.0, "status": Status.RUN | Status.REVERSE})
+    wire = Wire(YD1000(1), {**AT_30_HZ, **TURNS[REVERSE]})
     wire.drive.start()
     assert wire.sent == [REVERSE]
 
 
 def test_jog_leaves_the_run_bit_off() -> None:
-    wire = Wire(YD1000(1), STANDING)
+    jogs = [frame(YD1000(1), YD1000.control, Control(word)) for word in (0xC100, 0xC300)]
+    wire = Wire(YD1000(1), STANDING, turns=dict.fromkeys(jogs, TURNS[FORWARD]))
     wire.drive.jog()
     wire.drive.jog(Direction.REVERSE)
     assert [it[:17] for it in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
@@ -222,7 +230,7 @@ def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
 
 
 def test_nothing_releases_the_command() -> None:
-    wire = Wire(YD1000(1), STANDING)
+    wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     for verb in (
         wire.drive.start,
         wire.drive.stop,
@@ -268,10 +276,11 @@ def test_the_setpoint() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.set_frequency(80)
     assert wire.sent == [EIGHTY]
-    with pytest.raises(ValueError, match=r"80\.5 Hz is above"):
+    with pytest.raises(Refused, match=r"80\.50 Hz is above maximum_frequency, which is 80 Hz"):
         wire.drive.set_frequency(80.5)
+    wire.held.clear()
     wire.says["frequency"] = [60.0]
-    with pytest.raises(Unconfirmed, match=r"60\.00 Hz"):
+    with pytest.raises(NotDone, match=r"60\.00 Hz"):
         wire.drive.set_frequency(80)
 
 

@@ -84,9 +84,9 @@ def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
 def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
-        device = bus.attach(Device, ADDRESS, framing=framing)
+        device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS, framing=framing)
         with pytest.raises(DriveRefused, match="illegal address") as refusal:
-            bus.read(device, find_model(DEVICE.replace("Device", "Mistaken")).register("absent"))
+            bus.read(device, device.register("absent"))
         assert refusal.value.code == 2
 
 
@@ -103,7 +103,7 @@ def test_the_command_line_reads_and_writes_it_too(
 ) -> None:
     port, framing = server
     where = [port, DEVICE, str(ADDRESS), "--framing", framing]
-    assert main(["write", *where, "frequency", "31.4"]) == 0
+    assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0
     assert main(["read", *where, "frequency", "current"]) == 0
     shown = capsys.readouterr().out
     assert "frequency = 31.40 Hz" in shown

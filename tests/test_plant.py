@@ -264,7 +264,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             HEAD + FIXED + "rated_frequency = 50",
             'line "L", drive "F": unknown key \'rated_frequency\'; '
-            "the keys here are name, model, address, framing, baudrate, format, every, poll",
+            "the keys here are name, model, address, framing, baudrate, format, ram, every, poll",
         ),
         (
             HEAD + '[[line.drive]]\nname = "M"\nmodel = "family.py:Mute"\naddress = 1',
@@ -335,3 +335,28 @@ def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
 def test_what_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a duration above 0, such as"):
         parse_duration(text)
+
+
+def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        """
+        [[line]]
+        name = "hall-1"
+        port = "/dev/ttyUSB0"
+        [[line.drive]]
+        name = "pump-1"
+        model = "innovert-ibd"
+        address = 1
+        confirmed = 1
+        ram = ["acceleration_time"]
+        """
+    )
+    (drive,) = (it.drive for it in load_plant(path).lines[0].drives)
+    assert (drive.ram, drive.option) == ({"acceleration_time"}, {"confirmed": 1})
+    path.write_text(path.read_text().replace("acceleration_time", "acceleration"))
+    with pytest.raises(PlantError, match="did you mean acceleration_time"):
+        load_plant(path)
+    path.write_text(path.read_text().replace('["acceleration"]', "[3]"))
+    with pytest.raises(PlantError, match="ram takes names of registers, not 3"):
+        load_plant(path)

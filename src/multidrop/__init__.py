@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from multidrop.audit import read_audit as read_audit
     from multidrop.batch import Batch as Batch
     from multidrop.bus import Bus as Bus
     from multidrop.drive import Condition as Condition
@@ -22,11 +23,18 @@ if TYPE_CHECKING:
     from multidrop.errors import BadReply as BadReply
     from multidrop.errors import BusError as BusError
     from multidrop.errors import DriveRefused as DriveRefused
+    from multidrop.errors import Expired as Expired
     from multidrop.errors import LineError as LineError
     from multidrop.errors import NoReply as NoReply
+    from multidrop.errors import NotDone as NotDone
     from multidrop.errors import Refused as Refused
     from multidrop.errors import Unconfirmed as Unconfirmed
     from multidrop.errors import Unsupported as Unsupported
+    from multidrop.ledger import Ledger as Ledger
+    from multidrop.motion import ramp as ramp
+    from multidrop.motion import start_staggered as start_staggered
+    from multidrop.outcome import Effect as Effect
+    from multidrop.outcome import Outcome as Outcome
     from multidrop.plant import Plant as Plant
     from multidrop.plant import PlantError as PlantError
     from multidrop.plant import load_plant as load_plant
@@ -41,6 +49,7 @@ if TYPE_CHECKING:
 
 # Every public name and the module that it comes from, which is loaded when the name is first used.
 _HOMES = {
+    "audit": ("read_audit",),
     "batch": ("Batch",),
     "bus": ("Bus",),
     "drive": ("Condition", "Direction", "Drive", "State", "verb"),
@@ -49,12 +58,17 @@ _HOMES = {
         "BadReply",
         "BusError",
         "DriveRefused",
+        "Expired",
         "LineError",
         "NoReply",
+        "NotDone",
         "Refused",
         "Unconfirmed",
         "Unsupported",
     ),
+    "ledger": ("Ledger",),
+    "motion": ("ramp", "start_staggered"),
+    "outcome": ("Effect", "Outcome"),
     "plant": ("Plant", "PlantError", "load_plant"),
     "poller": ("Poller",),
     "recording": ("convert", "open_reader", "open_writer"),

@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from multidrop import core
-from multidrop.core import Completion, Exchange, Message, Respondent, Result, raw_value
-from multidrop.drive import Drive, Read, Script, Step, Wait
-from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
+from multidrop.audit import AuditLog
+from multidrop.core import Message, Respondent
+from multidrop.drive import Drive, Read, Script, State, Step, Wait, Write, carry_out
+from multidrop.errors import BusError, DriveRefused, Refused
+from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
+from multidrop.ledger import Ledger
 from multidrop.line import Line, now_ns, sleep
-from multidrop.plan import Block, blocks, write_request
-from multidrop.register import Kept, Register
+from multidrop.outcome import Outcome
+from multidrop.parting import Parting
+from multidrop.register import Register
+from multidrop.rules import check_own, check_plain, raw_count
+from multidrop.stopping import Stopped, stop_together
+from multidrop.writing import Writer
+
+__all__ = ["LEAST_TIMEOUT", "READ_ATTEMPTS", "Bus", "exchange"]
 
 D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)
-
-READ_ATTEMPTS = 3
-LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
-
-
-def exchange(
-    drive: Drive, request: Message, respondent: Respondent, block: core.Block | None = None
-) -> Exchange:
-    """What the core needs to carry out a request to this drive."""
-    settings = drive.settings
-    return Exchange(
-        drive.framing,
-        request,
-        respondent,
-        baudrate=settings.baudrate,
-        format=settings.format,
-        character=settings.character,
-        # One bit more: the other side may still be sending its second stop bit.
-        silence=drive.needed_silence() + settings.bit,
-        turnaround=drive.turnaround_delay,
-        block=block,
-    )
 
 
 class Bus:
@@ -45,15 +33,31 @@ class Bus:
 
     `port` is a device such as /dev/ttyUSB0 or any pyserial URL; `baudrate` and `format` replace the
     families' defaults for drives that are attached without their own. Raises LineError when the
-    port cannot be opened. Leaving the `with` block closes the port and sends nothing.
+    port cannot be opened. Writes that may wear an EEPROM are counted in `ledger`, a file that all
+    processes share, and all writes are noted in the file `audit`. A write whose turn does not come
+    within `expiry` seconds is not sent. Leaving the `with` block closes the port and sends nothing,
+    unless `stop_on_exit` was called.
     """
 
-    def __init__(self, port: str, *, baudrate: int | None = None, format: str | None = None) -> None:
+    def __init__(
+        self,
+        port: str,
+        *,
+        baudrate: int | None = None,
+        format: str | None = None,
+        ledger: Ledger | Path | str | None = None,
+        audit: Path | str | None = None,
+        expiry: float = 1.0,
+    ) -> None:
         self.baudrate = baudrate
         self.format = format
         self.drives: list[Drive] = []
+        log = AuditLog(audit) if audit else None
         self.line = Line(port)
-        self._respondents: dict[Drive, Respondent] = {}
+        self._exchanges = Exchanges(self.line)
+        book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
+        self._writer = Writer(self._exchanges, book, log, expiry)
+        self._parting: Parting | None = None
 
     def __enter__(self) -> Bus:
         return self
@@ -67,7 +71,10 @@ class Bus:
         self.close()
 
     def close(self) -> None:
+        if self._parting is not None:
+            self._parting.now()
         self.line.close()
+        self._writer.close()
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
         """Put a drive on the bus: a family with address, name and so on, or a drive made before.
@@ -83,10 +90,8 @@ class Bus:
             if other.address == drive.address:
                 raise ValueError(f"address {drive.address} is taken by {other.name}")
         drive.perform = lambda script: self.perform(drive, script)
-        self._respondents[drive] = Respondent(
-            least_timeout=min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay)),
-            most_timeout=drive.response_timeout,
-        )
+        drive.introduce = lambda: self.introduce(drive)
+        self._exchanges.add(drive)
         self.drives.append(drive)
         return drive
 
@@ -102,131 +107,135 @@ class Bus:
     def read_many(self, drive: Drive, registers: Iterable[Register[Any]]) -> dict[str, Any]:
         """Values by register name, in as few exchanges as the family allows; raises as `read` does."""
         registers = list(registers)
-        raw: dict[str, Any] = {}
-        for block in blocks(drive, registers):
-            reply = self._ask(drive, block)
-            for register in block.registers:
-                raw[register.name] = register.decode(
-                    raw_value(reply.data, block.offset(register), register.wire)
-                )
-        return {register.name: raw[register.name] for register in registers}
-
-    def _ask(self, drive: Drive, block: Block) -> Message:
-        for attempt in range(READ_ATTEMPTS):
-            try:
-                return self._reply(drive, self._carry_out(drive, block.request(drive.address)))
-            except (NoReply, BadReply):
-                if attempt == READ_ATTEMPTS - 1:
-                    raise
-        raise AssertionError("unreachable")
+        for register in registers:
+            check_own(drive, register)
+        return self._exchanges.values(drive, registers, READ_ATTEMPTS)
 
     # ---- writing ----
 
     def write(self, drive: Drive, register: Register[T], value: T) -> T:
         """Write a value and return what the drive then holds, where that can be read, else `value`.
 
-        Sent once. A register kept in EEPROM is not written when it holds the value already.
-        Raises ValueError or TypeError for a value that the register does not take, Refused for what
-        the library never sends, DriveRefused when the drive says no, and Unconfirmed when its
-        answer is lost and the write may have happened.
+        Sent once; not at all where a register that may be in EEPROM holds the value already, nor when
+        its turn does not come within `expiry` seconds. Before the first write to a drive it is looked
+        at, whether it is of its family. Raises Refused (also a ValueError) for what the library does
+        not send, TypeError for what is no value, Expired, DriveRefused when the drive says no, and
+        Unconfirmed when its answer is lost and the write may have happened.
         """
-        raw = self._checked(drive, register, value)
-        if register.kept is Kept.EEPROM and register.ram_address is None and register.readable:
+        return cast(T, self.try_write(drive, register, value).value)
+
+    def try_write(self, drive: Drive, register: Register[T], value: T) -> Outcome:
+        """As `write`, but what became of a write that was sent is returned, whatever it is."""
+        check_plain(drive, register, raw_count(drive, register, value))
+        return self._writer.put(drive, Write(register, value))
+
+    def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
+        """Send any request once, past every rule, and return the data of the reply.
+
+        The one deliberate way round: no look at the drive's family, no span, no budget. It may start a
+        motor. Raises Unconfirmed when no answer comes, and DriveRefused.
+        """
+        return self._writer.raw(drive, Message(drive.address, function, start, count, data))
+
+    # ---- who is there ----
+
+    def introduce(self, drive: Drive) -> None:
+        """Look, once, whether the drive at this address is of its family; Refused when it is another.
+
+        The first write does this by itself.
+        """
+        self._writer.acquaintance.make(drive)
+
+    def watchdog(self, drive: Drive) -> str:
+        """What becomes of the motor when this client dies, as far as the drive can say."""
+        register = drive.registers.get("communication_timeout")
+        if register is None or not register.readable:
+            return drive.watchdog
+        try:
             held = self.read(drive, register)
-            if held == register.decode(raw):
-                return held
-        what = f"{register.name} = {register.format(register.decode(raw))}"
-        completion = self._carry_out(drive, write_request(drive, register, raw))
-        try:
-            self._reply(drive, completion)
-        except (NoReply, BadReply) as failure:
-            raise Unconfirmed(drive.name, what, _why(failure)) from failure
-        if not register.readable:
-            return value
-        try:
-            return self.read(drive, register)
-        except (NoReply, BadReply) as failure:
-            raise Unconfirmed(
-                drive.name, what, f"it was confirmed, but not read back: {failure}"
-            ) from failure
+        except DriveRefused:
+            return drive.watchdog
+        if held == 0:
+            return f"its watchdog ({register.name}) is off: the motor runs on when the client dies"
+        return f"its watchdog ({register.name}) acts {register.format(held)} after the last message"
 
-    def broadcast(self, register: Register[T], value: T) -> None:
-        """Write to every drive on the line at once; nobody answers, so look at each one afterwards.
+    # ---- all drives at once ----
 
-        Refused unless all drives on the line are of one family, share their settings and framing,
-        and its document has this broadcast, because the same address means different things to
-        different families. Raises Refused.
+    def broadcast(self, register: Register[T], value: T) -> dict[str, State | BusError]:
+        """Write to every drive on the line at once; nobody answers, so each one is looked at afterwards.
+
+        Refused unless all drives on the line are of one family, share their settings and framing, and
+        its document has this broadcast, because the same address means different things to different
+        families. Returns what each drive then says, or why it says nothing. Raises Refused.
         """
         kinds = {(type(drive), drive.settings, drive.framing) for drive in self.drives}
         if len(kinds) != 1:
             raise Refused(
                 f"{register.name} cannot be broadcast: the drives on this line differ in family or settings, "
-                "and the same address means different things to them; write to one after another"
+                "and the same address means different things to them; write to one after another",
+                register=register.name,
+                rule="the drives on the line differ",
             )
         drive = self.drives[0]
-        raw = self._checked(drive, register, value)
+        raw = raw_count(drive, register, value)
         if raw not in register.broadcast:
             raise Refused(f"{drive.title} has no harmless broadcast of {register.name} = {value}")
-        self._carry_out(drive, write_request(drive, register, raw, address=0))
+        for it in self.drives:
+            self.introduce(it)
+        self._writer.broadcast(drive, register, raw)
+        return {it.name: self._look(it) for it in self.drives}
 
-    def _checked(self, drive: Drive, register: Register[T], value: T) -> int:
-        if register.never:
-            raise Refused(f"{register.name} of {drive.name} is never written: {register.never}")
-        if not register.writable:
-            raise Refused(
-                f"{register.name} of {drive.name} cannot be written: it is a {register.access.value}"
-            )
-        return register.encode(value)
+    def _look(self, drive: Drive) -> State | BusError:
+        try:
+            return cast(State, self.perform(drive, drive.state.script()))
+        except BusError as failure:
+            return failure
+
+    def stop_all(self) -> dict[str, Stopped]:
+        """Stop every drive, ahead of all that is queued; by drive's name, what is known of it.
+
+        By broadcast where all drives are of one family that has it, and known to be; and then each of
+        them, in turns, until it is seen to stand. Never raises for one drive: the others go on.
+        """
+        at_once = self._stop_by_broadcast()
+        silent_last = sorted(self.drives, key=lambda drive: self.respondent(drive).failures)
+        return stop_together(silent_last, self._step, lambda: now_ns() / 1e9, sleep, at_once)
+
+    def _stop_by_broadcast(self) -> bool:
+        """Whether a stop was broadcast, which it is only where that harms none and all are known."""
+        drives = self.drives
+        kinds = {(type(drive), drive.settings, drive.framing) for drive in drives}
+        known = all(self._writer.acquaintance.is_known(drive) for drive in drives)
+        control = drives[0].registers.get("control") if drives else None
+        if len(drives) < 2 or len(kinds) != 1 or not known or control is None or not control.broadcast:
+            return False
+        with suppress(BusError):
+            self._writer.broadcast(drives[0], control, control.broadcast[0])
+            return True
+        return False
+
+    def stop_on_exit(self) -> None:
+        """From now on, stop all drives when the `with` block is left or the process ends.
+
+        Also on SIGINT and SIGTERM, at once, and then the signal does what it did before. Without this
+        call leaving sends nothing: the motors go on as they are. Call it from the main thread.
+        """
+        if self._parting is None:
+            self._parting = Parting(self.stop_all)
 
     # ---- verbs ----
 
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
         """Carry out a verb's steps; the drive's verbs call this."""
-        try:
-            step = next(script)
-            while True:
-                try:
-                    result = self._step(drive, step)
-                except (BusError, ValueError) as failure:
-                    step = script.throw(failure)
-                else:
-                    step = script.send(result)
-        except StopIteration as end:
-            return end.value
+        return carry_out(script, lambda step: self._step(drive, step))
 
     def _step(self, drive: Drive, step: Step) -> Any:
         if isinstance(step, Wait):
             return sleep(step.seconds)
         if isinstance(step, Read):
             return self.read(drive, step.register)
-        return self.write(drive, step.register, step.value)
-
-    # ---- exchanges ----
-
-    def _carry_out(self, drive: Drive, request: Message) -> Completion:
-        """One exchange, ahead of any polling; first an answer that may still come late is waited for."""
-        made = exchange(drive, request, self.respondent(drive))
-        while True:
-            late_until_ns = made.respondent.late_until_ns
-            completion = self.line.carry_out(made)
-            if completion.result != Result.LATE_ANSWER_DUE:
-                return completion
-            sleep(max(0, late_until_ns - now_ns()) / 1e9)
+        return self._writer.put(drive, step).value
 
     def respondent(self, drive: Drive) -> Respondent:
-        """What is known of how this drive answers."""
-        return self._respondents[drive]
-
-    def _reply(self, drive: Drive, completion: Completion) -> Message:
-        if completion.result == Result.NO_REPLY:
-            raise NoReply(drive.name)
-        if completion.result <= 0:
-            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
-        if completion.reply.exception:
-            code = completion.reply.exception
-            raise DriveRefused(drive.name, code, drive.exception(code))
-        return completion.reply
-
-
-def _why(failure: BusError) -> str:
-    return failure.reason if isinstance(failure, BadReply) else "no reply"
+        """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
+        return self._exchanges.respondent(drive)

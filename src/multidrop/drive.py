@@ -8,14 +8,14 @@ a drive that is attached to a bus, a verb is carried out there.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from multidrop.core import Framing
-from multidrop.errors import BusError, DriveRefused, Refused, Unconfirmed, Unsupported
-from multidrop.register import Access, Register, Table
+from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.register import Access, Kept, Register, Table
 from multidrop.timing import Settings
 
 __all__ = [  # also the names of other modules that a family's file needs
@@ -26,6 +26,8 @@ __all__ = [  # also the names of other modules that a family's file needs
     "Drive",
     "DriveRefused",
     "Framing",
+    "Insist",
+    "NotDone",
     "Option",
     "Read",
     "Refused",
@@ -36,6 +38,7 @@ __all__ = [  # also the names of other modules that a family's file needs
     "Unsupported",
     "Wait",
     "Write",
+    "carry_out",
     "insist",
     "read",
     "until",
@@ -43,6 +46,8 @@ __all__ = [  # also the names of other modules that a family's file needs
     "wait",
     "write",
 ]
+
+START_TIME = 5.0  # s in which a motor that was started is to be seen to run
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -107,6 +112,11 @@ class Write:
 
 
 @dataclass(frozen=True)
+class Insist(Write):
+    """A write that does no harm at any time, nor when it is repeated: a stop, or a command taken back."""
+
+
+@dataclass(frozen=True)
 class Wait:
     seconds: float
 
@@ -129,11 +139,26 @@ def wait(seconds: float) -> Script[None]:
     yield Wait(seconds)
 
 
+def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
+    """Do a script's steps; what it returns. A step's failure is raised in it, and may be mended there."""
+    try:
+        step = next(script)
+        while True:
+            try:
+                result = do(step)
+            except (BusError, ValueError) as failure:
+                step = script.throw(failure)
+            else:
+                step = script.send(result)
+    except StopIteration as end:
+        return cast(R, end.value)
+
+
 def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
     """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
     for attempt in range(1, attempts + 1):
         try:
-            yield from write(register, value)
+            yield Insist(register, value)
         except (Unconfirmed, DriveRefused):
             if attempt == attempts:
                 raise
@@ -152,6 +177,10 @@ def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1)
     return True
 
 
+# Verbs before which the drive must be known to be of its family; a stop goes to a silent one too.
+_LOOKS_FIRST = ("start", "jog", "reset_fault", "set_frequency")
+
+
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive: calling it carries it out."""
 
@@ -161,6 +190,8 @@ class _BoundVerb(Generic[P, R]):
         self._script = script
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        if self.name in _LOOKS_FIRST:
+            self.drive.introduce()
         return cast(R, self.drive.perform(self._script(self.drive, *args, **kwargs)))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
@@ -196,11 +227,15 @@ VERBS = (
 )
 
 
+_TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
+
+
 class Drive:
     """One drive on a line; its class is the family: the table of the manual, in the manual's order.
 
     `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
-    family's. Options are facts that only the owner knows (see `options`).
+    family's. Options are facts that only the owner knows (see `options`); `ram` names the registers
+    that its owner knows to be kept in RAM although the document does not say so.
     Raises ValueError for anything the family's document does not allow.
     """
 
@@ -230,8 +265,11 @@ class Drive:
         5: "acknowledged, still working",
         6: "busy",
     }
+    damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
     options: ClassVar[Mapping[str, Option]] = {}
+    setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
+    remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the master dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
@@ -253,6 +291,7 @@ class Drive:
         framing: Framing | str | None = None,
         baudrate: int | None = None,
         format: str | None = None,
+        ram: Iterable[str] = (),
         **options: float,
     ) -> None:
         self.address = self._checked("address", address, self.addresses)
@@ -267,7 +306,10 @@ class Drive:
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         self.option = self._options(options)
+        self.ram = frozenset(self._in_ram(name) for name in ram)
+        self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
+        self.introduce: Callable[[], None] = lambda: None  # a bus looks at it
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
         raise RuntimeError(f"{self.name} is not attached to a bus: use bus.attach(...)")
@@ -305,6 +347,15 @@ class Drive:
         return given
 
     @classmethod
+    def _in_ram(cls, name: str) -> str:
+        if not isinstance(name, str):
+            raise TypeError(f"ram takes names of registers, not {name!r}")
+        register = cls.register(name)
+        if register.kept is Kept.EEPROM:
+            raise ValueError(f"{name} of {cls.title or cls.__name__} is in EEPROM, as its document says")
+        return register.name
+
+    @classmethod
     def register(cls, name: str) -> Register[Any]:
         """The register of this name; ValueError with the nearest names when there is none."""
         try:
@@ -339,14 +390,39 @@ class Drive:
             raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
 
     def _hold(self, register: Register[float], value: float) -> Script[None]:
-        """Write a setting; Unconfirmed when the drive then holds another value."""
+        """Write the setpoint; NotDone when the drive then holds another value."""
+        self.commanded = None
         held = yield from write(register, value)
         if held != register.decode(register.encode(value)):
-            raise Unconfirmed(
-                self.name,
-                f"{register.name} = {register.format(value)}",
-                f"the drive holds {register.format(held)}",
+            what = f"{register.name} = {register.format(value)}"
+            raise NotDone(self.name, what, f"the drive holds {register.format(held)}")
+        self.commanded = held
+
+    def _setpoint_in_force(self) -> Script[None]:
+        """Refused unless the setpoint is known, is not 0, and is still the one that was written."""
+        register = self.register(self.setpoint_name)
+        held = (yield from read(register)) if register.readable else self.commanded
+        if held is None:
+            raise Refused(f"{self.name} cannot say its setpoint: call set_frequency before start")
+        if held == 0:
+            raise Refused(f"the setpoint of {self.name} is 0: call set_frequency before start")
+        if self.commanded is not None and held != self.commanded:
+            raise Refused(
+                f"{self.name} holds {register.format(held)} and not {register.format(self.commanded)} as it "
+                "was told: it may have lost its power; call set_frequency before start"
             )
+
+    def _started(self) -> Script[None]:
+        """Look whether it runs: NotDone when it trips, Unconfirmed when it is not seen to run."""
+        if not (yield from until(self._runs, limit=START_TIME)):
+            reason = f"after {START_TIME:g} s it is not seen to run; {self.remote}"
+            raise Unconfirmed(self.name, "the start", reason)
+
+    def _runs(self) -> Script[bool]:
+        state = yield from self.state.script()
+        if state.condition is Condition.FAULT:
+            raise NotDone(self.name, "the start", f"it tripped: {state.fault or 'it shows a fault'}")
+        return state.condition in _TURNING
 
     @verb
     def identify(self) -> Script[None]:

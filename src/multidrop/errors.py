@@ -63,5 +63,31 @@ class Unsupported(BusError):
     """The family's document has no such thing."""
 
 
-class Refused(BusError):
-    """The library itself would not send it, and says why."""
+class NotDone(BusError):
+    """The drive is seen not to do what it confirmed: it took another value, or tripped."""
+
+    def __init__(self, drive: str, what: str, reason: str) -> None:
+        super().__init__(f"{drive}: {what} did not take effect: {reason}")
+        self.drive = drive
+        self.what = what
+        self.reason = reason
+
+
+class Expired(BusError):
+    """Never sent: its turn on the line did not come within its time."""
+
+    def __init__(self, drive: str, what: str, seconds: float) -> None:
+        super().__init__(f"{drive}: {what} was not sent: its turn did not come within {seconds:g} s")
+        self.drive = drive
+        self.what = what
+        self.seconds = seconds
+
+
+class Refused(BusError, ValueError):
+    """The library itself would not send it: which register, by which rule, and where the manual has it."""
+
+    def __init__(self, sentence: str, *, register: str = "", rule: str = "", place: str = "") -> None:
+        super().__init__(sentence)
+        self.register = register
+        self.rule = rule
+        self.place = place

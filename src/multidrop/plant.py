@@ -126,6 +126,7 @@ _DRIVE = {
     "framing": Key(str, 'framing = "rtu"'),
     "baudrate": Key(int, "baudrate = 9600"),
     "format": Key(str, 'format = "8N1"'),
+    "ram": Key(list, 'ram = ["frequency"], registers that this drive is known not to store in EEPROM'),
     "every": Key(str, 'every = "50 ms"'),
     "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
 }

@@ -88,6 +88,7 @@ class Details(TypedDict):
 
     step: value of one raw count; None where the document does not state it
     span: smallest and largest value that may be written
+    at_least, at_most: the register or option whose present value bounds it besides
     wire: how the number lies in the frame
     table: address space and function codes
     kept: RAM or EEPROM
@@ -95,6 +96,8 @@ class Details(TypedDict):
     default: value from the factory
     while_running: may be changed while the motor turns; None where not stated
     broadcast: the raw counts that are documented and harmless as a broadcast
+    harmless: of a register that moves the motor, the raw counts that anyone may write at any time,
+        and again when their answer is lost; all others are for verbs, which send them once
     never: why the library never writes it
     never_together: masks of bits that are never set in one write
     place: where the manual says so
@@ -104,6 +107,8 @@ class Details(TypedDict):
 
     step: NotRequired[float | None]
     span: NotRequired[tuple[float, float]]
+    at_least: NotRequired[str]
+    at_most: NotRequired[str]
     wire: NotRequired[Wire]
     table: NotRequired[Table]
     kept: NotRequired[Kept]
@@ -111,6 +116,7 @@ class Details(TypedDict):
     default: NotRequired[float]
     while_running: NotRequired[bool]
     broadcast: NotRequired[tuple[int, ...]]
+    harmless: NotRequired[tuple[int, ...]]
     never: NotRequired[str]
     never_together: NotRequired[tuple[int, ...]]
     place: NotRequired[str]
@@ -128,6 +134,8 @@ class Register(Generic[T]):
     values: type[T] | None = None
     step: float | None = 1
     span: tuple[float, float] | None = None
+    at_least: str = ""
+    at_most: str = ""
     wire: Wire = Wire.U16
     table: Table = HOLDING
     kept: Kept = Kept.UNKNOWN
@@ -135,6 +143,7 @@ class Register(Generic[T]):
     default: float | None = None
     while_running: bool | None = None
     broadcast: tuple[int, ...] = ()
+    harmless: tuple[int, ...] | None = None
     never: str = ""
     never_together: tuple[int, ...] = ()
     place: str = ""

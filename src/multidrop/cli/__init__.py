@@ -30,8 +30,17 @@ COMMANDS = {  # name: its module here, and what it does
     "jog": ("verbs", "turn it slowly until stopped"),
     "reset-fault": ("verbs", "reset a drive's fault; never starts the motor"),
     "set-frequency": ("verbs", "write a drive's frequency setpoint"),
+    "scan": ("scan", "find the drives on a line, by reading only"),
+    "plan": ("plan", "predict what a plant file's lines will reach; opens no port"),
+    "wear": ("wear", "list what was written to EEPROMs, and what is left"),
     "poll": ("poll", "poll the drives of a plant file, and record them"),
+    "doctor": ("doctor", "say what is amiss with a port and its adapter"),
+    "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
+    "sniff": ("sniff", "listen to a line that someone else masters"),
+    "decode": ("decode", "turn a capture into a recording or into text"),
+    "plot": ("plot", "draw a recording's values into a picture"),
+    "report": ("report", "write one page of all that a recording tells"),
     "convert": ("convert", "turn one recording into another format"),
 }
 

@@ -7,11 +7,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from multidrop.bus import Bus
-from multidrop.cli.poll import add_polling_arguments, follow
+from multidrop.cli.monitor import is_possible, watch
+from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.drives import MODELS
 from multidrop.plant import Line, load_plant
 
@@ -40,7 +42,14 @@ def run(arguments: argparse.Namespace) -> int:
         with _simulator(path, Path(directory)):
             plant = load_plant(path)
             _start_motors(plant.lines[0])
+            if _can_be_watched(arguments):
+                return conclude(plant, watch(plant, out=arguments.out, seconds=arguments.seconds), arguments)
             return follow(plant, arguments)
+
+
+def _can_be_watched(arguments: argparse.Namespace) -> bool:
+    """The monitor shows more than a table does, where there is a terminal and its library."""
+    return not arguments.json and is_possible() and find_spec("rich") is not None
 
 
 def _plant_file(port: Path) -> str:
@@ -57,7 +66,7 @@ def _plant_file(port: Path) -> str:
 
 def _start_motors(line: Line) -> None:
     """Every simulated motor at another frequency, so that there is something to be seen."""
-    with Bus(line.port) as bus:
+    with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
             drive.set_frequency(20.0 + 3 * number)

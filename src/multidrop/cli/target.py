@@ -24,6 +24,19 @@ def add_target_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="a fact about this drive; see `multidrop models MODEL`",
     )
+    parser.add_argument(
+        "--ram",
+        metavar="REGISTER",
+        action="append",
+        default=[],
+        help="a register that this drive is known not to store in EEPROM",
+    )
+
+
+def add_writing_arguments(parser: argparse.ArgumentParser) -> None:
+    """What every command takes that may write: whether it asks first, and where it is noted."""
+    parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
+    parser.add_argument("--audit", metavar="FILE", help="append every write and its outcome to this file")
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +51,7 @@ def drive_of(arguments: argparse.Namespace) -> Drive:
         framing=arguments.framing,
         baudrate=arguments.baudrate,
         format=arguments.format,
+        ram=arguments.ram,
         **dict(arguments.option),
     )
 

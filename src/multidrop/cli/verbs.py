@@ -7,11 +7,18 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.target import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.consent import ask
+from multidrop.cli.target import add_json_argument, add_target_arguments, add_writing_arguments, drive_of
 from multidrop.drive import Direction, Script, State, Write
 from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
+_ASKED = {  # before they are sent; a stop is never asked for
+    "start": "Start the motor of",
+    "jog": "Turn the motor of",
+    "reset-fault": "Reset the fault of",
+    "set-frequency": "Change the frequency setpoint of",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
     if command == "set-frequency":
         parser.add_argument("hz", metavar="HZ", type=float, help="the setpoint in Hz")
+    if command == "start":
+        parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
+    if command != "state":
+        add_writing_arguments(parser)
     add_json_argument(parser)
 
 
@@ -31,18 +42,25 @@ def run(arguments: argparse.Namespace) -> int:
     verb = getattr(drive, arguments.command.replace("-", "_"))
     given = _given(arguments)
     _rehearse(verb.script(*given))
-    with Bus(arguments.port) as bus:
+    if arguments.command in _ASKED:
+        ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
+    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus:
         bus.attach(drive)
+        if getattr(arguments, "frequency", None) is not None:
+            drive.set_frequency(arguments.frequency)
         state = verb(*given)
+        watchdog = bus.watchdog(drive) if arguments.command == "state" else ""
         if not isinstance(state, State):
             try:
                 state = drive.state()
             except Unsupported:
                 state = None
     if arguments.json:
-        print(json.dumps({"drive": drive.name, "done": arguments.command, "state": _json(state)}, indent=2))
+        told = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
+        print(json.dumps(told | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
         print(state)
+        print(f"watchdog: {watchdog}")
     else:
         print(f"{drive.name}: {arguments.command} done; state: {state or 'the family cannot say'}")
     return 0

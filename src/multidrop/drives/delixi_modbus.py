@@ -64,7 +64,13 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     exceptions = {}
     broadcasts = True
 
-    control = command(0x2000, Control, broadcast=(Control.STOP,), place="part 2, section 3: 2000H")
+    control = command(
+        0x2000,
+        Control,
+        broadcast=(Control.STOP,),
+        harmless=(Control.NOTHING, Control.STOP),
+        place="part 2, section 3: 2000H",
+    )
     frequency = setting(
         parameter(0, 2),
         "Hz",
@@ -76,7 +82,8 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def identify(self) -> Script[None]:
-        """P05.31 can be read, and is a fault code."""
+        """P04.30 is its address, P04.28 its baud rate, and P05.31 a fault code."""
+        yield from self._shows_its_line()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
             raise Refused(f"{self.name} has {int(fault):04X}H as its present fault: it is not a Delixi")
@@ -85,15 +92,21 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction forward, and only from rest."""
         forward = yield from self._forward(direction)
+        if (yield from read(self.frequency_source)) != 1:
+            raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
+        yield from self._setpoint_in_force()
         yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+        yield from self._started()
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly until stopped; without a direction forward, and only from rest."""
         forward = yield from self._forward(direction)
         yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+        yield from self._started()
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
+        yield from self._may_start()
         if direction is None and not (yield from self._stands()):
             raise Refused(f"{self.name} turns, and cannot say which way: name the direction")
         return direction is not Direction.REVERSE

@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from multidrop.drive import Condition, Direction, Framing, Script, State, insist, read, verb, write
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Framing,
+    NotDone,
+    Refused,
+    Script,
+    State,
+    insist,
+    read,
+    verb,
+    write,
+)
 from multidrop.drives.delixi_parameters import DelixiParameters, parameter
 from multidrop.register import Carrier, Kept, Table, command, reading, setting
 
@@ -64,10 +76,17 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         0xFE: "parameter locked",
         0xFF: "checksum error",
     }
+    damaged = frozenset({0xFF})
     broadcasts = True
 
     control = command(
-        0, Control, table=COMMAND, kept=Kept.RAM, broadcast=(Control.STOP,), place="part 3, section 5: K = 02"
+        0,
+        Control,
+        table=COMMAND,
+        kept=Kept.RAM,
+        broadcast=(Control.STOP,),
+        harmless=(Control.STOP,),
+        place="part 3, section 5: K = 02",
     )
     status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
     frequency = command(
@@ -88,16 +107,19 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def identify(self) -> Script[None]:
-        """P05.00 can be read: a drive of another protocol does not answer."""
-        yield from read(self.output_frequency)
+        """P04.30 is its address and P04.28 its baud rate; a drive of another protocol does not answer."""
+        yield from self._shows_its_line()
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        yield from self._may_start()
+        yield from self._setpoint_in_force()
         if direction is None and (yield from read(self.status)) == Status.REVERSE:
             direction = Direction.REVERSE
         word = Control.REVERSE if direction is Direction.REVERSE else Control.FORWARD
         yield from write(self.control, word)
+        yield from self._started()
 
     @verb
     def stop(self) -> Script[None]:
@@ -112,13 +134,19 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor."""
+        """Reset a fault; never starts the motor. Sent once, then looked at."""
+        if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
+            raise Refused(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, Control.RESET_FAULT)
+        status = yield from read(self.status)
+        if status in (Status.FAULT, Status.UNDERVOLTAGE):
+            fault = self.fault.format((yield from read(self.fault)))
+            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint that is not stored, which cannot be read back."""
-        yield from write(self.frequency, hz)
+        yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from enum import IntEnum
 
-from multidrop.drive import Drive, Option, Script, read
+from multidrop.drive import Drive, Option, Refused, Script, read
 from multidrop.register import Register, Table, reading, setting
 
 STOP_TIME = 60.0  # s; the deceleration time's number is not known
@@ -68,6 +68,7 @@ class DelixiParameters(Drive):
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
     addresses = range(1, 32)  # P04.30
     response_timeout = 0.15  # the drive needs less than 80 ms
+    remote = "P00.00 must be 2 (RS-485)"
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
     }
@@ -128,6 +129,25 @@ class DelixiParameters(Drive):
                 moved.__set_name__(cls, name)
                 setattr(cls, name, moved)
         super().__init_subclass__()
+
+    def _shows_its_line(self) -> Script[None]:
+        """Refused unless P04.30 and P04.28 are the address and baud rate at which it answers."""
+        address = yield from read(self.address_setting)
+        if address != self.address:
+            raise Refused(f"{self.name} has {address:g} as P04.30, not its address: it is not a Delixi")
+        baudrate = yield from read(self.baudrate_setting)
+        if baudrate != Baudrate[f"B{self.settings.baudrate}"]:
+            raise Refused(f"{self.name} has {int(baudrate)} as P04.28, not its baud rate: it is not a Delixi")
+
+    def _may_start(self) -> Script[None]:
+        """Refused with a fault, without a setpoint, and where the line does not command it."""
+        fault = yield from read(self.fault)
+        if fault:
+            raise Refused(
+                f"{self.name} has a fault, {self.fault.format(fault)}: see to it and reset it first"
+            )
+        if (yield from read(self.run_source)) != RunSource.LINE:
+            raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
 
     def _limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)

@@ -93,6 +93,9 @@ class ErmanERG220(Drive):
     - Exception 03 is used for any bad address and 04 says "on write": neither is a device failure.
     - The models -03 and -04 of the same make have another map: see `identify`.
 
+    - A setpoint is written between the minimum and the maximum frequency, for which the drive has no
+      refusal.
+
     No ranges, defaults, timing, nor what is kept in EEPROM are stated. Nor is it stated that
     broadcasts stay without an answer, so there are none. b.001 and b.002 must select RS-485.
     """
@@ -103,6 +106,7 @@ class ErmanERG220(Drive):
 
     formats = dict.fromkeys(Drive.framings, ("8N1",))
     baudrates = (38400,)
+    remote = "b.001 must be 2 and b.002 5 (RS-485)"
     addresses = range(1, 32)
     most_registers = {HOLDING: 88, INPUT: 17}
     readable_gaps = {HOLDING: range(0x0000, 0x0059), INPUT: range(0x0000, 0x1000)}
@@ -119,10 +123,14 @@ class ErmanERG220(Drive):
     }
 
     # Commands (section 10)
-    start_coil = command(0x0000, Coil, table=COIL, place="section 10, commands: 0")
-    stop_coil = command(0x0001, Coil, table=COIL, place="section 10, commands: 1")
-    emergency_stop_coil = command(0x0002, Coil, table=COIL, place="section 10, commands: 2")
-    fault_reset_coil = command(0x0009, Coil, table=COIL, place="section 10, commands: 9")
+    start_coil = command(0x0000, Coil, table=COIL, harmless=(Coil.OFF,), place="section 10, commands: 0")
+    stop_coil = command(0x0001, Coil, table=COIL, harmless=(Coil.ON,), place="section 10, commands: 1")
+    emergency_stop_coil = command(
+        0x0002, Coil, table=COIL, harmless=(Coil.ON,), place="section 10, commands: 2"
+    )
+    fault_reset_coil = command(
+        0x0009, Coil, table=COIL, harmless=(Coil.OFF,), place="section 10, commands: 9"
+    )
 
     # State registers (section 10)
     output_frequency = reading(0x0001, "Hz", step=0.1, table=INPUT, place="section 10, state: 1")
@@ -161,9 +169,20 @@ class ErmanERG220(Drive):
         never="it changes the kind of modulation and control, and what its bits mean is not stated",
         place="section 10, control: 1",
     )
-    frequency = setting(0x0002, "Hz", step=0.1, place="b.007; section 10, control: 2")
-    maximum_frequency = setting(0x0003, "Hz", step=0.1, place="b.006; section 10, control: 3")
-    minimum_frequency = setting(0x0004, "Hz", step=0.1, place="b.005; section 10, control: 4")
+    frequency = setting(
+        0x0002,
+        "Hz",
+        step=0.1,
+        at_least="minimum_frequency",
+        at_most="maximum_frequency",
+        place="b.007; section 10, control: 2",
+    )
+    maximum_frequency = setting(
+        0x0003, "Hz", step=0.1, at_least="minimum_frequency", place="b.006; section 10, control: 3"
+    )
+    minimum_frequency = setting(
+        0x0004, "Hz", step=0.1, at_most="maximum_frequency", place="b.005; section 10, control: 4"
+    )
     carrier_frequency = setting(0x000B, "kHz", step=0.1, place="d.006; section 10, control: 11")
     acceleration_time = setting(0x000C, "s", step=0.1, place="b.003; section 10, control: 12")
     deceleration_time = setting(0x000D, "s", step=0.1, place="b.004; section 10, control: 13")
@@ -195,9 +214,11 @@ class ErmanERG220(Drive):
                 f"{self.name} may have a fault, {self.last_fault.format(fault)}: see to it, then call "
                 f"reset_fault(), or declare acknowledged_fault={int(fault)}"
             )
+        yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)
         yield from write(self.emergency_stop_coil, Coil.OFF)
         yield from write(self.start_coil, Coil.ON)
+        yield from self._started()
 
     @verb
     def stop(self) -> Script[None]:
@@ -240,11 +261,7 @@ class ErmanERG220(Drive):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint; ValueError above the drive's maximum, which it has no refusal for."""
-        self.frequency.encode(hz)  # a mistake is told before anything is sent
-        most = yield from read(self.maximum_frequency)
-        if hz > most:
-            raise ValueError(f"{hz:g} Hz is above the maximum frequency of {self.name}, {most:g} Hz")
+        """Write the setpoint, which lies between the drive's minimum and maximum frequency."""
         yield from self._hold(self.frequency, hz)
 
     @verb

@@ -9,6 +9,7 @@ from multidrop.drive import (
     Condition,
     Direction,
     Drive,
+    DriveRefused,
     Framing,
     Option,
     Refused,
@@ -37,12 +38,16 @@ def parameter(name: str) -> int:
 
 
 class Control(IntEnum):
-    """The words that this library sends: the bits for the direction are left 0 in all of them."""
+    """The words that this library sends: at most one bit for the direction, and never the toggle."""
 
     NOTHING = 0x00
     STOP = 0x01
     RUN = 0x02
     JOG = 0x03
+    RUN_BIT_2 = 0x06
+    JOG_BIT_2 = 0x07
+    RUN_BIT_3 = 0x0A
+    JOG_BIT_3 = 0x0B
     RESET_FAULT = 0x10
 
 
@@ -103,7 +108,8 @@ class InnovertIBD(Drive):
     - What Prb.01 means is contradictory (5 is the line in the text, the potentiometer in an
       example): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
     - The bits for the direction are ambiguous (their order is printed the other way round than that
-      of the bits before): they are always 0, and a direction is refused. `start` turns the motor in
+      of the bits before): a direction is refused, unless the option `forward_bit` says which bit was
+      seen on site to be forward. Without a direction both bits are 0, and `start` turns the motor in
       whatever direction is in force. The toggle of the direction is never sent.
     - There is no state word. The state is unknown unless the outputs are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
@@ -114,6 +120,7 @@ class InnovertIBD(Drive):
       as the option `maximum_frequency`.
     - The table of letters is lost: of A and b the digit is known from examples, of C to H it is
       inferred, and these are read but never written.
+    - Nothing says that a drive is an IBD: see `identify`, and the option `confirmed`.
     - The "ordinal of the register" in a reply is the byte count. At most 4 registers are read.
 
     Functions 03 and 06 only. Exceptions, fault codes, what is kept in EEPROM and what may be changed
@@ -132,8 +139,11 @@ class InnovertIBD(Drive):
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True
+    remote = "set Prb.01 to 5 and Prb.02 to 2 on the keypad"
     options = {
-        "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that set_frequency may write"),
+        "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that may be written"),
+        "forward_bit": Option("", (2, 3), "2 or 3, the bit of 2000H that was seen to turn it forward"),
+        "confirmed": Option("", (0, 1), "1: its name plate says that it is an IBD; see `identify`"),
     }
 
     output_current = reading(parameter("PrA.03"), "A", step=0.1, place="PrA.03")
@@ -176,12 +186,19 @@ class InnovertIBD(Drive):
     format_setting = setting(parameter("PrH.01"), Format, never=INFERRED, place="PrH.01")
     address_setting = setting(parameter("PrH.02"), never=INFERRED, place="PrH.02")
 
-    control = command(0x2000, Control, broadcast=(Control.STOP,), place="2000H, table 3")
+    control = command(
+        0x2000,
+        Control,
+        broadcast=(Control.STOP,),
+        harmless=(Control.NOTHING, Control.STOP),
+        place="2000H, table 3",
+    )
     frequency = command(
         0x2001,
         "Hz",
         step=0.01,
         span=(0, 400),
+        at_most="maximum_frequency",
         broadcast=(0,),
         place="2001H, table 3",
         note="Used if Prb.01 = 5.",
@@ -191,22 +208,66 @@ class InnovertIBD(Drive):
         return super().needed_silence() if self.framing is Framing.RTU else 0.0
 
     @verb
+    def identify(self) -> Script[None]:
+        """PrH.00 and PrH.02 are its own baud rate and address; their addresses are inferred.
+
+        A drive that has something else there may be an IBD all the same, which nothing can tell: its
+        owner declares confirmed = 1, once, in the plant file.
+        """
+        if self.option.get("confirmed"):
+            return
+        if not (yield from self._shows_its_line()):
+            raise Refused(
+                f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
+                "name plate, and declare confirmed = 1 if it is an IBD"
+            )
+
+    def _shows_its_line(self) -> Script[bool]:
+        try:
+            baudrate = yield from read(self.baudrate_setting)
+            address = yield from read(self.address_setting)
+        except DriveRefused:
+            return False
+        return baudrate == Baudrate[f"B{self.settings.baudrate}"] and address == self.address
+
+    @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start in the direction in force; a direction is refused, because its bits are ambiguous."""
+        """Start in the direction in force; in another only where `forward_bit` is declared."""
         yield from self._command(Control.RUN, direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn at PrE.00 until stopped; a direction is refused, because its bits are ambiguous."""
+        """Turn at PrE.00 until stopped, in the direction in force; for another see `start`."""
         yield from self._command(Control.JOG, direction)
 
     def _command(self, word: Control, direction: Direction | None) -> Script[None]:
-        if direction is not None:
+        sent = word if direction is None else Control(word | self._bit(direction))
+        yield from self._commanded_by_line()
+        if (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
+            raise Refused(f"{self.name} has a fault: see to it, then call reset_fault()")
+        if word is Control.RUN:
+            yield from self._setpoint_in_force()
+        yield from write(self.control, sent)
+        yield from self._started()
+
+    def _bit(self, direction: Direction) -> int:
+        forward = self.option.get("forward_bit")
+        if forward not in (2, 3):
             raise Refused(
                 f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
-                "set the direction on the drive, and start without one"
+                "start without a direction, or try which of bits 2 and 3 turns it forward, and declare that "
+                "as forward_bit"
             )
-        yield from write(self.control, word)
+        return 1 << int(forward if direction is Direction.FORWARD else 5 - forward)
+
+    def _commanded_by_line(self) -> Script[None]:
+        if (yield from read(self.frequency_source)) != FrequencySource.LINE or (
+            yield from read(self.run_source)
+        ) != RunSource.LINE:
+            raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
+
+    def _runs(self) -> Script[bool]:
+        return (yield from super()._runs()) or not (yield from self._stands())
 
     @verb
     def stop(self) -> Script[None]:
@@ -230,10 +291,7 @@ class InnovertIBD(Drive):
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint, which cannot be read back."""
-        most = self.option.get("maximum_frequency", 400.0)
-        if not 0 <= hz <= most:
-            raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
-        yield from write(self.frequency, hz)
+        yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:

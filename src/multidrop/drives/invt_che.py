@@ -10,6 +10,7 @@ from multidrop.drive import (
     Direction,
     Drive,
     DriveRefused,
+    NotDone,
     Option,
     Refused,
     Script,
@@ -161,7 +162,10 @@ class InvtCHE(Drive):
         0x12: "write not allowed: out of range, not changeable now, or terminal function already used",
         0x13: "locked by a password",
     }
+    damaged = frozenset({0x11})
     broadcasts = True
+    setpoint_name = "setpoint"
+    remote = "P0.01 must be 2, and P0.03 take the frequency from the line"
     options = {
         "maximum_frequency": Option("Hz", (1, 3000), "P0.04, of which the setpoint is a percentage"),
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
@@ -172,7 +176,13 @@ class InvtCHE(Drive):
     )
 
     control = command(
-        0x1000, Control, kept=Kept.RAM, while_running=True, broadcast=(Control.STOP,), outside=CHE100
+        0x1000,
+        Control,
+        kept=Kept.RAM,
+        while_running=True,
+        broadcast=(Control.STOP,),
+        harmless=(Control.STOP, Control.COAST, Control.STOP_JOG),
+        outside=CHE100,
     )
     status = reading(0x1001, Status, outside=CHE100)
     setpoint = setting(
@@ -229,17 +239,24 @@ class InvtCHE(Drive):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
         forward = yield from self._forward(direction)
+        yield from self._setpoint_in_force()
         yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+        yield from self._started()
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
         forward = yield from self._forward(direction)
         yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+        yield from self._started()
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
+        status = yield from read(self.status)
+        if status == Status.FAULT:
+            fault = self.fault.format((yield from read(self.fault)))
+            raise Refused(f"{self.name} has a fault, {fault}: see to it, then call reset_fault()")
         if direction is None:
-            return (yield from read(self.status)) != Status.REVERSE
+            return status != Status.REVERSE
         return direction is Direction.FORWARD
 
     @verb
@@ -269,8 +286,13 @@ class InvtCHE(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor."""
+        """Reset a fault; never starts the motor. Sent once, then looked at."""
+        if (yield from read(self.status)) in (Status.FORWARD, Status.REVERSE):
+            raise Refused(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, Control.RESET_FAULT)
+        if (yield from read(self.status)) == Status.FAULT:
+            fault = self.fault.format((yield from read(self.fault)))
+            raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

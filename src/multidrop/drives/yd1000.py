@@ -109,6 +109,11 @@ def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details])
     return setting(number, "Hz", **_parameter(place, more))
 
 
+def preset(number: int, place: str, /) -> Register[float]:
+    """A preset speed, from LL to UL."""
+    return hertz(number, place, at_least="minimum_frequency", at_most="upper_limit_frequency", default=0.0)
+
+
 def _parameter(place: str, more: Details) -> Details:
     return {"kept": Kept.EEPROM, "while_running": True, "place": place, **more}
 
@@ -159,6 +164,7 @@ class YD1000(Drive):
         4: "cannot be done now (after VF-S15)",
     }
     broadcasts = True
+    remote = "a start has bits 15 and 14 set, so that neither CNOD nor FNOD matters"
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; without it, dEC and 5 s"),
     }
@@ -179,25 +185,29 @@ class YD1000(Drive):
     panel_direction = choice(0x0008, "6.1, FR", 1, default=0)
     acceleration_time = seconds(0x0009, "6.1, ACC", default=10.0)
     deceleration_time = seconds(0x0010, "6.1, DEC", default=10.0)
-    maximum_frequency = hertz(0x0011, "6.1, FH", 30, default=80.0, while_running=False)
-    upper_limit_frequency = hertz(0x0012, "6.1, UL", 0.5, default=80.0, note="At most FH.")
-    minimum_frequency = hertz(0x0013, "6.1, LL", default=0.0, note="At most UL.")
+    maximum_frequency = hertz(
+        0x0011, "6.1, FH", 30, at_least="upper_limit_frequency", default=80.0, while_running=False
+    )
+    upper_limit_frequency = hertz(
+        0x0012, "6.1, UL", 0.5, at_least="minimum_frequency", at_most="maximum_frequency", default=80.0
+    )
+    minimum_frequency = hertz(0x0013, "6.1, LL", at_most="upper_limit_frequency", default=0.0)
     base_frequency = hertz(0x0014, "6.1, uL", 25, default=60.0)
     voltage_frequency_mode = choice(0x0015, "6.1, PT", default=0, while_running=False, never=PANEL)
     torque_boost = choice(0x0016, "6.1, UB", step=None, never=NO_SCALE, note="0.0 to 30.0.")
     thermal_protection = choice(0x0017, "6.1, OLN", 7, default=0)
-    preset_speed_1 = hertz(0x0018, "6.1, SR1", default=0.0, note="From LL to UL.")
-    preset_speed_2 = hertz(0x0019, "6.1, SR2", default=0.0, note="From LL to UL.")
-    preset_speed_3 = hertz(0x0020, "6.1, SR3", default=0.0, note="From LL to UL.")
-    preset_speed_4 = hertz(0x0021, "6.1, SR4", default=0.0, note="From LL to UL.")
-    preset_speed_5 = hertz(0x0022, "6.1, SR5", default=0.0, note="From LL to UL.")
-    preset_speed_6 = hertz(0x0023, "6.1, SR6", default=0.0, note="From LL to UL.")
-    preset_speed_7 = hertz(0x0024, "6.1, SR7", default=0.0, note="From LL to UL.")
+    preset_speed_1 = preset(0x0018, "6.1, SR1")
+    preset_speed_2 = preset(0x0019, "6.1, SR2")
+    preset_speed_3 = preset(0x0020, "6.1, SR3")
+    preset_speed_4 = preset(0x0021, "6.1, SR4")
+    preset_speed_5 = preset(0x0022, "6.1, SR5")
+    preset_speed_6 = preset(0x0023, "6.1, SR6")
+    preset_speed_7 = preset(0x0024, "6.1, SR7")
 
     # Section 6.2, extended parameters
-    low_speed_frequency = hertz(0x0100, "6.2, F100", default=0.0, note="At most FH.")
-    speed_reach_frequency = hertz(0x0101, "6.2, F101", default=0.0, note="At most FH.")
-    speed_reach_band = hertz(0x0102, "6.2, F102", default=2.5, note="At most FH.")
+    low_speed_frequency = hertz(0x0100, "6.2, F100", at_most="maximum_frequency", default=0.0)
+    speed_reach_frequency = hertz(0x0101, "6.2, F101", at_most="maximum_frequency", default=0.0)
+    speed_reach_band = hertz(0x0102, "6.2, F102", at_most="maximum_frequency", default=2.5)
     st_selection = choice(0x0103, "6.2, F103", 2, default=1)
     rst_selection = choice(0x0104, "6.2, F104", 1, default=0)
     always_on_function = choice(0x0110, "6.2, F110", 37, default=0)
@@ -216,6 +226,7 @@ class YD1000(Drive):
         kept=Kept.RAM,
         while_running=True,
         broadcast=(STOP, Control.COMMAND_VALID),
+        harmless=(STOP, Control.COMMAND_VALID, STOP | Control.COAST),
         never_together=(Control.RESET | Control.RUN, Control.RESET | Control.JOG),
         place="6.3, 8.1 table 1: 1000",
     )
@@ -224,14 +235,22 @@ class YD1000(Drive):
         "Hz",
         step=0.01,
         span=(0, 320),
+        at_most="maximum_frequency",
         kept=Kept.RAM,
         while_running=True,
         broadcast=(0,),
         place="6.3: 1001",
-        note="Used while bit 14 of 1000H is set. At most FH.",
+        note="Used while bit 14 of 1000H is set.",
     )
     panel_frequency = setting(
-        0x1002, "Hz", step=0.01, span=(0, 320), kept=Kept.RAM, while_running=True, place="6.3: 1002"
+        0x1002,
+        "Hz",
+        step=0.01,
+        span=(0, 320),
+        at_most="maximum_frequency",
+        kept=Kept.RAM,
+        while_running=True,
+        place="6.3: 1002",
     )
 
     # Section 6.4, live
@@ -279,6 +298,7 @@ class YD1000(Drive):
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at 1001H; without a direction, in the one it turns in, or forward."""
+        yield from self._setpoint_in_force()
         yield from self._turn(Control.RUN, direction)
 
     @verb
@@ -287,10 +307,14 @@ class YD1000(Drive):
         yield from self._turn(Control.JOG, direction)
 
     def _turn(self, how: Control, direction: Direction | None) -> Script[None]:
-        if direction is None and (yield from read(self.output_frequency)) > 0:
-            direction = yield from self._direction()
+        state = yield from self.state.script()
+        if state.condition is Condition.FAULT:
+            raise Refused(f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()")
+        if direction is None and state.condition is Condition.RUNNING:
+            direction = state.direction
         reverse = Control.REVERSE if direction is Direction.REVERSE else Control(0)
         yield from write(self.control, STOP | how | reverse)
+        yield from self._started()
 
     def _direction(self) -> Script[Direction]:
         """Of a motor that turns: then 1201H is not frozen."""
@@ -343,14 +367,11 @@ class YD1000(Drive):
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)
+        self.commanded = None
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint; ValueError above FH."""
-        self.frequency.encode(hz)  # a mistake is told before anything is sent
-        most = yield from read(self.maximum_frequency)
-        if hz > most:
-            raise ValueError(f"{hz:g} Hz is above the maximum frequency of {self.name}, {most:g} Hz")
+        """Write the setpoint, which is at most FH."""
         yield from self._hold(self.frequency, hz)
 
     @verb

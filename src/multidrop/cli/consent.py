@@ -1,0 +1,19 @@
+"""Asking before a motor may move or a register be written."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from multidrop.errors import Refused
+
+
+def ask(question: str, arguments: argparse.Namespace) -> None:
+    """Go on if --yes was given or the person at the terminal says yes; Refused otherwise."""
+    if arguments.yes:
+        return
+    if not sys.stdin.isatty():
+        raise Refused(f"{question} There is no terminal to ask on: add --yes if it is meant")
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise Refused("nothing was sent")

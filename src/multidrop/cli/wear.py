@@ -1,0 +1,63 @@
+"""`multidrop wear`: how often registers that a drive may keep in EEPROM were written, and what is left."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from datetime import UTC, datetime
+
+from multidrop.cli.target import add_json_argument
+from multidrop.cli.values import aligned
+from multidrop.ledger import BUDGET, CYCLES, Ledger, Wear
+from multidrop.line import now_ns, utc_minus_monotonic_ns
+
+HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEFT", "LAST")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--ledger", metavar="FILE", help="another one than the user's own")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    ledger = Ledger(arguments.ledger)
+    found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
+    if arguments.json:
+        print(json.dumps([_facts(it) for it in found], indent=2))
+    elif not found:
+        print(f"{ledger.path}: no register that may be in EEPROM was written yet")
+    else:
+        print("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
+        print(f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears.")
+    return 0
+
+
+def _row(wear: Wear) -> tuple[str, ...]:
+    cell = wear.cell
+    numbers = (str(wear.writes), str(wear.this_year), str(BUDGET - wear.this_year))
+    return (
+        cell.port,
+        str(cell.address),
+        cell.model,
+        cell.register,
+        *numbers,
+        _time(wear)[:16].replace("T", " "),
+    )
+
+
+def _facts(wear: Wear) -> dict[str, object]:
+    cell = wear.cell
+    return {
+        "port": cell.port,
+        "address": cell.address,
+        "model": cell.model,
+        "register": cell.register,
+        "writes": wear.writes,
+        "this_year": wear.this_year,
+        "left": BUDGET - wear.this_year,
+        "last": _time(wear),
+    }
+
+
+def _time(wear: Wear) -> str:
+    return datetime.fromtimestamp(wear.last, UTC).isoformat(timespec="seconds")

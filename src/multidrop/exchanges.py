@@ -1,0 +1,115 @@
+"""Exchanges with the drives on a line, one at a time and ahead of any polling: what is read from them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from multidrop import core
+from multidrop.core import Completion, Exchange, Message, Respondent, Result, raw_value
+from multidrop.drive import Drive
+from multidrop.errors import BadReply, DriveRefused, NoReply
+from multidrop.line import Line, now_ns, sleep
+from multidrop.plan import Block, blocks
+from multidrop.register import Register
+
+READ_ATTEMPTS = 3
+LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
+NO_ROWS = core.Block([])  # of a command: a poll's summary counts the values of its rows alone
+
+
+def exchange(
+    drive: Drive, request: Message, respondent: Respondent, block: core.Block | None = None
+) -> Exchange:
+    """What the core needs to carry out a request to this drive."""
+    settings = drive.settings
+    return Exchange(
+        drive.framing,
+        request,
+        respondent,
+        baudrate=settings.baudrate,
+        format=settings.format,
+        character=settings.character,
+        # One bit more: the other side may still be sending its second stop bit.
+        silence=drive.needed_silence() + settings.bit,
+        turnaround=drive.turnaround_delay,
+        block=block,
+    )
+
+
+class Exchanges:
+    """What passes between a line and its drives, and what is learnt of each drive from it."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self._respondents: dict[Drive, Respondent] = {}
+        self._heard: dict[Drive, object] = {}  # the open port on which it answered last
+
+    def add(self, drive: Drive) -> None:
+        self._respondents[drive] = Respondent(
+            least_timeout=min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay)),
+            most_timeout=drive.response_timeout,
+        )
+
+    def respondent(self, drive: Drive) -> Respondent:
+        """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
+        if drive not in self._respondents:
+            raise ValueError(f"{drive.name} is not attached to this bus: use bus.attach(...)")
+        return self._respondents[drive]
+
+    def is_heard(self, drive: Drive) -> bool:
+        """Whether it has answered since the port was opened."""
+        return self._heard.get(drive, self) is self.line.queue
+
+    def values(self, drive: Drive, registers: list[Register[Any]], attempts: int) -> dict[str, Any]:
+        """Registers' values by name, each block asked for so many times until it is answered."""
+        raw: dict[str, Any] = {}
+        for block in blocks(drive, registers):
+            reply = self._ask(drive, block, attempts)
+            for register in block.registers:
+                raw[register.name] = register.decode(
+                    raw_value(reply.data, block.offset(register), register.wire)
+                )
+        return {register.name: raw[register.name] for register in registers}
+
+    def _ask(self, drive: Drive, block: Block, attempts: int) -> Message:
+        for attempt in range(1, attempts + 1):
+            try:
+                return self._read(drive, self.carry_out(drive, block.request(drive.address)))
+            except (NoReply, BadReply):
+                if attempt == attempts:
+                    raise
+            except DriveRefused as refusal:
+                if refusal.code not in drive.damaged or attempt == attempts:
+                    raise
+        raise AssertionError("unreachable")
+
+    def carry_out(self, drive: Drive, request: Message, expiry: float = 0.0) -> Completion:
+        """One exchange, ahead of any polling; first an answer that may still come late is waited for.
+
+        After `expiry` seconds it is not sent; 0: never too late.
+        """
+        made = exchange(drive, request, self.respondent(drive), NO_ROWS)
+        expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
+        while True:
+            late_until_ns = made.respondent.late_until_ns
+            completion = self.line.carry_out(made, expires_ns=expires_ns)
+            if completion.result != Result.LATE_ANSWER_DUE:
+                return completion
+            sleep(max(0, late_until_ns - now_ns()) / 1e9)
+
+    def reply(self, drive: Drive, completion: Completion) -> Message:
+        """The good reply; raises NoReply, BadReply or DriveRefused."""
+        if completion.result == Result.NO_REPLY:
+            raise NoReply(drive.name)
+        if completion.result <= 0:
+            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
+        if completion.reply.exception:
+            code = completion.reply.exception
+            raise DriveRefused(drive.name, code, drive.exception(code))
+        return completion.reply
+
+    def _read(self, drive: Drive, completion: Completion) -> Message:
+        """The reply to a read: that the drive is there, an exception says too."""
+        if completion.result > 0:
+            self._heard[drive] = self.line.queue
+        return self.reply(drive, completion)

@@ -1,0 +1,116 @@
+"""Ledger: how often each register that a drive may keep in EEPROM was written, across restarts.
+
+It is a file that several processes share. EEPROM bears some 10,000 writes, so a budget keeps them
+for ten years.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+YEAR = 365 * 86400.0  # s
+CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
+YEARS = 10
+BUDGET = CYCLES // YEARS  # writes of one register in a year
+LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One register of one drive, as a ledger knows it."""
+
+    port: str
+    address: int
+    model: str
+    register: str
+
+
+@dataclass(frozen=True)
+class Wear:
+    """What a ledger says of a cell at some time."""
+
+    cell: Cell
+    writes: int  # in all
+    this_year: int  # in the year before
+    last: float  # UTC, s
+
+
+def default_path() -> Path:
+    """Where state that survives restarts belongs (XDG base directory specification)."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state) / "multidrop" / "wear.sqlite"
+
+
+class Ledger:
+    """The ledger in this file, which is made at its first entry. Times are UTC in s."""
+
+    def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
+        self.path = Path(path) if path else default_path()
+        self.budget = budget
+
+    def enter(self, cell: Cell, now: float, least_interval: float) -> str:
+        """Count a write that is about to be sent; a reason why it must not be, and then it is not counted.
+
+        The question and the entry are one transaction, so that two processes cannot both have the last
+        of the budget. Raises OSError where the file cannot be kept.
+        """
+        with self._opened() as ledger:
+            ledger.execute("begin immediate")
+            wear = _wear(ledger, cell, now)
+            since = now - wear.last
+            if wear.writes and 0 <= since < least_interval:
+                return (
+                    f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
+                    f"{least_interval:.0f} s at most"
+                )
+            if wear.this_year >= self.budget:
+                return (
+                    f"it was written {wear.this_year} times in a year, and its EEPROM bears {CYCLES} writes "
+                    f"in all: {self.budget} a year for {YEARS} years"
+                )
+            ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
+            ledger.commit()
+        return ""
+
+    def wear(self, now: float) -> list[Wear]:
+        """Every cell that was ever written, the most worn in the last year first."""
+        if not self.path.exists():
+            return []
+        with self._opened() as ledger:
+            rows = ledger.execute("select distinct port, address, model, register from writes").fetchall()
+            found = [_wear(ledger, Cell(*row), now) for row in rows]
+        return sorted(found, key=lambda it: (-it.this_year, it.cell.port, it.cell.address, it.cell.register))
+
+    @contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with closing(sqlite3.connect(self.path, timeout=5.0, isolation_level=None)) as ledger:
+                ledger.execute(
+                    "create table if not exists writes"
+                    " (port text, address integer, model text, register text, time real)"
+                )
+                ledger.execute("create index if not exists cells on writes (port, address, register)")
+                yield ledger
+        except sqlite3.Error as failure:
+            raise OSError(f"the ledger of EEPROM writes {self.path} cannot be kept: {failure}") from failure
+
+
+def _key(cell: Cell) -> tuple[str, int, str, str]:
+    return cell.port, cell.address, cell.model, cell.register
+
+
+def _wear(ledger: sqlite3.Connection, cell: Cell, now: float) -> Wear:
+    where = "port = ? and address = ? and model = ? and register = ?"
+    writes, last = ledger.execute(
+        f"select count(*), max(time) from writes where {where}", _key(cell)
+    ).fetchone()
+    (this_year,) = ledger.execute(
+        f"select count(*) from writes where {where} and time > ?", (*_key(cell), now - YEAR)
+    ).fetchone()
+    return Wear(cell, writes, this_year, last or 0.0)
