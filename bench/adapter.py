@@ -1,31 +1,25 @@
-"""The one place in bench/, besides played.py, that knows multidrop's API."""
+"""The one place in bench/, besides played.py and many_adapter.py, that knows multidrop's API."""
 
 from __future__ import annotations
 
-import os
 import select
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from unittest.mock import patch
 
 import numpy
 import pyarrow
 import pyarrow.compute
 from jobs import REGISTERS, Job, expected
-from played import Played, Unpaced, Unreliable
+from played import Played
 
 from multidrop.batch import Batch, Row
 from multidrop.bus import Bus
-from multidrop.core import Block, Columns, Field, Port, new_completion
-from multidrop.drive import Drive
-from multidrop.line import Line
-from multidrop.plant import Line as Declared
-from multidrop.plant import Plant, Polled, PolledDrive, load_plant
+from multidrop.core import Block, Columns, Field, new_completion
+from multidrop.plant import load_plant
 from multidrop.poller import Poller
 from multidrop.recording import open_writer
 
@@ -58,61 +52,6 @@ def polling(job: Job) -> Iterator[Poller]:
         plant = load_plant(path)
     with Poller(plant) as poller:
         yield poller
-
-
-class Inherited(Line):
-    """A line on a descriptor that is open already, which no URL can name."""
-
-    def _open(self) -> None:
-        os.set_blocking(int(self.port), False)
-        self._core = Port(int(self.port), must_take=-1)
-
-    def close(self) -> None:
-        if self._core:
-            self._core.close()
-            self._core = None
-
-
-def _opened(port: str) -> Line:
-    return Inherited(port) if port.isdigit() else Line(port)
-
-
-@contextmanager
-def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
-    """All registers of the drives on each port: a path, or the number of an open descriptor."""
-    declared = tuple(
-        Declared(
-            port,
-            port,
-            None,
-            None,
-            tuple(
-                PolledDrive(it, tuple(Polled(register, every) for register in it.readings())) for it in drives
-            ),
-        )
-        for port, drives in lines.items()
-    )
-    with patch("multidrop.bus.Line", _opened), Poller(Plant(declared, Path())) as poller:
-        yield poller
-
-
-@contextmanager
-def polling_lines(
-    ports: Sequence[str], baudrate: int, drives: int = 16, every: float | None = None
-) -> Iterator[Poller]:
-    """Drives with the addresses from 1 on each port; baud rate 0: without waits."""
-
-    def drive(port: str, address: int) -> Drive:
-        name = _name(port, address)
-        return Played(address, name=name, baudrate=baudrate) if baudrate else Unpaced(address, name=name)
-
-    lines = {port: [drive(port, address) for address in range(1, drives + 1)] for port in ports}
-    with _polling_drives(lines, every) as poller:
-        yield poller
-
-
-def _name(port: str, address: int) -> str:
-    return f"{port}/{address}"
 
 
 def counts(poller: Poller) -> tuple[int, int]:
@@ -163,71 +102,6 @@ def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
                 late.append(now - _replied_ns(batch))
         good, _ = counts(poller)
     return good, numpy.concatenate(late) / 1e6
-
-
-def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds: float) -> list[float]:
-    """How long after it was due each request of one drive per line began to leave."""
-    with polling_lines(ports, baudrate, 1, every) as poller:
-        batches = list(poller.batches(seconds))
-        grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
-    period_ns = round(every * 1e9)
-    sent_ns = {(row.drive, row.monotonic_ns - grids[row.drive]) for batch in batches for row in batch}
-    # The first ones are due at the moment at which polling starts.
-    return [sent % period_ns / 1e3 for _, sent in sorted(sent_ns) if sent > period_ns / 2]
-
-
-@dataclass
-class Judged:
-    """What came of drives on which replies are late, lost or doubled."""
-
-    exchanges: int = 0
-    samples: int = 0
-    wrong: int = 0  # values that are another register's
-    late: int = 0  # replies that were recognised after their time-out
-    misses: Counter[str] = field(default_factory=Counter)
-
-
-def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
-    """Poll until so many exchanges are done, and hold each value against what its register holds."""
-    judged = Judged()
-    names = [_name(port, address) for port in ports for address in range(1, drives + 1)]
-    held = {
-        (name, register): Unreliable.held(int(name.partition("/")[2]), register)
-        for name in names
-        for register in Unreliable.registers
-    }
-    lines = {
-        port: [Unreliable(address, name=_name(port, address)) for address in range(1, drives + 1)]
-        for port in ports
-    }
-    with _polling_drives(lines, None) as poller:
-        while judged.exchanges < exchanges:
-            for batch in poller.batches(1.0):
-                _judge(batch, held, judged)
-            judged.exchanges = sum(line["exchanges"] for line in poller.summary()["lines"].values())
-    while batch := poller.take():
-        _judge(batch, held, judged)
-    summary = poller.summary()
-    judged.late = sum(line["late_replies"] for line in summary["lines"].values())
-    if summary["dropped"] or (judged.samples, judged.misses.total()) != (
-        summary["samples"],
-        summary["misses"],
-    ):
-        raise AssertionError(f"rows are missing: {judged}, {summary}")
-    return judged
-
-
-def _judge(batch: Batch, held: Mapping[tuple[str, str], int], judged: Judged) -> None:
-    columns = pyarrow.record_batch(batch)
-    good = columns.filter(columns["value"].is_valid())
-    drives, registers = (good[name].dictionary_encode() for name in ("drive", "register"))
-    names = drives.dictionary.to_pylist(), registers.dictionary.to_pylist()
-    truth = numpy.array([[held[drive, register] for register in names[1]] for drive in names[0]])
-    if len(good):
-        right = truth[drives.indices.to_numpy(), registers.indices.to_numpy()]
-        judged.wrong += int((good["value"].to_numpy() != right).sum())
-    judged.samples += len(good)
-    judged.misses.update(columns.filter(columns["value"].is_null())["status"].to_pylist())
 
 
 def _replied_ns(batch: Batch) -> numpy.ndarray:

@@ -3,7 +3,7 @@
  *
  * Every address holds 256 * address + register, and for function 04 the register 128 further on. A
  * reply comes at once, or when it would have been whole on a wire of --baudrate. Some of them come
- * later by up to --late-us, are lost, or come twice. Lines are descriptors that were inherited, or
+ * later by up to --late-us and never by more, are lost, or come twice. Lines are descriptors that were inherited, or
  * new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
@@ -34,7 +34,7 @@ struct line {
 
 /* Replies on their way: a heap, the one that is due first at 0. */
 struct reply {
-    int64_t due_ns;
+    int64_t due_ns, last_ns; /* it comes then or never */
     int fd;
     uint16_t len;
     uint8_t bytes[MOST_REPLY];
@@ -90,6 +90,10 @@ static void drop_first(void)
 
 static void hand_over(const struct reply *reply)
 {
+    if (options.late_us && now_ns() > reply->last_ns) {
+        lost++;
+        return;
+    }
     (void)!write(reply->fd, reply->bytes, reply->len); /* a client that is gone hears nothing */
 }
 
@@ -124,19 +128,21 @@ static void answer(int fd, const uint8_t *request, int64_t came_ns)
         lost++;
         return;
     }
-    int copies = 1 + happens(options.twice_permille);
-    twice += copies == 2;
+    if (happens(options.twice_permille) && reply.len <= MOST_REPLY / 2) {
+        twice++;
+        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* one behind the other, as on a wire */
+        reply.len = (uint16_t)(2 * reply.len);
+    }
     reply.due_ns = came_ns + (REQUEST + reply.len) * character_ns + options.delay_us * 1000;
+    reply.last_ns = reply.due_ns + options.late_us * 1000;
     if (happens(options.late_permille)) {
         late++;
         reply.due_ns += rand() % (options.late_us + 1) * 1000;
     }
-    for (; copies; copies--) {
-        if (reply.due_ns > came_ns)
-            push(&reply);
-        else
-            hand_over(&reply);
-    }
+    if (reply.due_ns > came_ns)
+        push(&reply);
+    else
+        hand_over(&reply);
 }
 
 static void hear(struct line *line)

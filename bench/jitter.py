@@ -31,9 +31,9 @@ class Rate:
 
 
 def poll(job: Rate) -> list[float]:
-    import adapter
+    import many_adapter
 
-    lateness: list[float] = adapter.start_lateness_us(job.ports, BAUDRATE, 1 / job.hertz, job.seconds)
+    lateness: list[float] = many_adapter.start_lateness_us(job.ports, BAUDRATE, 1 / job.hertz, job.seconds)
     return lateness
 
 

@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=16)
     parser.add_argument("--drives", type=int, default=8, help="on each line")
     arguments = parser.parse_args()
-    import adapter
+    import many_adapter
 
     tables.heading(
         f"{arguments.lines} lines without waits, {arguments.drives} drives each, 4 blocks of 10 registers; "
@@ -32,12 +32,13 @@ def main() -> None:
     options += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
     begun = time.monotonic()
     with far_ends("socketpair", arguments.lines, *options) as (ports, _):
-        judged = adapter.judge(ports, arguments.exchanges, arguments.drives)
+        judged = many_adapter.judge(ports, arguments.exchanges, arguments.drives)
     rows = [
         ("seconds", f"{time.monotonic() - begun:.0f}"),
         ("exchanges", judged.exchanges),
         ("values", judged.samples),
-        ("values that are another register's", judged.wrong),
+        ("values that are another register's", judged.wrong - judged.beyond),
+        ("the same, by answers later than that", judged.beyond),
         ("late replies that were recognised", judged.late),
         *((f"missed: {why}", count) for why, count in judged.misses.most_common()),
     ]
@@ -45,6 +46,7 @@ def main() -> None:
     print(
         f"\nOf the replies {LATE_PERMILLE / 10:g} % come up to {3 * TIMEOUT_MS} ms late, "
         f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
+        "\nLater than that: over three time-outs after the request, when the far ends were late to hear it."
     )
 
 

@@ -48,9 +48,10 @@ def _thread_seconds() -> dict[int, float]:
 
 def poll(job: Lines) -> dict[str, Any]:
     import adapter
+    import many_adapter
 
     begun = time.monotonic()
-    with adapter.polling_lines(job.ports, job.baudrate) as poller:
+    with many_adapter.polling_lines(job.ports, job.baudrate) as poller:
         opened = time.monotonic() - begun
         for _ in poller.batches(SETTLE_S):
             pass

@@ -40,9 +40,6 @@ class Unpaced(Played):
         super().__init__(address, **details)
         self.settings = NoTime(self.settings.baudrate, self.settings.format)
 
-    def needed_silence(self) -> float:
-        return 0.0
-
 
 class Unreliable(Unpaced):
     """Played by far_ends: four blocks of one length, whose replies only their values tell apart."""
@@ -52,13 +49,12 @@ class Unreliable(Unpaced):
     most_registers = {HOLDING: 10, INPUT: 10}
     response_timeout = 5e-3
 
-    def needed_silence(self) -> float:
-        return 3e-4
-
-
     s0, s1, s2, s3, s4, s5, s6, s7, s8, s9 = (reading(address) for address in range(20, 30))
     t0, t1, t2, t3, t4, t5, t6, t7, t8, t9 = (reading(address) for address in range(40, 50))
     u0, u1, u2, u3, u4, u5, u6, u7, u8, u9 = (reading(address, table=INPUT) for address in range(10))
+
+    def needed_silence(self) -> float:
+        return 3e-4  # in which a reply that comes twice is over
 
     @classmethod
     def held(cls, address: int, name: str) -> int:
