@@ -20,6 +20,7 @@ from multidrop.drives.yd1000 import YD1000
 from multidrop.errors import LineError
 from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
+from multidrop.sim.dialect import Reason, Refusal
 from multidrop.timing import Settings
 
 FAMILIES = list(MODELS.values())
@@ -362,3 +363,34 @@ def test_every_question_is_a_read_of_the_documents() -> None:
             reads = {it.table.read for it in family.registers.values() if it.readable}
             assert sweep.question.function in reads
     assert len(set(questions(sweeps(FAMILIES)))) < 10
+
+
+class Bare(SimulatedDrive):
+    """An IBD of which only what examples of its manual show is there: the addresses above are inferred."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start >= 200:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().read(function, start, count)
+
+    codes = {}
+
+
+def test_an_ibd_that_does_not_show_its_line_is_found_but_not_named() -> None:
+    line = Line(Pair([Bare(InnovertIBD(3)), Bare(InnovertIBD(4, framing="ascii"))]))
+    plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
+    assert drives(found(line, plan)) == {(3, "", "9600 8N1", "rtu"), (4, "", "9600 8N1", "ascii")}
+
+
+class Anything(SimulatedDrive):
+    """Says 0 for whatever it is asked, as some gateways do."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        return [0] * count
+
+
+def test_a_device_that_answers_everything_is_of_no_family() -> None:
+    line = Line(Pair([Anything(Toy(7))]))
+    (it,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
+    assert isinstance(it, Found)
+    assert (it.address, it.models) == (7, ())

@@ -72,11 +72,10 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [it for it in sweep.addresses if _key(sweep, it) not in self._found]
-        listener = self._listener(sweep)
         garbled: list[int] = []
         for number, address in enumerate(addresses, 1):
             try:
-                completion = self.ask(sweep, sweep.question.to(address), listener)
+                completion = self.ask(sweep, sweep.question.to(address), self._listener(sweep))
             except LineError as refusal:
                 if number > 1:
                     raise
@@ -93,8 +92,6 @@ class _Scan:
                     self._excess = max(self._excess, closer.excess)
                 elif not closer.answers and closer.damaged == TRIES:
                     garbled.append(suspect)
-            if completion.result > 0:
-                listener = self._listener(sweep)  # what it has learnt is of this drive alone
             left = left_after + (len(addresses) - number) * sweep.each
             yield Progress(sweep.settings, sweep.framing, address, left)
         yield from self._explain(sweep, garbled, len(addresses))
