@@ -15,7 +15,6 @@ from typing import Any
 import checksums
 import pytest
 from lines import Faulty, line, plant, polled, proofs, rows_of, until
-from peers import require_module
 from toy import Toy
 
 from multidrop import poller as poller_module
@@ -171,7 +170,7 @@ def test_batches_until_the_caller_leaves_off(port: str) -> None:
 
 @pytest.mark.parametrize("taker", ["pyarrow", "polars"])
 def test_a_batch_is_taken_as_it_is(port: str, taker: str) -> None:
-    module = require_module(taker)
+    module = pytest.importorskip(taker, reason=f"needs {taker}")
     take = {"pyarrow": "record_batch", "polars": "DataFrame"}[taker]
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         batch = next(poller.batches())
