@@ -133,6 +133,8 @@ COMMANDED = sorted({*re.findall(r"`(?:uv run )?multidrop ([^`]+)`", README)})
 def test_its_commands_are_commands(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     name, *arguments = shlex.split(words)
     assert name in COMMANDS
+    if not arguments and name not in {"models", "demo"}:
+        return  # named, not given as it is typed
     module = importlib.import_module(f"multidrop.cli.{COMMANDS[name][0]}")
     monkeypatch.setattr(module, "run", lambda arguments: 0)
     assert main([name, *arguments]) == 0
