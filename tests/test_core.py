@@ -96,7 +96,8 @@ class Far:
             received += more
             used, request = parse_request(Framing.RTU, received)
             while request is not None:
-                os.write(self.fd, self._answer(request))
+                if answer := self._answer(request):
+                    os.write(self.fd, answer)
                 received = received[used:]
                 used, request = parse_request(Framing.RTU, received)
 
