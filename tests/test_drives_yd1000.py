@@ -253,6 +253,14 @@ def test_emergency_stop_is_taken_back_when_it_has_worked() -> None:
     assert wire.sent[-1] == STOP
 
 
+@pytest.mark.parametrize("failure", [Unconfirmed("drive", "stop", "no reply"), DriveRefused("drive", 4, "")])
+def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
+    pulse = frame(YD1000(1), YD1000.control, Control(0xD000))
+    wire = Wire(YD1000(1), STANDING, {pulse: [failure]})
+    wire.drive.emergency_stop()
+    assert wire.sent == [pulse, STOP]
+
+
 def test_coast() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()

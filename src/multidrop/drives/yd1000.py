@@ -11,6 +11,7 @@ from multidrop.drive import (
     Condition,
     Direction,
     Drive,
+    DriveRefused,
     Option,
     Refused,
     Script,
@@ -335,8 +336,15 @@ class YD1000(Drive):
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor as the drive's own emergency stop does, which is a fault."""
-        yield from insist(self.control, STOP | Control.EMERGENCY_STOP)
+        """Stop the motor as the drive's own emergency stop does, which is a fault.
+
+        It is a pulse and sent once. When it is not confirmed, the stop along the ramp follows at once.
+        """
+        try:
+            yield from insist(self.control, STOP | Control.EMERGENCY_STOP, attempts=1)
+        except (Unconfirmed, DriveRefused):
+            yield from self.stop.script()
+            return
         try:
             yield from self._stopped(self._stands, (yield from self._limit()))
         except BusError:
