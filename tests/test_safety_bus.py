@@ -44,7 +44,7 @@ MAKE: dict[str, Callable[[int], Drive]] = {
 assert set(MAKE) == set(MODELS)
 every_family = pytest.mark.parametrize("model", MAKE)
 
-# What starts the motor, of each family, by address and value (drives.md has the documents' words).
+# What starts the motor, of each family, by address and value, in the documents' words.
 STARTS: dict[str, Callable[[Message], bool]] = {
     "erman-er-g-220": lambda it: it.function in (5, 15) and it.start == 0 and it.data != b"\0\0",
     "invt-che": lambda it: it.start == 0x1000 and it.data[-1] in (1, 2, 3, 4),
@@ -261,6 +261,19 @@ def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None
     hall.deafens = hall.loses
     outcome = hall.bus.try_write(drive, drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
+
+
+def test_the_first_look_tells_the_watchdog_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    hall, drive, _ = one(monkeypatch, YD1000(1))
+    assert not hall.frames  # attached, and nothing was sent
+    with caplog.at_level("INFO", "multidrop"):
+        drive.set_frequency(20)
+        drive.start()
+    told = [it.getMessage() for it in caplog.records]
+    off = "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
+    assert told == [f"{drive.name}: {off}"]
 
 
 def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:

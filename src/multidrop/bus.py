@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -79,7 +80,8 @@ class Bus:
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
         """Put a drive on the bus: a family with address, name and so on, or a drive made before.
 
-        Nothing is sent. Raises ValueError for what the family does not allow, or an address taken.
+        Nothing is sent: its watchdog is read and logged at the first look. Raises ValueError for
+        what the family does not allow, or an address taken.
         """
         if isinstance(drive, type):
             if address is None:
@@ -142,9 +144,13 @@ class Bus:
     def introduce(self, drive: Drive) -> None:
         """Look, once, whether the drive at this address is of its family; Refused when it is another.
 
-        The first write does this by itself.
+        The first write does this by itself. The first look also logs what the drive's watchdog does.
         """
-        self._writer.acquaintance.make(drive)
+        acquaintance = self._writer.acquaintance
+        if acquaintance.is_known(drive):
+            return
+        acquaintance.make(drive)
+        logging.getLogger("multidrop").info("%s: %s", drive.name, self.watchdog(drive))
 
     def watchdog(self, drive: Drive) -> str:
         """What becomes of the motor when this client dies, as far as the drive can say."""

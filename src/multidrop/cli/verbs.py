@@ -13,6 +13,7 @@ from multidrop.drive import Direction, Script, State, Write
 from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
+_WATCHED = ("state", *_DIRECTED)  # it is told what becomes of the motor when the client dies
 _ASKED = {  # before they are sent; a stop is never asked for
     "start": "Start the motor of",
     "jog": "Turn the motor of",
@@ -49,20 +50,21 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, "frequency", None) is not None:
             drive.set_frequency(arguments.frequency)
         state = verb(*given)
-        watchdog = bus.watchdog(drive) if arguments.command == "state" else ""
+        watchdog = bus.watchdog(drive) if arguments.command in _WATCHED else ""
         if not isinstance(state, State):
             try:
                 state = drive.state()
             except Unsupported:
                 state = None
     if arguments.json:
-        told = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
-        print(json.dumps(told | ({"watchdog": watchdog} if watchdog else {}), indent=2))
+        record = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
+        print(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
         print(state)
         print(f"watchdog: {watchdog}")
     else:
-        print(f"{drive.name}: {arguments.command} done; state: {state or 'the family cannot say'}")
+        told = f"{drive.name}: {arguments.command} done; state: {state or 'the family cannot say'}"
+        print(told + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
 
 
