@@ -15,6 +15,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
+from multidrop.errors import BusError, Refused, Unsupported
+
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {  # name: its module here, and what it does
@@ -52,7 +54,7 @@ Poll every drive on an RS-485 line as fast as the wire allows.
 {_LIST}
 
 `multidrop COMMAND --help` says what a command takes; --json prints for programs.
-Exit status: 0 done, 1 the line or a drive failed, 2 mistaken call.
+Exit status: 0 done, 1 the line or a drive failed or a rule forbade it, 2 mistaken call.
 """
 
 
@@ -81,7 +83,9 @@ def _guarded(command: str, words: list[str]) -> int:
     except BrokenPipeError:  # whoever reads our output has seen enough
         _abandon_output()
         return DONE
-    except (ValueError, TypeError) as mistake:
+    except Refused as refusal:
+        return _say(str(refusal), FAILED)
+    except (ValueError, TypeError, Unsupported) as mistake:
         return _say(str(mistake), MISTAKE)
     except OSError as failure:
         if failure.strerror is None:  # one of ours
@@ -89,12 +93,8 @@ def _guarded(command: str, words: list[str]) -> int:
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
         return _say(f"{where}{failure.strerror}", FAILED)
-    except Exception as failure:
-        from multidrop.errors import BusError, Refused, Unsupported
-
-        if not isinstance(failure, BusError):
-            raise
-        return _say(str(failure), MISTAKE if isinstance(failure, (Refused, Unsupported)) else FAILED)
+    except BusError as failure:
+        return _say(str(failure), FAILED)
     return status
 
 
