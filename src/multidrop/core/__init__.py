@@ -1,0 +1,79 @@
+"""The only room that imports the compiled module: frames, exchanges and columns for Python."""
+
+from __future__ import annotations
+
+from multidrop.core.columns import COLUMNS, Block, Columns, Field, Wire, raw_value, spell
+from multidrop.core.exchanges import Completion, Exchange, Respondent, Tally, completion, new_completion
+from multidrop.core.frames import (
+    Framing,
+    Message,
+    build_reply,
+    build_request,
+    crc16,
+    lrc,
+    parse_reply,
+    parse_request,
+    reply_length,
+    sum8,
+)
+from multidrop.core.overheard import (
+    HEARD_ROOM,
+    Decoded,
+    Decoder,
+    Heard,
+    Kind,
+    Side,
+    Span,
+    Splitter,
+    Unpacked,
+    Unpacker,
+)
+from multidrop.core.ports import Port, notice_fd, now_ns
+from multidrop.core.results import EXCEPTION_STATUS, STATUSES, Result, status_text
+from multidrop.core.settings import REFUSALS, get_settings, set_settings
+
+__all__ = [
+    "COLUMNS",
+    "EXCEPTION_STATUS",
+    "HEARD_ROOM",
+    "REFUSALS",
+    "STATUSES",
+    "Block",
+    "Columns",
+    "Completion",
+    "Decoded",
+    "Decoder",
+    "Exchange",
+    "Field",
+    "Framing",
+    "Heard",
+    "Kind",
+    "Message",
+    "Port",
+    "Respondent",
+    "Result",
+    "Side",
+    "Span",
+    "Splitter",
+    "Tally",
+    "Unpacked",
+    "Unpacker",
+    "Wire",
+    "build_reply",
+    "build_request",
+    "completion",
+    "crc16",
+    "get_settings",
+    "lrc",
+    "new_completion",
+    "notice_fd",
+    "now_ns",
+    "parse_reply",
+    "parse_request",
+    "raw_value",
+    "reply_length",
+    "set_settings",
+    "spell",
+    "status_text",
+    "sum8",
+]

@@ -1,0 +1,155 @@
+"""An exchange: who is asked what, what is known of how they answer, and what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from multidrop._core import ffi
+from multidrop.core.columns import Block
+from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
+from multidrop.core.results import EXCEPTION_STATUS, Result
+from multidrop.core.settings import settings_to_c
+
+
+class Respondent:
+    """What is known of a drive as one who answers (struct md_drive): shared by all its exchanges.
+
+    `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
+    bit to the reply's first; between them it is learnt from the drive's own response delays.
+    """
+
+    def __init__(self, *, least_timeout: float, most_timeout: float) -> None:
+        self.c = ffi.new(
+            "struct md_drive *",
+            {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
+        )
+
+    @property
+    def failures(self) -> int:
+        """Exchanges in a row without an answer."""
+        return int(self.c.failures)
+
+    @property
+    def late_until_ns(self) -> int:
+        """So long the answer to an earlier request may still come."""
+        return int(self.c.late_until_ns)
+
+    @property
+    def response_delay(self) -> float:
+        """In s, smoothed; 0 before the first reply."""
+        return float(self.c.delay_ns) / 1e9
+
+    def tally(self) -> Tally:
+        """What became of its exchanges so far."""
+        found = self.c.tally
+        return Tally(
+            found.exchanges,
+            found.answered,
+            found.values,
+            found.exceptions,
+            found.late,
+            found.stray_bytes,
+            found.ideal_ns,
+            {Result(-code): count for code, count in enumerate(found.missed) if count},
+        )
+
+
+class Tally(NamedTuple):
+    """What became of a drive's exchanges, by number (struct md_tally)."""
+
+    exchanges: int
+    answered: int
+    values: int
+    exceptions: int  # values that the drive refused
+    late: int
+    stray_bytes: int
+    ideal_ns: int
+    missed: dict[Result, int]  # values, by reason
+
+
+class Exchange:
+    """One request and all that is needed to carry it out; made once, run as often as wanted.
+
+    Times are in seconds: `character` of one character, `silence` before the request and after
+    its reply, `turnaround` after a broadcast. `block` is what rows are made of.
+    """
+
+    __slots__ = ("block", "c", "framing", "request", "respondent", "settings")
+
+    def __init__(
+        self,
+        framing: Framing,
+        request: Message,
+        respondent: Respondent,
+        *,
+        baudrate: int,
+        format: str,
+        character: float,
+        silence: float,
+        turnaround: float = 0.1,
+        block: Block | None = None,
+    ) -> None:
+        build_request(framing, request)  # raises for what no frame can say
+        self.framing = framing
+        self.request = request
+        self.respondent = respondent
+        self.block = block
+        self.settings = (baudrate, format)
+        self.c = ffi.new(
+            "struct md_exchange *",
+            {
+                "framing": framing,
+                "request": to_c(request)[0],
+                "settings": settings_to_c(baudrate, format),
+                "character_ns": round(character * 1e9),
+                "silence_ns": round(silence * 1e9),
+                "turnaround_ns": round(turnaround * 1e9),
+                "drive": respondent.c,
+                "block": block.c if block else ffi.NULL,
+            },
+        )
+
+
+@dataclass(frozen=True)
+class Completion:
+    """What became of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
+
+    result: int
+    error: int
+    begun_ns: int
+    sent_ns: int
+    first_ns: int
+    last_ns: int
+    stale: int
+    skipped: int
+    reply: Message
+    raw: bytes
+
+    @property
+    def status(self) -> int:
+        """As a column has it: 0, the reason's number, or EXCEPTION_STATUS + exception code."""
+        if self.result <= 0:
+            return -self.result
+        return EXCEPTION_STATUS + self.reply.exception if self.reply.exception else 0
+
+
+def new_completion() -> Any:
+    """The core's own memory for what becomes of one exchange (struct md_completion)."""
+    return ffi.new("struct md_completion *")
+
+
+def completion(found: Any) -> Completion:
+    """What the core's memory says."""
+    return Completion(
+        found.result,
+        found.error,
+        found.begun_ns,
+        found.sent_ns,
+        found.first_ns,
+        found.last_ns,
+        found.stale,
+        found.skipped,
+        from_c(found.reply),
+        bytes(ffi.buffer(found.raw, found.raw_len)),
+    )

@@ -1,0 +1,100 @@
+"""Frames: their meaning as bytes in three framings, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from multidrop._core import ffi, lib
+
+crc16 = lib.md_crc16
+lrc = lib.md_lrc
+sum8 = lib.md_sum
+
+
+class Framing(IntEnum):
+    RTU = lib.MD_RTU
+    ASCII = lib.MD_ASCII
+    DELIXI = lib.MD_DELIXI
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class Message:
+    """One frame's meaning, whatever its framing (struct md_message)."""
+
+    address: int
+    function: int
+    start: int = 0
+    count: int = 0
+    data: bytes = b""
+    exception: int = 0
+
+
+def to_c(message: Message) -> Any:
+    if len(message.data) > lib.MD_MOST_DATA:
+        raise ValueError(f"{len(message.data)} data bytes do not fit a frame: {lib.MD_MOST_DATA} at most")
+    return ffi.new(
+        "struct md_message *",
+        {
+            "address": message.address,
+            "function": message.function,
+            "exception": message.exception,
+            "start": message.start,
+            "count": message.count,
+            "data_len": len(message.data),
+            "data": list(message.data),
+        },
+    )
+
+
+def from_c(found: Any) -> Message:
+    return Message(
+        found.address,
+        found.function,
+        found.start,
+        found.count,
+        bytes(ffi.buffer(found.data, found.data_len)),
+        found.exception,
+    )
+
+
+def _build(build: Any, framing: Framing, message: Message) -> bytes:
+    room = lib.MD_MOST_FRAME
+    out = ffi.new("uint8_t[]", room)
+    length = build(framing, to_c(message), out, room)
+    if length < 0:
+        raise ValueError(f"no {framing} frame can say {message}")
+    return bytes(ffi.buffer(out, length))
+
+
+def build_request(framing: Framing, message: Message) -> bytes:
+    """The frame of a request; ValueError when a field is out of bounds."""
+    return _build(lib.md_build_request, framing, message)
+
+
+def build_reply(framing: Framing, message: Message) -> bytes:
+    """The frame of a reply, for the drive's side; ValueError when a field is out of bounds."""
+    return _build(lib.md_build_reply, framing, message)
+
+
+def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | None]:
+    """The request at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    found = ffi.new("struct md_message *")
+    used = lib.md_parse_request(framing, received, len(received), found)
+    return used, from_c(found) if used > 0 else None
+
+
+def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
+    """The reply to `request` at the beginning of `received`: as parse_request."""
+    found = ffi.new("struct md_message *")
+    used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
+    return used, from_c(found) if used > 0 else None
+
+
+def reply_length(framing: Framing, request: Message) -> int:
+    """Length in bytes of the good reply to `request`; 0 after a broadcast."""
+    return int(lib.md_reply_length(framing, to_c(request)))
