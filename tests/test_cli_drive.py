@@ -20,7 +20,7 @@ from multidrop.sim.wire import Wire
 
 __all__ = ["run"]  # a fixture
 
-DOG = "watchdog: The document names no watchdog: the motor runs on when the master dies."
+DOG = "watchdog: The document names no watchdog: the motor runs on when the client dies."
 
 
 class Stubborn(SimulatedDrive):

@@ -27,6 +27,7 @@ OUTSIDE = {
 FLOORS = [
     {"errors", "mistakes", "audit", "ledger", "parting"},
     {"core", "register", "timing"},
+    {"script", "state"},
     {
         "line",
         "schedule",

@@ -1,21 +1,34 @@
 """Drive: what a family's manual says, collected from its registers, and the verbs that command it.
 
-A family is a subclass that declares registers. Its verbs are scripts: generators that yield steps
-(read, write, wait) and receive results, so that they are written down without any I/O. Called on
-a drive that is attached to a bus, a verb is carried out there.
+A family is a subclass that declares registers. Its verbs are scripts; called on a drive that is
+attached to a bus, a verb is carried out there.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from multidrop.core import Framing
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 from multidrop.register import Access, Kept, Register, Table
+from multidrop.script import (
+    Insist,
+    Read,
+    Script,
+    Step,
+    Wait,
+    Write,
+    carry_out,
+    insist,
+    read,
+    until,
+    wait,
+    write,
+)
+from multidrop.state import Condition, Direction, State
 from multidrop.timing import Settings
 
 __all__ = [  # also the names of other modules that a family's file needs
@@ -54,40 +67,6 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
-class Direction(Enum):
-    FORWARD = "forward"
-    REVERSE = "reverse"
-
-
-class Condition(Enum):
-    STOPPED = "stopped"
-    RUNNING = "running"
-    ACCELERATING = "accelerating"
-    DECELERATING = "decelerating"
-    FAULT = "fault"
-    UNKNOWN = "unknown"  # the drive cannot say; never to be taken for stopped
-
-
-@dataclass(frozen=True)
-class State:
-    """What a drive says of itself: never more than its document lets it say."""
-
-    condition: Condition
-    direction: Direction | None = None
-    fault: str | None = None
-    note: str = ""
-
-    def __str__(self) -> str:
-        words = [self.condition.value]
-        if self.direction:
-            words.append(self.direction.value)
-        if self.fault:
-            words.append(f"({self.fault})")
-        if self.note:
-            words.append(f"- {self.note}")
-        return " ".join(words)
-
-
 @dataclass(frozen=True)
 class Option:
     """A fact about one drive that only its owner knows, such as its maximum frequency."""
@@ -95,86 +74,6 @@ class Option:
     unit: str
     span: tuple[float, float]
     meaning: str
-
-
-# ---- scripts: the steps a verb consists of ----
-
-
-@dataclass(frozen=True)
-class Read:
-    register: Register[Any]
-
-
-@dataclass(frozen=True)
-class Write:
-    register: Register[Any]
-    value: Any
-
-
-@dataclass(frozen=True)
-class Insist(Write):
-    """A write that does no harm at any time, nor when it is repeated: a stop, or a command taken back."""
-
-
-@dataclass(frozen=True)
-class Wait:
-    seconds: float
-
-
-Step = Read | Write | Wait
-Script = Generator[Step, Any, R]
-
-
-def read(register: Register[T]) -> Script[T]:
-    """The register's value, as `value = yield from read(register)`."""
-    return cast(T, (yield Read(register)))
-
-
-def write(register: Register[T], value: T) -> Script[T]:
-    """Write once; what the drive then holds, where that can be read, else `value`."""
-    return cast(T, (yield Write(register, value)))
-
-
-def wait(seconds: float) -> Script[None]:
-    yield Wait(seconds)
-
-
-def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
-    """Do a script's steps; what it returns. A step's failure is raised in it, and may be mended there."""
-    try:
-        step = next(script)
-        while True:
-            try:
-                result = do(step)
-            except (BusError, ValueError) as failure:
-                step = script.throw(failure)
-            else:
-                step = script.send(result)
-    except StopIteration as end:
-        return cast(R, end.value)
-
-
-def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
-    """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
-    for attempt in range(1, attempts + 1):
-        try:
-            yield Insist(register, value)
-        except (Unconfirmed, DriveRefused):
-            if attempt == attempts:
-                raise
-        else:
-            return
-
-
-def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Look again and again until it is true; False when `limit` seconds have passed."""
-    waited = 0.0
-    while not (yield from look()):
-        if waited >= limit:
-            return False
-        yield from wait(every)
-        waited += every
-    return True
 
 
 # Verbs before which the drive must be known to be of its family; a stop goes to a silent one too.
@@ -270,7 +169,7 @@ class Drive:
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
-    watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the master dies."
+    watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
 

@@ -1,0 +1,93 @@
+"""Scripts: the steps a verb consists of, written down as a generator without any I/O.
+
+A script yields steps (read, write, wait) and receives what they gave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+from multidrop.errors import BusError, DriveRefused, Unconfirmed
+from multidrop.register import Register
+
+T = TypeVar("T", bound=float)
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Read:
+    register: Register[Any]
+
+
+@dataclass(frozen=True)
+class Write:
+    register: Register[Any]
+    value: Any
+
+
+@dataclass(frozen=True)
+class Insist(Write):
+    """A write that does no harm at any time, nor when it is repeated: a stop, or a command taken back."""
+
+
+@dataclass(frozen=True)
+class Wait:
+    seconds: float
+
+
+Step = Read | Write | Wait
+Script = Generator[Step, Any, R]
+
+
+def read(register: Register[T]) -> Script[T]:
+    """The register's value, as `value = yield from read(register)`."""
+    return cast(T, (yield Read(register)))
+
+
+def write(register: Register[T], value: T) -> Script[T]:
+    """Write once; what the drive then holds, where that can be read, else `value`."""
+    return cast(T, (yield Write(register, value)))
+
+
+def wait(seconds: float) -> Script[None]:
+    yield Wait(seconds)
+
+
+def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
+    """Do a script's steps; what it returns. A step's failure is raised in it, and may be mended there."""
+    try:
+        step = next(script)
+        while True:
+            try:
+                result = do(step)
+            except (BusError, ValueError) as failure:
+                step = script.throw(failure)
+            else:
+                step = script.send(result)
+    except StopIteration as end:
+        return cast(R, end.value)
+
+
+def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
+    """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
+    for attempt in range(1, attempts + 1):
+        try:
+            yield Insist(register, value)
+        except (Unconfirmed, DriveRefused):
+            if attempt == attempts:
+                raise
+        else:
+            return
+
+
+def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
+    """Look again and again until it is true; False when `limit` seconds have passed."""
+    waited = 0.0
+    while not (yield from look()):
+        if waited >= limit:
+            return False
+        yield from wait(every)
+        waited += every
+    return True
