@@ -40,7 +40,7 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         reply->data[2] = (uint8_t)(request->start >> 8);
         reply->data[3] = (uint8_t)request->start;
     } else if (framing != MD_DELIXI && request->function >= 0x0F)
-        *reply = *request;
+        md_copy_message(reply, request);
 }
 
 /* Rows of the last request: what its reply says, or why there is none. 0 when there is no room. */
@@ -53,7 +53,7 @@ static int add_rows(struct md_decoder *decoder, int result, struct md_columns *c
     completion->sent_ns = decoder->asked_ns;
     completion->first_ns = decoder->span.time_ns;
     if (result > 0) {
-        completion->reply = decoder->span.message;
+        md_copy_message(&completion->reply, &decoder->span.message);
         put_written(&completion->reply, decoder->span.framing, &decoder->splitter.request);
     }
     if (!md_columns_add(columns, decoder->block, completion, 0))

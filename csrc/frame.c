@@ -125,6 +125,14 @@ static void get_body(int shape, const uint8_t *body, struct md_message *message)
     memcpy(message->data, body + data_at, data_len);
 }
 
+/* All but the data, which costs more to clear than to parse. */
+static void begin_message(struct md_message *message, uint8_t address, uint8_t function)
+{
+    memset(message, 0, offsetof(struct md_message, data));
+    message->address = address;
+    message->function = function;
+}
+
 /* Length of a request's body from its first bytes; MD_INCOMPLETE when they do not tell yet. A
  * count that cannot be answered is still a request, where the length does not depend on it: the
  * drive's side answers it with an exception. */
@@ -195,6 +203,12 @@ static int hex_digit(uint8_t character)
     return -1;
 }
 
+int md_hex_byte(const uint8_t digits[2])
+{
+    int high = hex_digit(digits[0]), low = hex_digit(digits[1]);
+    return high < 0 || low < 0 ? -1 : high << 4 | low;
+}
+
 static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
 {
     return framing == MD_ASCII ? md_lrc(body, len) : md_sum(body, len);
@@ -207,12 +221,12 @@ static int open_text(int framing, const uint8_t *text, size_t len, const struct 
     size_t have = 0;
     int stopped = MD_INCOMPLETE; /* why no more digits can be read */
     while (have <= MOST_BODY && 2 * have + 2 < len) {
-        int high = hex_digit(text[2 * have + 1]), low = hex_digit(text[2 * have + 2]);
-        if (high < 0 || low < 0) {
+        int byte = md_hex_byte(text + 2 * have + 1);
+        if (byte < 0) {
             stopped = MD_BAD_CHARACTER;
             break;
         }
-        body[have++] = (uint8_t)(high << 4 | low);
+        body[have++] = (uint8_t)byte;
     }
     int length = body_length(framing, body, have, request);
     if (length < 0)
@@ -387,7 +401,7 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
     int used = open_frame(framing, bytes, len, NULL, text, &body);
     if (used <= 0)
         return used;
-    *message = (struct md_message){.address = body[0], .function = body[1]};
+    begin_message(message, body[0], body[1]);
     get_body(request_shape(framing, body[1]), body, message);
     return used;
 }
@@ -403,7 +417,7 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
     int is_exception = body[1] != request->function;
     if (!is_exception && !confirms(framing, body, request))
         return MD_BAD_ECHO;
-    *reply = (struct md_message){.address = body[0], .function = request->function};
+    begin_message(reply, body[0], request->function);
     if (is_exception) {
         reply->exception = framing == MD_DELIXI ? body[1] : body[2];
         return used;
@@ -440,4 +454,9 @@ int md_is_mistakable(int framing, const struct md_message *one, const struct md_
     if (find_function(one->function)->reply == DATA)
         return md_reply_length(framing, one) == md_reply_length(framing, other);
     return one->start == other->start;
+}
+
+void md_copy_message(struct md_message *to, const struct md_message *from)
+{
+    memcpy(to, from, offsetof(struct md_message, data) + from->data_len);
 }

@@ -247,7 +247,7 @@ static void search(struct md_line *line)
             at += line->tx_len - 1u;
         }
         if (used > 0) {
-            line->completion->reply = reply;
+            md_copy_message(&line->completion->reply, &reply);
             line->completion->skipped -= (uint32_t)used;
             learn_echo(line, at);
             measure(line, used);

@@ -78,6 +78,12 @@ int md_is_mistakable(int framing, const struct md_message *one, const struct md_
 /* Length in bytes of the good reply to `request`; 0 when nobody answers (broadcast). */
 int md_reply_length(int framing, const struct md_message *request);
 
+/* Copy what the message has: most are much shorter than the longest. */
+void md_copy_message(struct md_message *to, const struct md_message *from);
+
+/* What two upper-case hex digits say; -1 where they are none. */
+int md_hex_byte(const uint8_t digits[2]);
+
 /* ---- port.c ---- */
 
 struct md_settings {

@@ -58,13 +58,6 @@ static int find_request(int framing, const uint8_t *bytes, size_t len, struct md
     return message->address > MOST_ADDRESS ? MD_BAD_ADDRESS : used;
 }
 
-static int hex_digit(uint8_t character)
-{
-    if (character >= '0' && character <= '9')
-        return character - '0';
-    return character >= 'A' && character <= 'F' ? character - 'A' + 10 : -1;
-}
-
 /* The first bytes of the body, 0 where there are none. */
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[6])
 {
@@ -74,10 +67,10 @@ static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t hea
             head[i] = bytes[i];
         if (framing == MD_RTU || 2 * i + 2 >= len)
             continue;
-        int high = hex_digit(bytes[2 * i + 1]), low = hex_digit(bytes[2 * i + 2]);
-        if (high < 0 || low < 0)
+        int byte = md_hex_byte(bytes + 2 * i + 1);
+        if (byte < 0)
             return;
-        head[i] = (uint8_t)(high << 4 | low);
+        head[i] = (uint8_t)byte;
     }
 }
 
@@ -147,7 +140,7 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
         splitter->awaited = 0;
     if (span->kind != MD_REQUEST && span->kind != MD_EITHER)
         return;
-    splitter->request = span->message;
+    md_copy_message(&splitter->request, &span->message);
     splitter->framing = span->framing;
     splitter->awaited = span->message.address != 0;
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import checksums
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -56,6 +57,15 @@ def test_lrc(data: bytes, checksum: int) -> None:
 )
 def test_delixi_s_sum(data: bytes, checksum: int) -> None:
     assert sum8(data, len(data)) == checksum
+
+
+@pytest.mark.parametrize("at", range(4))
+@pytest.mark.parametrize("more", range(4))
+def test_crc16_is_what_is_defined_bit_by_bit(at: int, more: int) -> None:
+    """Every byte value at every place among the four that are taken at once, and single ones behind."""
+    for byte in range(256):
+        data = bytes(at) + bytes([byte]) + bytes(3 - at) + bytes([byte] * more)
+        assert data + crc(data).to_bytes(2, "little") == checksums.rtu(data)
 
 
 frames = st.binary(min_size=1, max_size=255)
