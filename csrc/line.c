@@ -169,6 +169,10 @@ static void expect_late_answer(struct md_line *line)
     drive->late = exchange->request;
     drive->late_framing = exchange->framing;
     drive->late_until_ns = later(until_ns, drive->late_until_ns);
+    for (const struct md_drive *owes = line->late; owes; owes = owes->next_late)
+        if (owes == drive)
+            return;
+    drive->next_late = line->late;
     line->late = drive;
 }
 
@@ -184,18 +188,40 @@ static int is_ambiguous(const struct md_exchange *exchange, int64_t now_ns)
            (drive->late_others && md_is_mistakable(exchange->framing, &other, &exchange->request));
 }
 
-/* What came unasked may be the answer to an earlier request; then it need not be waited for. */
-static void recognise_late_answer(struct md_line *line)
+/* Whether the answer to an earlier request begins there: its length, MD_INCOMPLETE or a reason. That
+ * drive need not be waited for then, and what has come for it is no reply to anything else. */
+static int parse_late_at(struct md_line *line, size_t at, int64_t now_ns)
 {
     struct md_message reply;
-    struct md_drive *drive = line->late;
-    for (size_t at = 0; drive && at < line->rx_len; at++) {
-        if (md_parse_reply(drive->late_framing, line->rx + at, line->rx_len - at, &drive->late, &reply) <= 0)
+    int found = MD_NO_START;
+    for (struct md_drive **link = &line->late; *link;) {
+        struct md_drive *drive = *link;
+        if (now_ns >= drive->late_until_ns) { /* not to be expected any more */
+            *link = drive->next_late;
             continue;
-        drive->tally.late++;
-        if (!drive->late_others)
-            drive->late_until_ns = 0;
-        drive = line->late = NULL;
+        }
+        int used = md_parse_reply(drive->late_framing, line->rx + at, line->rx_len - at, &drive->late, &reply);
+        if (used > 0) {
+            *link = drive->next_late;
+            drive->tally.late++;
+            if (!drive->late_others)
+                drive->late_until_ns = 0;
+            return used;
+        }
+        if (used == MD_INCOMPLETE)
+            found = used;
+        link = &drive->next_late;
+    }
+    return found;
+}
+
+/* Among bytes that came unasked. */
+static void recognise_late_answers(struct md_line *line, int64_t now_ns)
+{
+    for (size_t at = 0; line->late && at < line->rx_len; at++) {
+        int used = parse_late_at(line, at, now_ns);
+        if (used > 0)
+            at += (size_t)used - 1;
     }
 }
 
@@ -233,18 +259,26 @@ static void learn_echo(struct md_line *line, size_t reply_at)
             line->echoes = 1;
 }
 
-/* Look for the reply at every place where it may still begin. */
-static void search(struct md_line *line)
+/* What is no part of this exchange, as far as anyone can tell from the rest. */
+static void cut_out(struct md_line *line, size_t at, size_t len)
+{
+    line->rx_len = (uint16_t)(line->rx_len - len);
+    memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
+}
+
+/* Look for the reply at every place where it may still begin. A late answer is looked for only where
+ * what precedes it cannot be the reply's beginning: it may be the inside of the reply. */
+static void search(struct md_line *line, int64_t now_ns)
 {
     struct md_message reply;
-    size_t first_open = line->rx_len;
-    for (size_t at = line->rx_from; at < line->rx_len; at++) {
+    size_t at = line->rx_from, first_open = SIZE_MAX;
+    while (at < line->rx_len) {
         int used = parse_at(line, at, &reply);
         if (used > 0 && line->echo_due && is_copy(line, at)) {
             line->echo_due = 0; /* the adapter's, not the drive's */
-            used = MD_NO_START;
-            first_open = line->rx_len;
-            at += line->tx_len - 1u;
+            first_open = SIZE_MAX;
+            at += line->tx_len;
+            continue;
         }
         if (used > 0) {
             md_copy_message(&line->completion->reply, &reply);
@@ -254,10 +288,17 @@ static void search(struct md_line *line)
             finish(line, used, line->rx + at, (size_t)used);
             return;
         }
-        if (used == MD_INCOMPLETE && at < first_open)
+        if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
+            used = parse_late_at(line, at, now_ns);
+        if (used > 0) {
+            cut_out(line, at, (size_t)used);
+            continue;
+        }
+        if (used == MD_INCOMPLETE && first_open == SIZE_MAX)
             first_open = at;
+        at++;
     }
-    line->rx_from = (uint16_t)first_open;
+    line->rx_from = first_open < line->rx_len ? (uint16_t)first_open : line->rx_len;
 }
 
 /* A reply that has begun comes character by character: it is not worth looking at each. */
@@ -394,7 +435,7 @@ static void take_stale(struct md_line *line, const uint8_t *bytes, size_t len, i
         line->state = SILENT;
     for (size_t at = 0; at < len;)
         at += keep(line, bytes + at, len - at);
-    recognise_late_answer(line);
+    recognise_late_answers(line, now_ns);
 }
 
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
@@ -412,7 +453,7 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
     completion->skipped += (uint32_t)len;
     for (size_t at = 0; at < len && line->state != IDLE;) {
         at += keep(line, bytes + at, len - at);
-        search(line);
+        search(line, now_ns);
     }
     if (line->state == LISTENING)
         foresee(line, now_ns);

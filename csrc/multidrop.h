@@ -122,6 +122,7 @@ struct md_drive {
     struct md_message late;
     int late_framing;
     int late_others;                /* and answers to requests before that one, too */
+    struct md_drive *next_late;     /* on the same line, whose answer may still come */
     uint32_t failures;              /* in a row */
     struct md_tally tally;
 };
@@ -166,7 +167,7 @@ struct md_line {
     int64_t wake_ns;
     int64_t give_up_ns; /* until then it waits for a babbling line to fall silent, or for the reply */
     int64_t ready_ns;   /* before then the reply cannot be whole */
-    struct md_drive *late; /* whose answer may still come */
+    struct md_drive *late; /* the first of those whose answers may still come */
     const struct md_exchange *exchange;
     struct md_completion *completion;
     uint16_t tx_len, tx_at;

@@ -219,16 +219,84 @@ def test_a_late_answer_is_recognised_and_ends_the_waiting(
     assert (found.reply.data, found.stale) == (words(2222), 7)
 
 
-def test_a_late_answer_within_another_drive_s_exchange_is_not_its_reply(
+def respondent() -> Respondent:
+    return Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+
+
+def answer_of(address: int, *values: int) -> bytes:
+    return build_reply(Framing.RTU, Message(address, 3, data=words(*values)))
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize(
+    "junk", [b"", b"\x00", b"\x02", b"\x01"], ids=["", "00", "our address", "its address"]
+)
+def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
+    line: LineDriver, drive: Respondent, junk: bytes, piece: int
+) -> None:
+    time_out(line, drive)
+    ask(line, respondent(), Message(2, 3, 0, 1))
+    line.receive(junk + reply(1111), piece)
+    assert line.listens
+    assert (drive.tally().late, drive.late_until_ns) == (1, 0)
+    line.receive(answer_of(2, 5), piece)
+    assert line.want == "done"
+    assert (line.completion.reply.data, line.completion.skipped) == (words(5), len(junk) + 7)
+    ask(line, drive, OTHER)  # it need not be waited for any more
+
+
+def test_all_who_owe_an_answer_are_recognised(line: LineDriver) -> None:
+    drives = {address: respondent() for address in (1, 2, 3)}
+    for address, it in drives.items():
+        time_out(line, it, Message(address, 3, 0, address))
+    ask(line, respondent(), Message(9, 3, 0, 1))
+    line.receive(answer_of(3, 1, 2, 3) + answer_of(1, 1))
+    assert [it.tally().late for it in drives.values()] == [1, 0, 1]
+    assert [bool(it.late_until_ns) for it in drives.values()] == [False, True, False]
+    line.receive(answer_of(2, 1, 2) + answer_of(9, 4))
+    assert line.completion.reply.data == words(4)
+    assert drives[2].tally().late == 1
+
+
+def test_a_late_answer_of_the_drive_that_is_asked_something_else(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive)
+    ask(line, drive, LONGER)
+    line.receive(reply(1111))
+    assert line.listens
+    assert (drive.tally().late, drive.late_until_ns) == (1, 0)
+    line.receive(answer_of(1, 7, 8))
+    assert line.completion.reply.data == words(7, 8)
+
+
+def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive)
+    ask(line, other := respondent(), Message(2, 3, 0, 1))
+    line.receive(reply(1111))
+    line.wait_until_done()
+    assert (line.completion.result, line.completion.skipped) == (Result.NO_REPLY, 7)
+    assert other.late_until_ns > line.now
+
+
+def test_what_the_reply_s_own_data_look_like_is_no_late_answer(line: LineDriver, drive: Respondent) -> None:
+    """Whether it comes at once or byte by byte: the bar stays, and the reply is read."""
+    time_out(line, drive)
+    until = drive.late_until_ns
+    inside = reply(1111) + b"\x00"
+    ask(line, respondent(), Message(2, 3, 0, 4))
+    line.receive(build_reply(Framing.RTU, Message(2, 3, data=inside)), 1)
+    assert line.completion.reply.data == inside
+    assert (drive.tally().late, drive.late_until_ns) == (0, until)
+
+
+def test_a_frame_of_a_drive_that_owes_nothing_any_more_is_a_stray_one(
     line: LineDriver, drive: Respondent
 ) -> None:
     time_out(line, drive)
-    other = Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
-    ask(line, other, Message(2, 3, 0, 1))
+    line.now = drive.late_until_ns
+    ask(line, respondent(), Message(2, 3, 0, 1))
     line.receive(reply(1111))
-    assert line.listens
-    line.receive(build_reply(Framing.RTU, Message(2, 3, data=words(5))))
-    assert (line.completion.reply.data, line.completion.skipped) == (words(5), 7)
+    line.wait_until_done()
+    assert (line.completion.result, drive.tally().late) == (Result.BAD_ADDRESS, 0)
 
 
 def test_damage_is_not_silence(line: LineDriver, drive: Respondent) -> None:
