@@ -94,22 +94,11 @@ static int is_failure(int result)
 static void count(const struct md_exchange *exchange, const struct md_completion *completion)
 {
     struct md_drive *drive = exchange->drive;
-    struct md_tally *tally = &drive->tally;
-    uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
-    tally->exchanges++;
-    tally->stray_bytes += completion->stale + completion->skipped;
-    if (completion->result < 0)
-        tally->missed[-completion->result] += values;
-    else if (completion->reply.exception)
-        tally->exceptions += values;
-    else
-        tally->values += values;
+    md_tally_end(&drive->tally, exchange, completion);
     if (is_failure(completion->result))
         drive->failures++;
-    if (completion->result > 0) {
-        tally->answered++;
+    if (completion->result > 0)
         drive->failures = 0;
-    }
 }
 
 static void finish(struct md_line *line, int result, const uint8_t *raw, size_t raw_len)
@@ -146,7 +135,8 @@ static void measure(struct md_line *line, int reply_len)
     if (line->looks == 1 && line->ready_ns && early_ns(exchange) < delay_ns)
         delay_ns = early_ns(exchange);
     learn_delay(exchange->drive, delay_ns);
-    exchange->drive->tally.ideal_ns += (uint64_t)(line->silence_ns + request_ns + delay_ns + reply_ns);
+    int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
+    md_tally_answer(&exchange->drive->tally, delay_ns, ideal_ns);
 }
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)

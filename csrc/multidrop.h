@@ -103,14 +103,21 @@ int md_port_get(int fd, struct md_settings *settings);
 
 /* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
 
-/* What became of a drive's exchanges. Values are those of the exchange's block, or one. */
+enum { MD_DELAY_BUCKETS = 128 };
+
+/* What became of a drive's exchanges (tally.c). Values are those of the exchange's block, or one. */
 struct md_tally {
     uint64_t exchanges, answered, values;
+    uint64_t sent;        /* requests that began to leave */
+    uint64_t ended[16];   /* exchanges that were not answered, by -result; 0: broadcasts */
     uint64_t missed[16];  /* values, by -result */
-    uint64_t exceptions;  /* values that the drive refused */
+    uint32_t refused[256]; /* values, by exception code */
+    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7, 6 */
     uint64_t late;        /* answers that came after their time-out */
     uint64_t stray_bytes; /* bytes that were no part of a reply */
     uint64_t ideal_ns;    /* what the answered exchanges had to take of the line */
+    uint64_t delays[128]; /* replies, by their response delay: bucket n is from md_delay_edge(n) to that of n + 1 */
+    int64_t longest_ns;   /* response delay */
 };
 
 /* What is known of a drive: the bounds of its time-out are given, the rest is learnt from its
@@ -187,6 +194,15 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
+
+/* ---- tally.c: what became of a drive's exchanges, counted ---- */
+
+/* An exchange is over, as its completion says. */
+void md_tally_end(struct md_tally *tally, const struct md_exchange *exchange, const struct md_completion *completion);
+/* It was answered after this delay, and had to take so long of the line. */
+void md_tally_answer(struct md_tally *tally, int64_t delay_ns, int64_t ideal_ns);
+/* The least delay of a bucket; it is less than a part in 8 longer than that, but in the first and the last. */
+int64_t md_delay_edge(int bucket);
 
 /* ---- engine.c: the thread that runs every line of the process ---- */
 

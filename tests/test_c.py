@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = ["tests/c/test_core.c", *(f"csrc/{name}.c" for name in ("checksum", "frame", "line", "columns"))]
+SOURCES = [
+    "tests/c/test_core.c",
+    *(f"csrc/{name}.c" for name in ("checksum", "frame", "line", "tally", "columns")),
+]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 CC = os.environ.get("CC", "cc")

@@ -38,6 +38,7 @@ FLOORS = [
         "drives",
         "rules",
         "outcome",
+        "statistics",
         "stopping",
         "motion",
     },

@@ -46,6 +46,10 @@ if TYPE_CHECKING:
     from multidrop.register import command as command
     from multidrop.register import reading as reading
     from multidrop.register import setting as setting
+    from multidrop.statistics import Delays as Delays
+    from multidrop.statistics import Diagnostics as Diagnostics
+    from multidrop.statistics import LineStatistics as LineStatistics
+    from multidrop.statistics import Statistics as Statistics
 
 # Every public name and the module that it comes from, which is loaded when the name is first used.
 _HOMES = {
@@ -73,6 +77,7 @@ _HOMES = {
     "poller": ("Poller",),
     "recording": ("convert", "open_reader", "open_writer"),
     "register": ("Register", "command", "reading", "setting"),
+    "statistics": ("Delays", "Diagnostics", "LineStatistics", "Statistics"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -20,6 +20,7 @@ from multidrop.outcome import Outcome
 from multidrop.parting import Parting
 from multidrop.register import Register
 from multidrop.rules import check_own, check_plain, raw_count
+from multidrop.statistics import LineStatistics, look
 from multidrop.stopping import Stopped, stop_together
 from multidrop.writing import Writer
 
@@ -59,6 +60,9 @@ class Bus:
         book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
         self._writer = Writer(self._exchanges, book, log, expiry)
         self._parting: Parting | None = None
+        self._opened_ns = now_ns()
+        self._reset_at = look(0.0, {}, self.line.overruns())
+        self._at_last: LineStatistics | None = None  # when it was closed
 
     def __enter__(self) -> Bus:
         return self
@@ -74,7 +78,9 @@ class Bus:
     def close(self) -> None:
         if self._parting is not None:
             self._parting.now()
+        overruns = self.line.overruns()
         self.line.close()
+        self._at_last = self._at_last or self._counted(overruns)
         self._writer.close()
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
@@ -245,3 +251,20 @@ class Bus:
     def respondent(self, drive: Drive) -> Respondent:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
         return self._exchanges.respondent(drive)
+
+    # ---- how it went ----
+
+    def statistics(self) -> LineStatistics:
+        """Of all exchanges since the bus was opened, or since `reset_statistics`, also per drive.
+
+        It may be asked for at any time, as often as wanted, and from any thread.
+        """
+        return (self._at_last or self._counted(self.line.overruns())).since(self._reset_at)
+
+    def reset_statistics(self) -> None:
+        """Count from here on."""
+        self._reset_at = self._at_last or self._counted(self.line.overruns())
+
+    def _counted(self, overruns: int | None) -> LineStatistics:
+        tallies = {drive.name: self.respondent(drive).tally() for drive in self.drives}
+        return look((now_ns() - self._opened_ns) / 1e9, tallies, overruns)

@@ -5,9 +5,11 @@ the operating system and its clocks.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import select
 import socket
+import struct
 import termios
 import threading
 import time
@@ -32,6 +34,11 @@ def now_ns() -> int:
 _ALL_SETTINGS = sum(REFUSALS)
 _BAUDRATE = min(REFUSALS)
 _NO_SETTINGS = -1
+
+# struct serial_icounter_struct of linux/serial.h
+_TIOCGICOUNT = 0x545D
+_ICOUNTER = struct.Struct("20i")
+_OVERRUN, _BUF_OVERRUN = 7, 10
 
 _PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
 
@@ -273,6 +280,21 @@ class Line:
             refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
             return LineError(self.port, f"the port does not take the {refused} that the drive needs")
         return None
+
+    def overruns(self) -> int | None:
+        """Characters that came too fast for the port, since its driver was loaded.
+
+        None while it is closed, and where the driver does not count them.
+        """
+        counts = bytearray(_ICOUNTER.size)
+        try:
+            if self._bridge or not self._serial:
+                return None
+            fcntl.ioctl(self._serial.fileno(), _TIOCGICOUNT, counts)
+        except (*_PORT_FAILURES, TypeError):  # it may be closed meanwhile
+            return None
+        found = _ICOUNTER.unpack(counts)
+        return int(found[_OVERRUN] + found[_BUF_OVERRUN])
 
     @property
     def queue(self) -> Port | None:

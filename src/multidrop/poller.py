@@ -18,7 +18,7 @@ from typing import Any
 from multidrop import core, plant
 from multidrop.batch import Batch
 from multidrop.bus import Bus, exchange
-from multidrop.core import Columns, Exchange, Field, Port, Respondent, Result
+from multidrop.core import EXCEPTION_STATUS, STATUSES, Columns, Exchange, Field, Port, Respondent, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
@@ -26,6 +26,7 @@ from multidrop.plan import Block, alone, blocks, duration, in_order
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
+from multidrop.statistics import LineStatistics
 
 LOOK_S = 0.05  # the longest that rows wait to be collected
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
@@ -141,7 +142,6 @@ class _PolledLine:
         self.name = declared.name
         self.bus = Bus(declared.port)
         self.schedule: Schedule[_Asked] = Schedule()
-        self.unasked: Counter[tuple[int, Result]] = Counter()  # values, by address and reason
         self.started_ns = self.ended_ns = now_ns()
         self.set_aside: list[_Asked] = []  # a single register that the drive refuses again and again
         self._rows = rows
@@ -187,6 +187,7 @@ class _PolledLine:
 
     def start(self) -> None:
         self.started_ns = self.ended_ns = now_ns()
+        self.bus.reset_statistics()
         place = {drive: at for at, drive in enumerate(in_order(self.bus.drives))}
         for job in sorted(self._jobs, key=lambda job: place[job.owner]):
             self.schedule.add(job, self.started_ns)
@@ -269,7 +270,7 @@ class _PolledLine:
 
     def _miss(self, slots: list[tuple[_Asked, int]], why: Result) -> None:
         for job, _ in slots:
-            self.unasked[job.drive, why] += job.fields.count
+            job.exchange.respondent.unasked[why] += job.fields.count
         self._rows.add_misses(slots, why)
 
     def _regain(self, now: int) -> None:
@@ -317,9 +318,7 @@ class _PolledLine:
         respondent = self.bus.respondent(drive)
         tally = respondent.tally()
         misses = Counter({str(why): count for why, count in tally.missed.items()})
-        misses.update({str(why): n for (address, why), n in self.unasked.items() if address == drive.address})
-        if tally.exceptions:
-            misses["exception"] = tally.exceptions
+        misses.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in tally.refused.items()})
         return {
             "exchanges": tally.exchanges,
             "samples": tally.values,
@@ -401,6 +400,15 @@ class Poller:
             sleep(every if end_ns is None else min(every, max(0.0, (end_ns - now_ns()) / 1e9)))
             while batch := self.take():
                 yield batch
+
+    def statistics(self) -> dict[str, LineStatistics]:
+        """Of each line by name, since polling began or `reset_statistics`, also per drive; cheap."""
+        return {line.name: line.bus.statistics() for line in self._lines}
+
+    def reset_statistics(self) -> None:
+        """Count from here on; `summary` is always since the beginning."""
+        for line in self._lines:
+            line.bus.reset_statistics()
 
     def summary(self) -> dict[str, Any]:
         """So far, per line and drive: exchanges, values, misses by reason, rates, utilisation."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from multidrop.core.columns import COLUMNS, Block, Columns, Field, Wire, raw_value, spell
-from multidrop.core.exchanges import Completion, Exchange, Respondent, Tally, completion, new_completion
+from multidrop.core.exchanges import Completion, Exchange, Respondent, completion, new_completion
 from multidrop.core.frames import (
     Framing,
     Message,
@@ -31,9 +31,11 @@ from multidrop.core.overheard import (
 from multidrop.core.ports import Port, notice_fd, now_ns
 from multidrop.core.results import EXCEPTION_STATUS, STATUSES, Result, status_text
 from multidrop.core.settings import REFUSALS, get_settings, set_settings
+from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
 
 __all__ = [
     "COLUMNS",
+    "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
     "HEARD_ROOM",
     "REFUSALS",
@@ -63,6 +65,7 @@ __all__ = [
     "build_request",
     "completion",
     "crc16",
+    "delay_edge",
     "get_settings",
     "lrc",
     "new_completion",

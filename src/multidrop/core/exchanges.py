@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop._core import ffi
 from multidrop.core.columns import Block
 from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
 from multidrop.core.results import EXCEPTION_STATUS, Result
 from multidrop.core.settings import settings_to_c
+from multidrop.core.tally import Tally, read_tally
 
 
 class Respondent:
@@ -24,6 +26,7 @@ class Respondent:
             "struct md_drive *",
             {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
         )
+        self.unasked: Counter[Result] = Counter()  # values that its client did not ask for, by reason
 
     @property
     def failures(self) -> int:
@@ -41,31 +44,8 @@ class Respondent:
         return float(self.c.delay_ns) / 1e9
 
     def tally(self) -> Tally:
-        """What became of its exchanges so far."""
-        found = self.c.tally
-        return Tally(
-            found.exchanges,
-            found.answered,
-            found.values,
-            found.exceptions,
-            found.late,
-            found.stray_bytes,
-            found.ideal_ns,
-            {Result(-code): count for code, count in enumerate(found.missed) if count},
-        )
-
-
-class Tally(NamedTuple):
-    """What became of a drive's exchanges, by number (struct md_tally)."""
-
-    exchanges: int
-    answered: int
-    values: int
-    exceptions: int  # values that the drive refused
-    late: int
-    stray_bytes: int
-    ideal_ns: int
-    missed: dict[Result, int]  # values, by reason
+        """What became of its exchanges so far, and of values that were due and not asked for."""
+        return read_tally(self.c.tally, self.unasked)
 
 
 class Exchange:

@@ -1,0 +1,54 @@
+/* What became of a drive's exchanges, counted: a few additions for each, in memory that does not grow.
+ *
+ * Numbers only rise, and nobody else writes them: whoever wants those of a span of time takes the
+ * difference of two looks. Response delays fall into buckets, PARTS of them to each doubling. */
+#include "multidrop.h"
+
+enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
+enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
+
+static int bucket(int64_t ns)
+{
+    if (ns < INT64_C(1) << FIRST_DOUBLING)
+        return 0;
+    int doubling = 63 - __builtin_clzll((unsigned long long)ns);
+    int part = (int)(ns >> (doubling - PART_BITS)) & (PARTS - 1);
+    int found = (doubling - FIRST_DOUBLING) * PARTS + part;
+    return found < MD_DELAY_BUCKETS ? found : MD_DELAY_BUCKETS - 1;
+}
+
+int64_t md_delay_edge(int bucket)
+{
+    if (bucket <= 0)
+        return 0;
+    return (int64_t)(PARTS + bucket % PARTS) << (FIRST_DOUBLING - PART_BITS + bucket / PARTS);
+}
+
+void md_tally_end(struct md_tally *tally, const struct md_exchange *exchange, const struct md_completion *completion)
+{
+    uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
+    uint8_t exception = completion->reply.exception;
+    tally->exchanges++;
+    tally->sent += completion->sent_ns != 0;
+    tally->stray_bytes += completion->stale + completion->skipped;
+    if (completion->result <= 0)
+        tally->ended[-completion->result]++;
+    if (completion->result < 0)
+        tally->missed[-completion->result] += values;
+    else if (exception) {
+        tally->exceptions++;
+        tally->naks += exception == NAK;
+        tally->busies += exception == BUSY;
+        tally->refused[exception] += (uint32_t)values;
+    } else
+        tally->values += values;
+    tally->answered += completion->result > 0;
+}
+
+void md_tally_answer(struct md_tally *tally, int64_t delay_ns, int64_t ideal_ns)
+{
+    tally->ideal_ns += (uint64_t)ideal_ns;
+    tally->delays[bucket(delay_ns)]++;
+    if (delay_ns > tally->longest_ns)
+        tally->longest_ns = delay_ns;
+}
