@@ -12,6 +12,7 @@ import struct
 import subprocess
 import termios
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,15 +28,17 @@ from multidrop.cli.keys import DOWN, ENTER, KEYS, UP, next_key
 from multidrop.cli.monitor import _Monitor
 from multidrop.cli.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
 from multidrop.cli.watched import WatchedPlant
+from multidrop.core import Result, Tally
 from multidrop.plant import Plant, load_plant
 from multidrop.recording.recorded import from_rows
+from multidrop.statistics import LineStatistics, look
 
 __all__ = ["plant", "run"]  # fixtures
 
 SECOND = 1_000_000_000
 NOW = 1_795_253_400 * SECOND
 CHE = ("output_frequency", "output_current", "status", "fault")
-MISSES = {"no reply": 3, "bad checksum": 9}
+MISSES = Counter({Result.NO_REPLY: 3, Result.BAD_CHECKSUM: 9})
 
 
 def a_plant(tmp_path: Path, drives: int = 3) -> Plant:
@@ -54,9 +57,19 @@ def row(drive: str, register: str, value: float | None, status: str = "ok", ago:
     return Row(at, at, None if value is None else 1000, drive, register, value, status)
 
 
-def summary(seconds: float, exchanges: int, utilisation: float) -> dict[str, Any]:
-    told = {"seconds": seconds, "exchanges": exchanges, "utilisation": utilisation, "misses": MISSES}
-    return {"lines": {"hall-1": told}}
+def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) -> dict[str, LineStatistics]:
+    """All of it is that of the first drive."""
+    busy = Tally(
+        sent=exchanges,
+        ideal_ns=round(utilisation * seconds * SECOND),
+        missed=MISSES,
+        late=2,
+        stray_bytes=17,
+        longest_ns=31_000_000,
+        delays=Counter({56: 99, 64: 1}),  # 8.4 to 9.4 ms, 16.8 to 18.9 ms
+    )
+    tallies = {f"drive-{at}": busy if at == 1 else Tally() for at in range(1, drives + 1)}
+    return {"hall-1": look(seconds, tallies, None)}
 
 
 @pytest.fixture
@@ -74,8 +87,8 @@ def watched(tmp_path: Path) -> WatchedPlant:
         *(row("drive-3", register, None, "no reply") for register in CHE),
     ]
     it.add(from_rows(rows))
-    it.tick(100.0, summary(10, 1000, 0.9))
-    it.tick(101.0, summary(11, 1050, 0.9))
+    it.tick(100.0, told(10, 1000, 0.9))
+    it.tick(101.0, told(11, 1050, 0.9))
     return it
 
 
@@ -93,7 +106,7 @@ def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
         ("silent", "", "no reply"),
     ]
     assert [it.age(NOW) for it in watched.drives] == [0.5, 9.0, None]
-    assert [it.misses.total() for it in watched.drives] == [0, 1, 4]
+    assert [it.so_far.misses.total() for it in watched.drives] == [12, 0, 0]
 
 
 def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
@@ -105,13 +118,15 @@ def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
 
 
 def test_rates_are_those_of_the_last_seconds(watched: WatchedPlant) -> None:
-    rates = watched.rates["hall-1"]
-    assert rates.exchanges == pytest.approx(50)
-    assert rates.utilisation == pytest.approx(0.9)
-    assert rates.misses == MISSES
+    lately = watched.lately["hall-1"]
+    assert lately.exchanges_per_second == pytest.approx(50)
+    assert lately.utilisation == pytest.approx(0.9)
+    assert lately.misses == {}
+    assert watched.so_far["hall-1"].misses == {"no reply": 3, "bad checksum": 9}
     for second in range(2, 12):
-        watched.tick(100.0 + second, summary(10 + second, 1050, 0.0))
-    assert watched.rates["hall-1"].exchanges == 0
+        watched.tick(100.0 + second, told(10 + second, 1050, 0.0))
+    assert watched.lately["hall-1"].exchanges == 0
+    assert watched.drives[0].lately.exchanges == 0
 
 
 def test_history_has_a_gap_where_a_value_was_missed(watched: WatchedPlant) -> None:
@@ -131,7 +146,7 @@ def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
     assert lines[0].startswith(" multidrop monitor  hall.toml")
     assert lines[0].endswith("09:30:00 UTC ")
     assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
-    assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "██"]
+    assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
     assert lines[4].startswith("!drive-2 fault")
     assert "oc1_overc" in lines[4]
     assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
@@ -144,7 +159,7 @@ def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
 def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
     it = WatchedPlant(a_plant(tmp_path, min(drives, 247)))
     it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
-    it.tick(1.0, summary(1, 1, 1.0))
+    it.tick(1.0, told(1, 1, 1.0, drives))
     for chosen in (0, drives - 1):
         for at in (Position(chosen), Position(chosen, question="Stop?"), Position(chosen, message="m" * 300)):
             for lines in (
@@ -162,13 +177,30 @@ def test_the_page_has_every_register(watched: WatchedPlant) -> None:
     others = {"motor_speed": "0 rpm"}
     lines = texts(page(it, others, Position(1, page=True), (80, 40), NOW))
     assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
-    rows = {line.split()[0]: line for line in lines[2:-2] if line.strip()}
+    rows = {line.split()[0]: line for line in lines[3:-2] if line.strip()}
     readable = {name for name, register in it.polled.drive.registers.items() if register.readable}
     assert set(rows) == readable
     assert rows["output_frequency"].split()[1:] == ["0.00", "Hz", "9.0", "s", "bad", "checksum"]
     assert rows["status"].split()[1:3] == ["not", "yet"]
     assert rows["motor_speed"].split()[1:] == ["0", "rpm", "not", "polled"]
     assert rows["device"].split()[1] == "..."
+
+
+def test_a_wide_overview_has_the_delays(watched: WatchedPlant) -> None:
+    lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
+    assert lines[2].split()[-2:] == ["DELAY", "HISTORY"]
+    assert " 8.9 ms " in lines[3]
+    assert " ms " not in lines[4]
+
+
+def test_the_page_says_how_the_drive_answers(watched: WatchedPlant) -> None:
+    lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
+    assert lines[1] == " forward      12 missed: bad checksum 9, no reply 3"
+    assert lines[2] == (
+        " 50.0 exchanges/s   answers after 8.9 ms, p99 8.9, at most 31.0   2 late   17 bytes skipped"
+    )
+    silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), NOW))
+    assert silent[2] == " 0.0 exchanges/s"
 
 
 def test_the_page_scrolls_as_far_as_there_is_something(watched: WatchedPlant) -> None:

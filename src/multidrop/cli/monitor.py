@@ -93,7 +93,7 @@ class _Monitor:
                 if now >= next_tick:
                     next_tick += 1.0
                     self._take()
-                    self._plant.tick(now, self._poller.summary())
+                    self._plant.tick(now, self._poller.statistics())
                 if now >= next_draw:
                     next_draw = max(next_draw + DRAW_S, now)
                     self._take()

@@ -16,6 +16,7 @@ from multidrop.cli.watched import CURRENT, FREQUENCY, Watched, WatchedPlant
 from multidrop.register import Register
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
+WIDE = 100  # has room for more columns
 OLD = 5.0  # s: an older value is marked
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 HELP = "up/down choose   Enter registers   s stop   S stop all   q quit"
@@ -63,7 +64,8 @@ def page(
     )
     top = [
         Text(head[:width].ljust(width), style="reverse"),
-        Text(f" {it.state or 'state not polled'}   {it.fault}   {_misses(it.misses)}"[:width]),
+        Text(_cut(f" {it.state or 'state not polled'}   {it.fault}   {_misses(it.so_far.misses)}", width)),
+        Text(_cut(f" {_pace(it)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
     polled = [poll.register.name for poll in it.polled.polls]
@@ -89,10 +91,10 @@ def _title(plant: WatchedPlant, width: int, now_ns: int) -> Text:
 def _line_states(plant: WatchedPlant, width: int) -> list[Text]:
     found = []
     for line in plant.plant.lines:
-        rates = plant.rates[line.name]
+        lately = plant.lately[line.name]
         text = (
-            f" {line.name}  {rates.utilisation:4.0%} of the wire used  {rates.exchanges:.1f} exchanges/s  "
-            f"{_misses(rates.misses)}"
+            f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
+            f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
         )
         found.append(Text(_cut(text, width)))
     return found
@@ -106,11 +108,28 @@ def _misses(reasons: Mapping[str, int]) -> str:
     return f"{total} missed: " + ", ".join(f"{reason} {count}" for reason, count in ordered)
 
 
+def _pace(it: Watched) -> str:
+    """How it answers: as of late, and its whole history's delays."""
+    so_far, delays = it.so_far, it.so_far.delays
+    told = f"{it.lately.exchanges_per_second:.1f} exchanges/s"
+    if delays.replies:
+        told += f"   answers after {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, at most {_ms(delays.longest)}"
+    if so_far.late_replies:
+        told += f"   {so_far.late_replies} late"
+    return f"{told}   {so_far.skipped_bytes} bytes skipped" if so_far.skipped_bytes else told
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.{0 if seconds >= 0.1 else 1}f}"
+
+
 def _columns(plant: WatchedPlant, width: int) -> dict[str, int]:
     """Widths by head; what is left over goes to the fault's name and the history."""
     longest = max(len(it.name) for it in plant.drives)
     columns = {"DRIVE": max(5, min(longest, 16)), "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10}
     columns |= {"AGE": 5, "MISSED": 6}
+    if width >= WIDE:
+        columns["DELAY"] = 8
     left = max(0, width - 1 - sum(columns.values()) - len(columns))
     more = min(left // 3, 26)
     columns["FAULT"] += more
@@ -118,7 +137,7 @@ def _columns(plant: WatchedPlant, width: int) -> dict[str, int]:
     return columns
 
 
-_RIGHT = {"FREQUENCY", "CURRENT", "AGE", "MISSED"}
+_RIGHT = {"FREQUENCY", "CURRENT", "AGE", "MISSED", "DELAY"}
 
 
 def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str:
@@ -140,7 +159,8 @@ def _drive(
         "CURRENT": it.shown(CURRENT),
         "FAULT": it.fault or it.why_silent,
         "AGE": _age(age),
-        "MISSED": str(it.misses.total() or ""),
+        "DELAY": f"{_ms(it.so_far.delays.p50)} ms" if it.so_far.delays.replies else "",
+        "MISSED": str(it.so_far.misses.total() or ""),
         "HISTORY": sparkline(list(it.history), columns["HISTORY"], blocks),
     }
     style = "red" if it.fault else "yellow" if it.why_silent or (age is not None and age > OLD) else ""

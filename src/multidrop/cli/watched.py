@@ -1,22 +1,26 @@
 """What a monitor knows of a plant that is polled: the newest of everything, a little history, and rates.
 
-It knows neither terminal nor clock: rows, summaries and times come in as arguments.
+It knows neither terminal nor clock: rows, statistics and times come in as arguments.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from multidrop.batch import Row, Rows
+from multidrop.core import Tally
 from multidrop.plant import Line, Plant, PolledDrive
 from multidrop.register import Register
+from multidrop.statistics import LineStatistics, Statistics, look
 
 HISTORY = 240  # s, a point each
-RATES_OVER = 5.0  # s: rates are those of so long
+LATELY = 5.0  # s: rates are those of so long
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
+
+_NOTHING = Statistics(1.0, Tally())
 
 
 @dataclass
@@ -27,8 +31,8 @@ class Watched:
     polled: PolledDrive
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # the misses that are newer than these
-    samples: int = 0
-    misses: Counter[str] = field(default_factory=Counter)
+    so_far: Statistics = _NOTHING
+    lately: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
     @property
@@ -37,10 +41,8 @@ class Watched:
 
     def add(self, row: Row) -> None:
         if row.value is None:
-            self.misses[row.status] += 1
             self.missed[row.register] = row
         else:
-            self.samples += 1
             self.newest[row.register] = row
             self.missed.pop(row.register, None)
 
@@ -89,47 +91,34 @@ class Watched:
         self.history.append(self.newest[name].value if fresh else None)
 
 
-@dataclass
-class Rates:
-    """What a line did in the last seconds."""
-
-    utilisation: float = 0.0
-    exchanges: float = 0.0  # a second
-    misses: Mapping[str, int] = field(default_factory=dict)  # since the beginning
-
-
 class WatchedPlant:
-    """All drives of a plant, and the rates of its lines."""
+    """All drives of a plant, and how its lines do: so far, and in the last seconds."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.drives = [Watched(line, polled) for line in plant.lines for polled in line.drives]
-        self.rates = {line.name: Rates() for line in plant.lines}
+        self.so_far = {line.name: look(1.0, {}, None) for line in plant.lines}
+        self.lately = self.so_far
         self._by_name = {it.name: it for it in self.drives}
-        self._earlier: deque[tuple[float, Mapping[str, Any]]] = deque()
+        self._earlier: deque[tuple[float, Mapping[str, LineStatistics]]] = deque()
 
     def add(self, rows: Rows) -> None:
         for row in rows:
             self._by_name[row.drive].add(row)
 
-    def tick(self, now: float, summary: Mapping[str, Any]) -> None:
-        """Once a second: what the poller says of itself by now."""
-        for it in self.drives:
-            it.remember()
-        lines = summary["lines"]
-        self._earlier.append((now, lines))
-        while now - self._earlier[0][0] > RATES_OVER:
+    def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
+        """Once a second: what the poller says of its lines by now."""
+        self._earlier.append((now, statistics))
+        while now - self._earlier[0][0] > LATELY:
             self._earlier.popleft()
         before = self._earlier[0][1]
-        for name, line in lines.items():
-            was = before[name] if before is not lines else {"seconds": 0, "exchanges": 0, "utilisation": 0}
-            seconds = max(line["seconds"] - was["seconds"], 1e-9)
-            busy = line["seconds"] * line["utilisation"] - was["seconds"] * was["utilisation"]
-            self.rates[name] = Rates(
-                min(max(busy / seconds, 0.0), 1.0),
-                (line["exchanges"] - was["exchanges"]) / seconds,
-                line["misses"],
-            )
+        self.so_far = self.lately = statistics
+        if before is not statistics:
+            self.lately = {name: line.since(before[name]) for name, line in statistics.items()}
+        for it in self.drives:
+            it.so_far = statistics[it.line.name].drives[it.name]
+            it.lately = self.lately[it.line.name].drives[it.name]
+            it.remember()
 
 
 def told(register: Register[Any], value: float) -> str:
