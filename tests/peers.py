@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
+import subprocess
+from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
@@ -17,6 +19,19 @@ def require_program(name: str) -> str:
     if path is None:
         _missing(f"the program {name} is not installed")
     return path
+
+
+def build_with_libmodbus(source: Path, built: Path) -> Path:
+    """The C program, compiled with libmodbus into the directory `built`."""
+    require_program("pkg-config")
+    flags = subprocess.run(
+        ["pkg-config", "--cflags", "--libs", "libmodbus"], capture_output=True, text=True, check=False
+    )
+    if flags.returncode:
+        _missing("the library libmodbus is not installed")
+    program = built / source.stem
+    subprocess.run(["cc", source, "-o", program, *flags.stdout.split()], check=True)
+    return program
 
 
 def require_module(name: str) -> ModuleType:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from peers import require_module, require_program
+from peers import build_with_libmodbus, require_module
 from ptys import linked_ptys
 
 from multidrop.bus import Bus
@@ -23,14 +23,7 @@ ADDRESS = 7
 
 
 def libmodbus(built: Path) -> list[str]:
-    require_program("pkg-config")
-    flags = subprocess.run(["pkg-config", "--cflags", "--libs", "libmodbus"], capture_output=True, text=True)
-    if flags.returncode:
-        require_program("libmodbus")  # skips, or fails in CI
-    program = built / "libmodbus_server"
-    source = SERVERS / "libmodbus_server.c"
-    subprocess.run(["cc", source, "-o", program, *flags.stdout.split()], check=True)
-    return [str(program), "PORT", str(ADDRESS)]
+    return [str(build_with_libmodbus(SERVERS / "libmodbus_server.c", built)), "PORT", str(ADDRESS)]
 
 
 def pymodbus(framing: str) -> list[str]:
