@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+
+def read_document(path: Path, what: str) -> dict[str, Any]:
+    """A TOML file's tables; ValueError, without the path, when there are none to be had."""
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as failure:
+        raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
+    except UnicodeDecodeError as failure:
+        raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
+    except tomllib.TOMLDecodeError as failure:
+        raise ValueError(f"is not TOML: {failure}") from failure
 
 
 @dataclass(frozen=True)

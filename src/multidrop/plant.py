@@ -6,7 +6,6 @@ Every mistake in the file is found before anything is done with it, and all are 
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +15,7 @@ from typing import Any
 
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
-from multidrop.mistakes import Key, Place
+from multidrop.mistakes import Key, Place, read_document
 from multidrop.models import find_model
 from multidrop.register import Register
 from multidrop.timing import Settings
@@ -96,7 +95,8 @@ def load_plant(path: Path | str) -> Plant:
     """The plant that the file describes; PlantError when anything in it is wrong."""
     path = Path(path)
     place = Place(path)
-    tables = place.check(_document(path), _PLANT).get("line", [])
+    document = place.attempt(read_document, path, "plant file")
+    tables = [] if document is None else place.check(document, _PLANT).get("line", [])
     lines = tuple(_line(table, at) for table, at in place.inside("line", tables))
     if place.mistakes:
         raise PlantError(tuple(place.mistakes))
@@ -135,17 +135,6 @@ _POLL = {
     "every": Key(str, 'every = "50 ms"'),
 }
 _NOT_ARGUMENTS = ("name", "model", "every", "poll")  # of a drive's class
-
-
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except OSError as failure:
-        raise PlantError((f"{path}: the plant file cannot be read: {failure.strerror}",)) from failure
-    except UnicodeDecodeError as failure:
-        raise PlantError((f"{path}: is not text in UTF-8, from byte {failure.start} on",)) from failure
-    except tomllib.TOMLDecodeError as failure:
-        raise PlantError((f"{path}: is not TOML: {failure}",)) from failure
 
 
 def _line(table: Any, place: Place) -> Line:

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from multidrop.plant import Line, load_plant
-from multidrop.sim import Simulator, Wire, serve, simulated
+from multidrop.sim import HostileWire, Simulator, Wire, load_faults, serve, simulated
+from multidrop.sim.faults import HELP, Faults
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,23 +16,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ports", metavar="DIR", type=Path, required=True, help="where a link to each line's port is put"
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
+    parser.add_argument("--faults", metavar="FILE", help="what befalls the bytes, as said below")
+    parser.epilog = HELP
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
+    faults = load_faults(arguments.faults) if arguments.faults else Faults()
     arguments.ports.mkdir(parents=True, exist_ok=True)
-    serve([_wire(line, arguments.ports, arguments.unpaced) for line in plant.lines], _announce)
+    serve([_wire(line, arguments.ports, faults, arguments.unpaced) for line in plant.lines], _announce)
     return 0
 
 
-def _wire(line: Line, directory: Path, unpaced: bool) -> Wire:
+def _wire(line: Line, directory: Path, faults: Faults, unpaced: bool) -> Wire:
     link = directory / line.name
     if link.parent != directory:
         raise ValueError(f"line {line.name!r} has a / in its name, which the link to its port cannot have")
     if link.is_symlink() or link.exists():
         raise ValueError(f"{link} is there already: remove it, or choose another directory with --ports")
     drives = [simulated(polled.drive) for polled in line.drives]
-    return Wire(drives, name=line.name, port=str(link), unpaced=unpaced)
+    return HostileWire(drives, faults, name=line.name, port=str(link), unpaced=unpaced)
 
 
 def _announce(simulator: Simulator) -> None:

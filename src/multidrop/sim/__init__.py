@@ -3,6 +3,8 @@
 from multidrop.sim.drive import Counters, SimulatedDrive, Written
 from multidrop.sim.encoded import EncodedDrive, encoded
 from multidrop.sim.families import simulated
+from multidrop.sim.faults import Faults, load_faults
+from multidrop.sim.hostile import HostileWire
 from multidrop.sim.motor import Motor, Phase, Rating
 from multidrop.sim.powered import PoweredDrive
 from multidrop.sim.simulator import Simulator, serve
@@ -11,6 +13,8 @@ from multidrop.sim.wire import Wire
 __all__ = [
     "Counters",
     "EncodedDrive",
+    "Faults",
+    "HostileWire",
     "Motor",
     "Phase",
     "PoweredDrive",
@@ -20,6 +24,7 @@ __all__ = [
     "Wire",
     "Written",
     "encoded",
+    "load_faults",
     "serve",
     "simulated",
 ]

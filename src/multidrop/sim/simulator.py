@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from types import TracebackType
 
+from multidrop.sim.port import Port
 from multidrop.sim.wire import Wire
 
 
@@ -25,6 +26,7 @@ class Simulator:
         self._failure: BaseException | None = None
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
         self._planned: dict[int, float] = {}  # of each wire, the wake that counts
+        self._attended: dict[int, tuple[Port, int]] = {}  # of each wire, the port that is listened to
 
     def __enter__(self) -> Simulator:
         self.open()
@@ -56,7 +58,8 @@ class Simulator:
         self._selector.register(self._ears, selectors.EVENT_READ, None)
         try:
             for number, wire in enumerate(self.wires):
-                self._selector.register(wire.open().fileno(), selectors.EVENT_READ, number)
+                wire.open()
+                self._attend(number)
         except (OSError, ValueError):
             self.close()
             raise
@@ -79,7 +82,7 @@ class Simulator:
             for key, _ in self._selector.select(0):
                 if key.data is None:
                     return
-                self._listen(key.data, key.fd)
+                self._listen(key.data)
             now = monotonic()
             while self._wakes and self._wakes[0][0] <= now:
                 at, number = heapq.heappop(self._wakes)
@@ -96,28 +99,39 @@ class Simulator:
         limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
         select.select([self._selector], [], [], limit)
 
-    def _listen(self, number: int, fd: int) -> None:
+    def _listen(self, number: int) -> None:
         wire = self.wires[number]
-        port = wire.opened
         now = monotonic()
-        chunk = port.read()
-        if port.fileno() != fd:
-            self._selector.unregister(fd)
-            self._selector.register(port.fileno(), selectors.EVENT_READ, number)
-        if chunk:
-            wire.receive(chunk, now, port.baudrate())
+        chunk = wire.port.read() if wire.port else b""
+        self._attend(number)
+        if chunk and wire.port:
+            wire.receive(chunk, now, wire.port.baudrate())
             self._speak(number)
 
     def _speak(self, number: int) -> None:
         """Hand over what the client hears by now, and plan the wire's next wake."""
         wire = self.wires[number]
         heard = wire.advance(monotonic())
-        if heard:
-            wire.opened.write(heard)
+        if heard and wire.port:
+            wire.port.write(heard)
+        self._attend(number)
         wake = wire.wake
         if wake is not None and wake < self._planned.get(number, math.inf):
             self._planned[number] = wake
             heapq.heappush(self._wakes, (wake, number))
+
+    def _attend(self, number: int) -> None:
+        """Listen to the wire's port as it is now: it may be gone, or another, or wait for another client."""
+        port, before = self.wires[number].port, self._attended.get(number)
+        now = (port, port.fileno()) if port else None
+        if now == before:
+            return
+        if before:
+            self._selector.unregister(before[1])
+            del self._attended[number]
+        if now:
+            self._selector.register(now[1], selectors.EVENT_READ, number)
+            self._attended[number] = now
 
 
 def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda simulator: None) -> None:

@@ -22,7 +22,7 @@ UNPACED_GAP = 20e-3  # s of silence that end a frame where characters take no ti
 
 
 @dataclass
-class _Transmission:
+class Transmission:
     """A reply on its way: the last bit of its n-th character ends n characters after `begin`."""
 
     data: bytes
@@ -51,7 +51,7 @@ class _Transmission:
         return taken
 
 
-class _Ears:
+class Ears:
     """Drives that hear alike: of one framing and baud rate, with one idea of a frame's end."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
@@ -84,16 +84,16 @@ class Wire:
             raise ValueError(f"{name}: a line needs at least one drive")
         self.drives = tuple(drives)
         self.name = name
-        self._where = port
-        self._port: Port | None = None
+        self.where = port
+        self.port: Port | None = None  # there while it is open
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
         self._ears = self._group()
-        self._outgoing: list[_Transmission] = []  # by their begin
+        self._outgoing: list[Transmission] = []  # by their begin
         self._quiet_since = -math.inf  # the end of the last reply
         self._baudrate: int | None = None
 
-    def _group(self) -> list[_Ears]:
-        groups: dict[tuple[Framing, Settings, float], _Ears] = {}
+    def _group(self) -> list[Ears]:
+        groups: dict[tuple[Framing, Settings, float], Ears] = {}
         taken: dict[tuple[int, Framing, int], SimulatedDrive] = {}
         for it in self.drives:
             drive = it.drive
@@ -104,7 +104,7 @@ class Wire:
             if key not in groups:
                 gap = it.most_gap if self._pace else UNPACED_GAP
                 character = drive.settings.character * self._pace
-                groups[key] = _Ears(Receiver(drive.framing, character, gap), drive.settings)
+                groups[key] = Ears(Receiver(drive.framing, character, gap), drive.settings)
             groups[key].drives[drive.address] = it
         return list(groups.values())
 
@@ -150,14 +150,15 @@ class Wire:
         """What becomes of a reply on its way; a test of noise replaces it."""
         return reply
 
-    def _deliver(self, ears: _Ears, frames: Sequence[Frame]) -> None:
+    def _deliver(self, ears: Ears, frames: Sequence[Frame]) -> None:
         for frame in frames:
             for it in ears.listeners(frame):
                 if self._may_hear(it, frame) and (reply := it.hear(frame)) is not None:
                     data = self.distort(build_reply(it.drive.framing, reply))
-                    begin = frame.end + it.delay * self._pace
-                    sending = _Transmission(data, begin, ears.receiver.character)
-                    bisect.insort(self._outgoing, sending, key=lambda it: it.begin)
+                    self._send(data, frame.end + it.delay * self._pace, ears.receiver.character)
+
+    def _send(self, data: bytes, begin: float, character: float) -> None:
+        bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda it: it.begin)
 
     def _may_hear(self, it: SimulatedDrive, frame: Frame) -> bool:
         """Count a frame that came before its silence was over, and say whether it is heard all the same.
@@ -177,21 +178,16 @@ class Wire:
     # ---- its port ----
 
     @property
-    def opened(self) -> Port:
-        if self._port is None:
-            raise RuntimeError(f"{self.name} is not open: run it in a Simulator")
-        return self._port
-
-    @property
     def path(self) -> str:
         """Where a client opens the line, while a simulator runs it."""
-        return self.opened.path
+        if self.port is None:
+            raise RuntimeError(f"{self.name} is not open: run it in a Simulator")
+        return self.port.path
 
-    def open(self) -> Port:
-        self._port = open_port(self._where, self.drives[0].drive.settings)
-        return self._port
+    def open(self) -> None:
+        self.port = open_port(self.where, self.drives[0].drive.settings)
 
     def close(self) -> None:
-        if self._port is not None:
-            self._port.close()
-            self._port = None
+        if self.port is not None:
+            self.port.close()
+            self.port = None
