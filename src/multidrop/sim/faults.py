@@ -35,7 +35,7 @@ class Faults:
     twice: float = _rate("of the replies come twice")
     delay: float = _rate("of the replies come late")
     late: float = _most(0.1, "100 ms", "the longest delay")
-    merge: float = _rate("of the replies wait, up to `late`, for the next one and come in one with it")
+    merge: float = _rate("of the replies wait, up to `late`, and come with the next")
     split: float = _rate("of the replies have a pause inside")
     pause: float = _most(0.02, "20 ms", "the longest pause")
     echo: float = _rate("of the requests come back to the client")
@@ -44,7 +44,7 @@ class Faults:
     burst: int = field(default=32, metadata={"means": "characters of noise at most", "example": "32"})
     hang_up: float = _rate("of the requests find the port gone")
     away: float = _most(1.0, "1 s", "the longest time until it is back")
-    rename: float = _rate("of the returns are under another name; the link then points there")
+    rename: float = _rate("of the returns are under another name; the link follows")
 
     def __post_init__(self) -> None:
         for it in fields(self):
