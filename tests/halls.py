@@ -54,6 +54,9 @@ class Hall:
     def close(self) -> None:
         pass
 
+    def overruns(self) -> None:
+        return None
+
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         request = exchange.request
         self.seconds += self.queue_time
