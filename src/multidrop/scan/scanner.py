@@ -73,9 +73,11 @@ class _Scan:
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [it for it in sweep.addresses if _key(sweep, it) not in self._found]
         garbled: list[int] = []
+        listeners: dict[int, Respondent] = {}
         for number, address in enumerate(addresses, 1):
+            listeners[address] = self._listener(sweep)
             try:
-                completion = self.ask(sweep, sweep.question.to(address), self._listener(sweep))
+                completion = self.ask(sweep, sweep.question.to(address), listeners[address])
             except LineError as refusal:
                 if number > 1:
                     raise
@@ -83,7 +85,11 @@ class _Scan:
                 yield Untried(sweep.settings, sweep.framing, refusal.reason)
                 return
             came = completion.result != Result.NO_REPLY
-            late = _late(sweep, addresses[max(0, number - 1 - LATE) : number - 1], completion)
+            earlier = addresses[max(0, number - 1 - LATE) : number - 1]
+            late = [it for it in earlier if it in listeners and listeners[it].tally().late]
+            for suspect in late:  # the core knew its answer as a late one
+                del listeners[suspect]
+            late += _late(sweep, earlier, completion)
             for suspect in late + [address] * came:
                 closer = Look(self, sweep, suspect)
                 if closer.answers and _key(sweep, suspect) not in self._found:
