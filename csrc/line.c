@@ -380,17 +380,29 @@ int md_line_want(struct md_line *line, int64_t now_ns)
     }
 }
 
+/* What came while the request was leaving answers nothing, but may be the beginning of its echo. */
+static void keep_echo(struct md_line *line)
+{
+    if (line->rx_len > line->tx_len || memcmp(line->rx, line->tx, line->rx_len) != 0)
+        line->rx_len = 0;
+    line->completion->stale -= line->rx_len;
+    line->completion->skipped = line->rx_len;
+}
+
 void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
     if (line->state != SENDING || len == 0)
         return;
-    if (line->tx_at == 0)
+    if (line->tx_at == 0) {
         line->completion->sent_ns = now_ns;
+        line->rx_len = 0;
+    }
     line->quiet_ns = later(line->quiet_ns, now_ns) + (int64_t)len * exchange->character_ns;
     line->tx_at = (uint16_t)(line->tx_at + len);
     if (line->tx_at < line->tx_len)
         return;
+    keep_echo(line);
     int reply_len = md_reply_length(exchange->framing, &exchange->request);
     if (reply_len == 0) {
         finish(line, 0, line->rx, 0);
@@ -418,10 +430,11 @@ static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
 /* Bytes that nobody asked for: they put off the next request, which must find the line silent. */
 static void take_stale(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
-    line->quiet_ns = now_ns;
+    line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
     if (line->state != IDLE)
         line->completion->stale += (uint32_t)len;
-    if (line->state == LOOKING && now_ns < line->give_up_ns)
+    int is_unsent = line->state == LOOKING || (line->state == SENDING && line->tx_at == 0);
+    if (is_unsent && now_ns < line->give_up_ns)
         line->state = SILENT;
     for (size_t at = 0; at < len;)
         at += keep(line, bytes + at, len - at);

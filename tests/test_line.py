@@ -178,6 +178,30 @@ def test_port_that_takes_nothing_is_lost(line: LineDriver) -> None:
     assert (found.result, found.error, found.sent_ns) == (Result.LINE_LOST, errno.ETIMEDOUT, 0)
 
 
+def test_noise_while_the_port_takes_nothing_renews_the_silence(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE
+    assert [line.want, line.want] == ["read", "write"]
+    line.take(0)
+    line.now += MS
+    line.receive(b"\xff")
+    assert line.want == "wait"
+    assert line.wake == line.now + SILENCE
+
+
+@pytest.mark.parametrize("taken", [0, 3])
+def test_what_comes_before_the_request_is_out_is_not_its_reply(line: LineDriver, taken: int) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE + TIMEOUT  # a babbling line is written to all the same
+    assert [line.want, line.want] == ["read", "write"]
+    line.take(taken)
+    line.receive(reply_of(1111))
+    line.take()
+    answer(line, reply_of(2222))
+    found = line.completion
+    assert (found.reply.data, found.stale, found.skipped) == (words(2222), 7, 0)
+
+
 @pytest.mark.parametrize("step", ["silent", "listening"])
 def test_port_that_fails(line: LineDriver, step: str) -> None:
     line.begin(exchange(READ))
@@ -373,6 +397,16 @@ def test_broadcast_is_over_when_sent_and_followed_by_the_turnaround_delay(line: 
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
 
 
+def test_noise_does_not_shorten_the_turnaround_delay(line: LineDriver) -> None:
+    ask(line, BROADCAST)
+    sent = line.now
+    line.now += MS
+    line.receive(b"\xff")  # while the broadcast is still leaving
+    line.begin(exchange(READ))
+    line.wait_until_write()
+    assert line.now == sent + 8 * CHARACTER + TURNAROUND
+
+
 def test_exchange_that_fails_unsent_does_not_cancel_the_turnaround_delay(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
@@ -420,6 +454,18 @@ def test_refusal_behind_the_echo_of_a_write(line: LineDriver) -> None:
     ask(line, WRITE)
     answer(line, confirmation() + rtu("01 86 02"))
     assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x06, exception=2))
+
+
+def test_echo_that_comes_while_the_port_still_takes_the_request(line: LineDriver) -> None:
+    teach_echo(line)
+    line.begin(exchange(WRITE))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    line.receive(line.take(5))
+    line.receive(line.take(3))
+    assert line.listens
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.stale, line.completion.skipped) == (8, 0, 8)
 
 
 def test_echo_behind_a_stray_byte(line: LineDriver) -> None:
