@@ -11,15 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 import pyarrow as pa
 import pytest
-from batches import METADATA, counting, example
+from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
+from disks import full_at, read_only_directory
 from test_batch import rows_of
+from toy import Toy
 
-from multidrop.batch import Row
+from multidrop.batch import Batch, Row
+from multidrop.core import Columns
 from multidrop.recording import FORMATS, Reader, RecordingError, open_reader, open_writer, repair
+from multidrop.recording.whole import WholeFile
 
 growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])
 ROWS = 20  # of a batch
@@ -69,6 +73,12 @@ def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
         reader = open_reader(path)
         assert reader.torn == cut - len(kept)
         assert rows(reader) == expected[: kept.count(b"\n") - 1]
+
+
+def test_no_drive_has_a_name_of_two_lines() -> None:
+    """A line of text that is torn within a name would look whole."""
+    with pytest.raises(ValueError, match=r"the name 'pump\\n1' is not one line"):
+        Toy(1, name="pump\n1")
 
 
 def test_long_torn_line_of_csv(tmp_path: Path) -> None:
@@ -208,43 +218,27 @@ def test_disk_that_is_full_from_the_beginning(tmp_path: Path, suffix: str) -> No
 
 
 @growing
-def test_recording_goes_on_when_there_is_room_again(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
     """A batch that did not fit leaves no half of itself between the others."""
-    resource = pytest.importorskip("resource", reason="needs POSIX")
     path = tmp_path / f"a{suffix}"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 100, before[1]))
-        try:
-            with pytest.raises(RecordingError, match=f"the {ROWS} rows before that can be read"):
-                writer.write(counting(ROWS, 40000))
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        with (
+            full_at(path.stat().st_size + 100),
+            pytest.raises(RecordingError, match=f"the {ROWS} rows before"),
+        ):
+            writer.write(counting(ROWS, 40000))
         writer.write(counting(ROWS, ROWS))
         assert writer.rows == 2 * ROWS
     assert rows(open_reader(path)) == list(counting(2 * ROWS))
 
 
-@pytest.fixture
-def read_only() -> Iterator[Path]:
-    """A directory in which nothing can be made; root, who can everywhere, becomes nobody."""
-    user = os.geteuid()
-    with TemporaryDirectory() as directory:
-        Path(directory).chmod(0o555)
-        if user == 0:
-            os.seteuid(65534)
-        yield Path(directory)
-        os.seteuid(user)
-
-
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_read_only_directory(read_only: Path, suffix: str) -> None:
-    path = read_only / f"a{suffix}"
-    with pytest.raises(RecordingError) as failure:
-        open_writer(path, METADATA)
+def test_read_only_directory(suffix: str) -> None:
+    with read_only_directory() as directory:
+        path = directory / f"a{suffix}"
+        with pytest.raises(RecordingError) as failure:
+            open_writer(path, METADATA)
     assert str(failure.value) == f"{path}: cannot be written: Permission denied"
     assert failure.value.strerror is None  # the sentence is ours
 
@@ -255,6 +249,95 @@ def test_directory_that_is_not_there(tmp_path: Path, suffix: str) -> None:
         open_writer(tmp_path / "none" / f"a{suffix}", METADATA)
     with pytest.raises(FileNotFoundError):
         open_reader(tmp_path / f"a{suffix}")
+
+
+def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails for a while, for cutting too."""
+    path = tmp_path / "a.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(ROWS))
+        cut = WholeFile._cut
+        monkeypatch.setattr(WholeFile, "_cut", _fail)
+        for _ in range(2):
+            with full_at(path.stat().st_size + 100), pytest.raises(RecordingError):
+                writer.write(counting(ROWS, 40000))
+        monkeypatch.setattr(WholeFile, "_cut", cut)
+        assert open_reader(path).torn == 100
+        writer.write(counting(ROWS, ROWS))
+    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+
+
+def _fail(file: WholeFile) -> None:
+    raise OSError(5, "Input/output error")
+
+
+@growing
+def test_a_write_that_a_signal_breaks_off_leaves_nothing(tmp_path: Path, suffix: str) -> None:
+    """Ctrl-C between the two halves of a piece that the system takes in two."""
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(ROWS))
+        growing_file = vars(writer)["_file"]
+        raw = growing_file._file
+        growing_file._file = Halving(raw)
+        with pytest.raises(KeyboardInterrupt):
+            writer.write(counting(ROWS, 40000))
+        growing_file._file = raw
+        writer.write(counting(ROWS, ROWS))
+    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+
+
+class Halving:
+    """A file that takes half of what it is given, and is interrupted then."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._writes = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, piece: memoryview) -> int:
+        self._writes += 1
+        if self._writes == 2:
+            raise KeyboardInterrupt
+        return int(self._file.write(piece[: len(piece) // 2]))
+
+
+@pytest.mark.parametrize("room", range(0, 120, 10))
+def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> None:
+    """Wherever the disk becomes full at the beginning: never half of a .csv.json."""
+    path = tmp_path / "a.csv"
+    whole = {"plant": "p" * 60}
+    try:
+        with full_at(room), open_writer(path, whole):
+            pass
+    except RecordingError:
+        with pytest.raises(ValueError, match=r"a\.csv is not a recording"):
+            open_reader(path)
+    else:
+        assert open_reader(path).metadata == whole
+    assert not list(tmp_path.glob("*.part"))
+
+
+# ---- clocks ----
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
+    """Rows stay in the order in which they were taken, by monotonic_ns; time says what the clock said."""
+    path = tmp_path / f"a{suffix}"
+    offsets = (UTC_0, UTC_0 - 3600 * SECOND)
+    with open_writer(path, METADATA) as writer:
+        for at, offset in enumerate(offsets):
+            columns = Columns(1)
+            assert columns.add(block(0, 0), completion(at + 1, first_ns=at + 2, words=(at,)), offset)
+            writer.write(Batch(columns, DRIVES, REGISTERS))
+    found = rows(open_reader(path))
+    assert [row.monotonic_ns for row in found] == [1, 2]
+    assert [row.time for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
 
 
 # ---- not a recording ----

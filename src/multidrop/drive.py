@@ -204,6 +204,8 @@ class Drive:
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
+        if not self.name.isprintable():  # in a text recording a torn line must be seen to be torn
+            raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = self._options(options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # the setpoint register that set_frequency wrote last

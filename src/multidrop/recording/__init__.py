@@ -6,6 +6,10 @@
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
 | `.parquet` | Parquet, needs pyarrow            | nothing can be read        |
 
+A crash is the process's: all of a batch whose `write` has returned is with the system, which has it
+on the disk within seconds; only a power cut in between takes it away. A file that was begun and not
+yet given its head is no recording.
+
 All three have the same columns, and one row for every sample or miss:
 
 | column           | type               | meaning                                                    |

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from itertools import islice
@@ -39,8 +40,8 @@ class Writer(interface.Writer):
         except OSError as failure:
             raise RecordingError.of(failure, path) from failure
         try:
-            self._append(HEADER)
-            beside(path).write_text(described + "\n", encoding="utf-8")
+            _put(beside(path), described + "\n")
+            self._append(HEADER)  # last: what begins with it is a recording, and has its metadata
         except OSError as failure:
             self.close()
             raise RecordingError.of(failure, path) from failure
@@ -60,6 +61,18 @@ class Writer(interface.Writer):
             self._file.close()
         except OSError as failure:
             raise RecordingError.of(failure, self.path, self.rows) from failure
+
+
+def _put(path: Path, text: str) -> None:
+    """Make the file at once: at no time is there half of it."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink()
+        raise
 
 
 class Reader(interface.Reader):
