@@ -672,6 +672,54 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     ]
 
 
+LOST = LineError("hall", "the port was lost")
+ENDINGS: dict[str, tuple[BaseException, int, Callable[[Hall, Any], object], str]] = {
+    "port lost at the reading back": (
+        LOST,
+        3,
+        lambda hall, drive: drive.set_frequency(30),
+        "setpoint = 60.00 %",
+    ),
+    "interrupted": (KeyboardInterrupt(), 6, lambda hall, drive: drive.start(), "control = FORWARD"),
+    "port lost in a raw request": (
+        LOST,
+        6,
+        lambda hall, drive: hall.bus.raw(drive, 6, 0x1000, b"\0\5"),
+        "raw request 01 06 10 00 00 05 4D 09",
+    ),
+    "port lost in a broadcast": (
+        LOST,
+        6,
+        lambda hall, drive: hall.bus.broadcast(drive.control, Control.STOP),
+        "control = STOP",
+    ),
+}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_write_whose_outcome_never_came_is_noted_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ending: str
+) -> None:
+    failure, function, act, what = ENDINGS[ending]
+    log = tmp_path / "audit.jsonl"
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    drive.set_frequency(20)
+    before = len(hall.written)
+    carry_out = hall.carry_out
+
+    def fail(exchange: Exchange, **times: int) -> Completion:
+        if exchange.request.function == function and (function == 6 or len(hall.written) > before):
+            raise failure
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(hall, "carry_out", fail)
+    with pytest.raises(type(failure)):
+        act(hall, drive)
+    hall.bus.close()
+    (record,) = list(read_audit(log))[1:]
+    assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
+
+
 def test_a_torn_tail_harms_no_other_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     log.write_text('{"write": "a"}\n{"write": "b')

@@ -1,6 +1,7 @@
 """Audit log: every write that was sent, as one line of JSON in a file that only grows.
 
-A line that was torn by a crash harms no other: the next process begins a new one.
+A write is noted when its outcome is known: the one that a killed process had under way is not there.
+A line that was torn, by a crash or a full disk, harms no other: the next record begins a new one.
 """
 
 from __future__ import annotations
@@ -18,25 +19,25 @@ class AuditLog:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._file = self.path.open("ab", buffering=0)  # one call, one write: processes do not mix lines
-        if _is_torn(self.path):
-            self._file.write(b"\n")
+        self._file = self.path.open("a+b", buffering=0)  # one call, one write: processes do not mix lines
 
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
+        """Append a record. Raises OSError, also when only a part of it had room."""
         time = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         line = json.dumps({"time": f"{time}.{utc_ns % 10**9:09d}Z", **record}, ensure_ascii=False)
-        self._file.write(line.encode() + b"\n")
+        whole = (b"\n" if self._is_torn() else b"") + line.encode() + b"\n"
+        if self._file.write(whole) < len(whole):
+            raise OSError(f"{self.path}: there was room for a part of a record only")
 
     def close(self) -> None:
         self._file.close()
 
-
-def _is_torn(path: Path) -> bool:
-    with path.open("rb") as log:
-        if log.seek(0, SEEK_END) == 0:
+    def _is_torn(self) -> bool:
+        """Whether the last line has no end, whichever process began it."""
+        if self._file.seek(0, SEEK_END) == 0:
             return False
-        log.seek(-1, SEEK_END)
-        return log.read(1) != b"\n"
+        self._file.seek(-1, SEEK_END)
+        return self._file.read(1) != b"\n"
 
 
 def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:

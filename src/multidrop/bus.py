@@ -54,8 +54,12 @@ class Bus:
         self.baudrate = baudrate
         self.format = format
         self.drives: list[Drive] = []
-        log = AuditLog(audit) if audit else None
         self.line = Line(port)
+        try:
+            log = AuditLog(audit) if audit else None
+        except OSError:
+            self.line.close()
+            raise
         self._exchanges = Exchanges(self.line)
         book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
         self._writer = Writer(self._exchanges, book, log, expiry)

@@ -37,7 +37,7 @@ class Wear:
     cell: Cell
     writes: int  # in all
     this_year: int  # in the year before
-    last: float  # UTC, s
+    last: float  # UTC, s, of the latest entry, whatever the clock said at others
 
 
 def default_path() -> Path:
@@ -62,7 +62,7 @@ class Ledger:
         with self._opened() as ledger:
             ledger.execute("begin immediate")
             wear = _wear(ledger, cell, now)
-            since = now - wear.last
+            since = now - wear.last  # below 0: the clock was set back, and nobody knows how long it is
             if wear.writes and 0 <= since < least_interval:
                 return (
                     f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
@@ -90,6 +90,9 @@ class Ledger:
     def _opened(self) -> Iterator[sqlite3.Connection]:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as failure:
+            raise self._unkept(failure) from failure
+        try:
             with closing(sqlite3.connect(self.path, timeout=5.0, isolation_level=None)) as ledger:
                 ledger.execute(
                     "create table if not exists writes"
@@ -98,7 +101,10 @@ class Ledger:
                 ledger.execute("create index if not exists cells on writes (port, address, register)")
                 yield ledger
         except sqlite3.Error as failure:
-            raise OSError(f"the ledger of EEPROM writes {self.path} cannot be kept: {failure}") from failure
+            raise self._unkept(failure) from failure
+
+    def _unkept(self, failure: Exception) -> OSError:
+        return OSError(f"the ledger of EEPROM writes {self.path} cannot be kept: {failure}")
 
 
 def _key(cell: Cell) -> tuple[str, int, str, str]:
@@ -107,10 +113,11 @@ def _key(cell: Cell) -> tuple[str, int, str, str]:
 
 def _wear(ledger: sqlite3.Connection, cell: Cell, now: float) -> Wear:
     where = "port = ? and address = ? and model = ? and register = ?"
-    writes, last = ledger.execute(
-        f"select count(*), max(time) from writes where {where}", _key(cell)
+    writes, latest = ledger.execute(
+        f"select count(*), max(rowid) from writes where {where}", _key(cell)
     ).fetchone()
     (this_year,) = ledger.execute(
         f"select count(*) from writes where {where} and time > ?", (*_key(cell), now - YEAR)
     ).fetchone()
-    return Wear(cell, writes, this_year, last or 0.0)
+    last = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone()
+    return Wear(cell, writes, this_year, last[0] if last else 0.0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from multidrop.acquaintance import Acquaintance
@@ -14,7 +16,6 @@ from multidrop.errors import (
     BusError,
     DriveRefused,
     Expired,
-    LineError,
     NoReply,
     Unconfirmed,
 )
@@ -62,14 +63,11 @@ class Writer:
         register = step.register
         what = f"{register.name} = {register.format(asked)}"
         seconds = 0.0 if isinstance(step, Insist) else self._expiry
-        try:
+        with self._noted(drive, request, what):
             completion = self._exchanges.carry_out(drive, request, seconds)
-        except LineError as failure:
-            self.log(drive, request, what, Effect.UNCONFIRMED, str(failure))
-            raise
-        if completion.result == Result.EXPIRED:
-            raise Expired(drive.name, what, seconds)
-        outcome = self._outcome(drive, register, asked, completion)
+            if completion.result == Result.EXPIRED:
+                raise Expired(drive.name, what, seconds)
+            outcome = self._outcome(drive, register, asked, completion)
         why = "" if outcome.failure is None else str(outcome.failure)
         self.log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
@@ -148,6 +146,17 @@ class Writer:
         except OSError as failure:
             logging.getLogger("multidrop").warning("the audit log cannot be written: %s", failure)
 
+    @contextmanager
+    def _noted(self, drive: Drive, request: Message, what: str) -> Iterator[None]:
+        """Note the write too when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
+        try:
+            yield
+        except Expired:  # it was not sent
+            raise
+        except BaseException as failure:
+            self.log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
+            raise
+
     def close(self) -> None:
         if self.audit is not None:
             self.audit.close()
@@ -156,8 +165,10 @@ class Writer:
     def raw(self, drive: Drive, request: Message) -> bytes:
         """Send any request once, past every rule; the data of the reply."""
         what = f"raw request {build_request(drive.framing, request).hex(' ').upper()}"
+        with self._noted(drive, request, what):
+            completion = self._exchanges.carry_out(drive, request)
         try:
-            reply = self._exchanges.reply(drive, self._exchanges.carry_out(drive, request))
+            reply = self._exchanges.reply(drive, completion)
         except (NoReply, BadReply) as failure:
             self.log(drive, request, what, Effect.UNCONFIRMED, str(failure))
             raise Unconfirmed(drive.name, what, _why(failure)) from failure
@@ -170,8 +181,9 @@ class Writer:
     def broadcast(self, drive: Drive, register: Register[Any], raw: int) -> None:
         """Write to all drives at once, by the table of one of them."""
         request = write_request(drive, register, raw, address=0)
-        self._exchanges.carry_out(drive, request)
         what = f"{register.name} = {register.format(register.decode(raw))}"
+        with self._noted(drive, request, what):
+            self._exchanges.carry_out(drive, request)
         self.log(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
 
 
