@@ -12,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -21,6 +22,7 @@ from multidrop.bus import Bus, exchange
 from multidrop.core import EXCEPTION_STATUS, STATUSES, Columns, Exchange, Field, Port, Respondent, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
+from multidrop.ledger import Ledger
 from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
 from multidrop.plan import Block, alone, blocks, duration, in_order
 from multidrop.plant import Plant
@@ -138,9 +140,9 @@ class _Rows:
 class _PolledLine:
     """A line's bus, its schedule, and what is queued on it."""
 
-    def __init__(self, declared: plant.Line, rows: _Rows, codes: _Codes) -> None:
+    def __init__(self, declared: plant.Line, bus: Bus, rows: _Rows, codes: _Codes) -> None:
         self.name = declared.name
-        self.bus = Bus(declared.port)
+        self.bus = bus
         self.schedule: Schedule[_Asked] = Schedule()
         self.started_ns = self.ended_ns = now_ns()
         self.set_aside: list[_Asked] = []  # a single register that the drive refuses again and again
@@ -333,10 +335,17 @@ class Poller:
     """Polls a plant as its file says, from `with` on until the block is left.
 
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
-    missing. Any thread may take batches; commands go through `bus(line)`, ahead of the polling.
+    missing. Any thread may take batches; commands go through `bus(line)`, ahead of the polling, and are
+    counted in `ledger` and noted in `audit`, as Bus says.
     """
 
-    def __init__(self, plant: Plant) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        ledger: Ledger | Path | str | None = None,
+        audit: Path | str | None = None,
+    ) -> None:
         codes = _Codes()
         self._rows = _Rows(codes)
         self._lines: list[_PolledLine] = []
@@ -344,7 +353,8 @@ class Poller:
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         try:
             for declared in plant.lines:
-                self._lines.append(_PolledLine(declared, self._rows, codes))
+                bus = Bus(declared.port, ledger=ledger, audit=audit)
+                self._lines.append(_PolledLine(declared, bus, self._rows, codes))
         except BaseException:
             self.close()
             raise
