@@ -1,13 +1,14 @@
 """Registers: scaling that is exact, spans that hold, names that read well."""
 
 from enum import IntEnum, IntFlag
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from multidrop.drive import Drive
-from multidrop.register import COIL, Kept, Wire, command, reading, setting
+from multidrop.register import COIL, Kept, Register, Wire, command, reading, setting
 
 
 class Run(IntEnum):
@@ -67,7 +68,9 @@ def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> 
         (Example.coarse, 5 * 65536, ValueError),
     ],
 )
-def test_what_a_register_does_not_take(register, value, error) -> None:  # type: ignore[no-untyped-def]
+def test_what_a_register_does_not_take(
+    register: Register[Any], value: object, error: type[Exception]
+) -> None:
     with pytest.raises(error, match=register.name):
         register.encode(value)
 
@@ -94,7 +97,7 @@ def test_encoding_takes_the_nearest_count(value: float) -> None:
         (Example.coarse, 15.0, "15 V"),
     ],
 )
-def test_values_read_well(register, value, text) -> None:  # type: ignore[no-untyped-def]
+def test_values_read_well(register: Register[Any], value: object, text: str) -> None:
     assert register.format(value) == text
 
 

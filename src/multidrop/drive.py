@@ -98,7 +98,7 @@ class _BoundVerb(Generic[P, R]):
         return self._script(self.drive, *args, **kwargs)
 
 
-class verb(Generic[P, R]):  # noqa: N801 - it is used as a decorator
+class Verb(Generic[P, R]):
     """A method that is a script, and is carried out on the drive's bus when it is called."""
 
     def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
@@ -107,11 +107,14 @@ class verb(Generic[P, R]):  # noqa: N801 - it is used as a decorator
         self.name = script.__name__
 
     @overload
-    def __get__(self, drive: None, owner: type) -> verb[P, R]: ...
+    def __get__(self, drive: None, owner: type) -> Verb[P, R]: ...
     @overload
     def __get__(self, drive: Drive, owner: type) -> _BoundVerb[P, R]: ...
-    def __get__(self, drive: Drive | None, owner: type) -> verb[P, R] | _BoundVerb[P, R]:
+    def __get__(self, drive: Drive | None, owner: type) -> Verb[P, R] | _BoundVerb[P, R]:
         return self if drive is None else _BoundVerb(self.name, drive, self._script)
+
+
+verb = Verb  # as a decorator
 
 
 VERBS = (
