@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ import multidrop.cli.extra
 from multidrop.batch import Row
 from multidrop.look import Look, load, plot, plot_page, png, report_page
 from multidrop.look.health import delays, miss_shares, reasons_of
+from multidrop.look.used import used
 from multidrop.look.values import MOST_PANELS, MOST_POINTS, thinned
+from multidrop.plant import load_plant
 from multidrop.recording import open_writer
 from multidrop.recording.recorded import from_rows
 
@@ -165,6 +168,94 @@ def test_noise_that_comes_with_speed_is_seen(look: Look) -> None:
     assert slow.max() == 0
     assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of one register of two
     assert miss_shares(look, "fan") is None
+
+
+# At 1 ms a character: a read of one register is 8 and 7 characters, of two 8 and 9.
+PLANNED: dict[str, Any] = {
+    "hall-1": {
+        "utilisation": 1.0,
+        "cycle_ms": 70.0,
+        "drives": {
+            "pump": {
+                "exchanges_per_second": 20.0,
+                "silence_ms": 4.0,
+                "character_ms": 1.0,
+                "response_delay_ms": 5.0,
+                "blocks": [
+                    {
+                        "registers": ["output_frequency", "fault"],
+                        "every_ms": None,
+                        "request_characters": 8,
+                        "reply_characters": 9,
+                    },
+                ],
+            },
+            "fan": {
+                "exchanges_per_second": 20.0,
+                "silence_ms": 10.0,
+                "character_ms": 1.0,
+                "response_delay_ms": 5.0,
+                "blocks": [
+                    {
+                        "registers": ["output_current"],
+                        "every_ms": None,
+                        "request_characters": 8,
+                        "reply_characters": 7,
+                    },
+                ],
+            },
+        },
+    }
+}
+
+
+def turns() -> list[Row]:
+    """The pump's two registers and the fan's one, in turns of 100 ms; the fan is lost half-way."""
+    rows = []
+    for tick in range(100):
+        second = tick / 10
+        rows += [row(second, "pump", name, 1.0, ms=14.0) for name in ("output_frequency", "fault")]
+        lost = tick >= 50
+        rows.append(
+            row(second + 0.05, "fan", "output_current", *((None, "no reply") if lost else (1.0,)), ms=13.0)
+        )
+    return rows
+
+
+def test_what_was_used_of_a_line(tmp_path: Path) -> None:
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
+    (line,) = used(look)
+    # pump: 14 ms to the reply's first character, 8 more; fan: 13 and 6; the silence is the longer of two.
+    assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
+    assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
+    assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
+    assert line.rate("pump") == pytest.approx(10, rel=0.01)
+    assert line.rate("fan") == pytest.approx(5, rel=0.01)
+    assert line.cycle == pytest.approx(9.976 * 2 / 150, rel=0.01)
+    page = report_page(look)
+    assert "fan, exchanges/s" in page
+    assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>133\.\d</td>", page)
+
+
+@pytest.mark.parametrize("planned", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
+def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> None:
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    assert used(look) == []
+    assert "does not carry a plan" in report_page(look)
+
+
+def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(
+        '[[line]]\nname = "hall-1"\nport = "x"\n[[line.drive]]\nname = "pump"\naddress = 1\nevery = "1 s"\n'
+        'model = "invt-che"\npoll = ["output_frequency", "output_current"]\n'
+    )
+    told = json.loads(json.dumps(load_plant(path).metadata()))["planned"]
+    (block,) = told["hall-1"]["drives"]["pump"]["blocks"]
+    assert set(block["registers"]) == {"output_frequency", "output_current"}
+    assert (block["every_ms"], block["request_characters"]) == (1000, 8)
+    assert told["hall-1"]["drives"]["pump"]["exchanges_per_second"] == 1
+    assert told["hall-1"]["drives"]["pump"]["character_ms"] == pytest.approx(10 / 9.6, abs=1e-6)
 
 
 def test_misses_are_told_by_reason(look: Look) -> None:

@@ -33,6 +33,7 @@ FLOORS = [
         "schedule",
         "plan",
         "prediction",
+        "forecast",
         "remedies",
         "drive",
         "drives",

@@ -15,8 +15,10 @@ from typing import Any
 
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
+from multidrop.forecast import forecast
 from multidrop.mistakes import Key, Place, read_document
 from multidrop.models import find_model
+from multidrop.plan import Planned, planned
 from multidrop.register import Register
 from multidrop.timing import Settings
 
@@ -47,6 +49,14 @@ class Line:
     format: str | None
     drives: tuple[PolledDrive, ...]
 
+    def planned(self) -> list[Planned]:
+        """All that is polled on it, in blocks."""
+        return [
+            one
+            for polled in self.drives
+            for one in planned(polled.drive, [(it.register, it.every) for it in polled.polls])
+        ]
+
 
 @dataclass(frozen=True)
 class Plant:
@@ -60,6 +70,7 @@ class Plant:
         return {
             "multidrop": version("multidrop"),
             "plant": str(self.path),
+            "planned": {line.name: forecast(line.planned()) for line in self.lines},
             "drives": {
                 polled.drive.name: _described(line, polled) for line in self.lines for polled in line.drives
             },

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from multidrop.cli.plan import exchanges, shortened
+from multidrop.cli.plan import shortened
 from multidrop.cli.values import aligned
 from multidrop.plant import Line
 from multidrop.prediction import Prediction, predict
@@ -15,7 +15,7 @@ Figures = dict[str, Any]
 
 def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
     """Predictions with the documents' response delays and with those measured, and the poller's summary."""
-    wanted = exchanges(line)
+    wanted = line.planned()
     told = summary["drives"]
     known = {
         polled.drive: told[polled.drive.name]["response_delay_ms"] / 1e3

@@ -14,7 +14,6 @@ from typing import Any
 
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import Row, aligned
-from multidrop.plan import Planned, planned
 from multidrop.plant import Line, load_plant
 from multidrop.prediction import Prediction, Rate, predict
 from multidrop.remedies import Remedies, duration_text, remedies
@@ -39,15 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if all(plan.prediction.fits for plan in plans) else 1
 
 
-def exchanges(line: Line) -> list[Planned]:
-    """All that is polled on a line, in blocks."""
-    return [
-        one
-        for polled in line.drives
-        for one in planned(polled.drive, [(it.register, it.every) for it in polled.polls])
-    ]
-
-
 @dataclass(frozen=True)
 class _Plan:
     line: Line
@@ -56,7 +46,7 @@ class _Plan:
 
 
 def _plan(line: Line) -> _Plan:
-    wanted = exchanges(line)
+    wanted = line.planned()
     prediction = predict(wanted)
     return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction))
 

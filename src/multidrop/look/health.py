@@ -12,11 +12,9 @@ from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import Framing, Message, build_request
 from multidrop.look.recorded import Array, Look, Series
-from multidrop.look.style import COLOURS, days, line_style, new_figure, tell_time
+from multidrop.look.style import COLOURS, days, line_style, new_figure, tell_time, time_edges
 from multidrop.timing import Settings
 
-FEWEST_BUCKETS, MOST_BUCKETS = 10, 120  # of the time axis; between these they are 2 s wide
-SHORTEST = 1_000_000_000  # ns, of the time axis
 MOST_REASONS = 6  # in a picture; the rest are one
 LEAST_IN_BIN = 20  # values, before a share of misses means something
 BINS = 12  # of the output frequency
@@ -88,8 +86,7 @@ def draw_delays(found: Sequence[Delays]) -> Figure:
 def draw_rates(look: Look) -> Figure:
     """Values a second of each drive, and below it the misses a second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
-    buckets = int(np.clip(look.seconds / 2, FEWEST_BUCKETS, MOST_BUCKETS))
-    edges = np.linspace(look.begin, max(look.end, look.begin + SHORTEST), buckets + 1)
+    edges = time_edges(look.begin, look.end)
     width = (edges[1] - edges[0]) / 1e9
     middles = days(((edges[1:] + edges[:-1]) / 2).astype(np.int64))
     for number, drive in enumerate(look.drives):

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from multidrop.look.health import Delays, delays, draw_delays, draw_miss_shares, draw_rates, reasons_of
 from multidrop.look.recorded import Look
 from multidrop.look.style import png
+from multidrop.look.used import Used, draw_used, used
 from multidrop.look.values import FAULTS, plot
 
 SHORT = 32  # characters, in a cell that is not broken
@@ -41,7 +42,7 @@ def plot_page(look: Look, figure: Figure) -> str:
 def report_page(look: Look) -> str:
     """All that the recording tells of itself."""
     figure, left = plot(look)
-    parts = [_about(look), *_drives(look), "<h2>Rates and misses</h2>"]
+    parts = [_about(look), *_drives(look), *_used(used(look), look), "<h2>Rates and misses</h2>"]
     parts += [_image(draw_rates(look), "values and misses a second"), *_misses(look)]
     shares = draw_miss_shares(look)
     if shares:
@@ -118,6 +119,34 @@ def _drives(look: Look) -> Iterator[str]:
         )
     heads = ["Drive", "Line", "Model", "Address", "Settings", "Registers"]
     yield _table([*heads, "#Values/s", "#Values", "#Misses", "#Missed"], rows)
+
+
+def _used(found: Sequence[Used], look: Look) -> Iterator[str]:
+    yield "<h2>Utilisation against plan</h2>"
+    if not found:
+        yield "<p>The recording does not carry a plan: it was not made by polling a plant file.</p>"
+        return
+    yield (
+        "<p>What the answered exchanges had to take of the line: silence, request, response delay and "
+        "reply. The plan reckons with the response delays that the drives' documents state.</p>"
+    )
+    yield _image(draw_used(found, look), "utilisation over time")
+    rows = []
+    for it in found:
+        planned = it.planned
+        cycle = "" if it.cycle is None else f"{it.cycle * 1e3:.1f}"
+        rows.append([it.line, "utilisation, %", _percent(planned["utilisation"]), _percent(it.utilisation)])
+        if cycle:
+            rows.append(["", "bus cycle, ms", f"{planned['cycle_ms']:.1f}", cycle])
+        rows += [
+            ["", f"{name}, exchanges/s", f"{drive['exchanges_per_second']:.1f}", f"{it.rate(name):.1f}"]
+            for name, drive in planned["drives"].items()
+        ]
+    yield _table(["Line", "What", "#Planned", "#Measured"], rows)
+
+
+def _percent(part: float) -> str:
+    return f"{part * 100:.1f}"
 
 
 def _misses(look: Look) -> Iterator[str]:

@@ -20,6 +20,9 @@ DASHES = ("solid", "dashed", "dotted", "dashdot")
 MISS = "#B00020"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
+FEWEST_BUCKETS, MOST_BUCKETS = 10, 120  # of the time axis
+BUCKET_NS = 2_000_000_000  # the width of one, between these
+SHORTEST_NS = 1_000_000_000  # time axis
 WIDTH = 11.0  # inches
 DPI = 110
 
@@ -43,6 +46,12 @@ def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[A
         one.set_axisbelow(True)
         one.spines[["top", "right"]].set_visible(False)
     return figure, list(axes)
+
+
+def time_edges(begin: int, end: int) -> Array:
+    """Of the buckets into which a picture cuts the time, in ns UTC."""
+    buckets = int(np.clip((end - begin) / BUCKET_NS, FEWEST_BUCKETS, MOST_BUCKETS))
+    return np.linspace(begin, max(end, begin + SHORTEST_NS), buckets + 1)
 
 
 def days(time: Array) -> Array:

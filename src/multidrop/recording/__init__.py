@@ -23,9 +23,10 @@ All three have the same columns, and one row for every sample or miss:
 | `status`         | utf8               | `ok`, or why there is no value: both others are then null  |
 
 The metadata is one JSON object. It lies in the schema's metadata under the key `multidrop` (.arrows,
-.parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file, and
-`drives`: for each drive's name its line, model, address, settings and framing, and `registers`, for
-each register's name its unit and step.
+.parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file; `planned`,
+for each line's name what it should reach (multidrop.forecast says how); and `drives`: for each drive's
+name its line, model, address, settings and framing, and `registers`, for each register's name its unit
+and step.
 
 pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; a recording whose end is torn they
 refuse until `repair` has cut the torn end off. The reader here needs neither, and leaves it out.
