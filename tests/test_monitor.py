@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from test_cli import Run, run
 from test_cli_poll import MULTIDROP, plant, plant_file
 
@@ -32,6 +33,7 @@ from multidrop.core import Result, Tally
 from multidrop.plant import Plant, load_plant
 from multidrop.recording.recorded import from_rows
 from multidrop.statistics import LineStatistics, look
+from multidrop.stopping import Seen, Stopped
 
 __all__ = ["plant", "run"]  # fixtures
 
@@ -242,9 +244,12 @@ class Poller:
     def bus(self, line: str) -> Poller:
         return self
 
-    def stop_all(self) -> dict[str, str]:
+    def stop_all(self) -> dict[str, Stopped]:
         self.asked.append("stop all")
-        return {"drive-1": "drive-1: stopped after 0.1 s"}
+        return {
+            "drive-1": Stopped("drive-1", Seen.STOPPED, 0.1),
+            "drive-2": Stopped("drive-2", Seen.FAILED, 0.2, "no reply"),
+        }
 
     def perform(self, name: str, script: Any) -> None:
         step = next(script)
@@ -259,7 +264,7 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     for polled in plant.lines[0].drives:
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
-    monitor: Any = _Monitor(plant, anyone, [])
+    monitor: Any = _Monitor(plant, anyone, [], Console())
     monitor._in_background = lambda what, work: work()
     return monitor, poller
 
@@ -279,6 +284,13 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         for key in keys:
             monitor._obey(key)
         assert poller.asked == asked
+
+
+def test_drives_that_do_not_stand_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    assert monitor._stop_all("hall-1") == (
+        "drive-2: failed after 0.2 s: no reply; 1 of 2 drives on hall-1 have stopped"
+    )
 
 
 def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -358,6 +370,16 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
         assert terminal.process.wait(timeout=20) == 0
         assert not re.search(rb"\x1b\[[0-9;]*3[0-9]m", terminal.written)
         assert terminal.written.isascii()
+
+
+def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
+    with on_terminal("monitor", plant, TERM="dumb") as terminal:
+        terminal.wait_for(">pump-1")
+        terminal.wait_for("q quit")
+        assert b"\x1b" not in terminal.written
+        assert len(terminal.text.partition("q quit")[0].splitlines()) == 23
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
 
 
 def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:

@@ -6,25 +6,28 @@ import argparse
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
+from os import get_terminal_size
 from pathlib import Path
 from typing import Any
 
 from multidrop.batch import Rows
+from multidrop.cli.aside import SideReader
 from multidrop.cli.extra import need
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.cli.watched import Watched, WatchedPlant, told
+from multidrop.cli.watched import Watched, WatchedPlant
 from multidrop.errors import BusError
 from multidrop.plant import Plant, load_plant
 from multidrop.poller import Poller
 from multidrop.recording import open_writer
+from multidrop.stopping import Seen
 
 DRAW_S = 0.25
-SIDE_S = 0.1  # between two reads of registers that are not polled
+SCROLL_S = 2.0  # between two pictures that scroll
 PAGE = 10  # lines
 
 
@@ -50,42 +53,56 @@ def is_possible() -> bool:
 
 def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
     """Poll the plant and show it until the user has seen enough; the poller's summary."""
+    console = _console()
     with ExitStack() as stack:
         interruption = stack.enter_context(Interruption())
         takers: list[Callable[[Rows], None]] = []
         if out:
             takers.append(stack.enter_context(open_writer(out, plant.metadata())).write)
         with Poller(plant) as poller:
-            _Monitor(plant, poller, takers).show(interruption, seconds)
+            _Monitor(plant, poller, takers, console).show(interruption, seconds)
         while batch := poller.take():  # what came while it closed
             for take in takers:
                 take(batch)
     return poller.summary()
 
 
+def _console() -> Any:
+    """The terminal; ValueError where there is too little of it."""
+    from rich.console import Console
+
+    from multidrop.cli.screen import LEAST_HEIGHT, LEAST_WIDTH
+
+    console = Console()
+    if console.is_dumb_terminal:
+        width, height = get_terminal_size()
+        console = Console(width=width, height=height - 1)  # it scrolls: the line after the last one is empty
+    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
+        raise ValueError(
+            f"the terminal is too small: it has {console.width} x {console.height} characters, "
+            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
+        )
+    return console
+
+
 class _Monitor:
-    def __init__(self, plant: Plant, poller: Poller, takers: list[Callable[[Rows], None]]) -> None:
-        from rich.console import Console
+    def __init__(
+        self, plant: Plant, poller: Poller, takers: list[Callable[[Rows], None]], console: Any
+    ) -> None:
+        from multidrop.cli.screen import BLOCKS, PLAIN_BLOCKS, Position
 
-        from multidrop.cli.screen import BLOCKS, LEAST_HEIGHT, LEAST_WIDTH, PLAIN_BLOCKS, Position
-
-        self._console = Console()
+        self._console = console
         self._poller = poller
         self._plant = WatchedPlant(plant)
         self._takers = [self._plant.add, *takers]
         self._at = Position()
         self._answer: Callable[[], None] | None = None  # what a y does
-        self._side = _SideReader(poller)
-        self._blocks = BLOCKS if "utf" in self._console.encoding else PLAIN_BLOCKS
-        if self._console.width < LEAST_WIDTH or self._console.height < LEAST_HEIGHT:
-            raise ValueError(
-                f"the terminal is too small: it has {self._console.width} x {self._console.height} "
-                f"characters, and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
-            )
+        self._side = SideReader(poller)
+        self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
 
     def show(self, interruption: Interruption, seconds: float | None) -> None:
         begun = next_draw = next_tick = time.monotonic()
-        with self._console.screen(hide_cursor=True) as screen, keys() as wait_for_key:
+        with self._drawing() as (draw, every), keys() as wait_for_key:
             while not interruption.came:
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
@@ -95,15 +112,24 @@ class _Monitor:
                     self._take()
                     self._plant.tick(now, self._poller.statistics())
                 if now >= next_draw:
-                    next_draw = max(next_draw + DRAW_S, now)
+                    next_draw = max(next_draw + every, now)
                     self._take()
-                    screen.update(self._drawn())
+                    draw(self._drawn())
                 key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
                 if key == "q":
                     return
                 if key:
                     self._obey(key)
                     next_draw = 0.0
+
+    @contextmanager
+    def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
+        """How a picture is drawn, and how often: on a terminal that cannot go back, below the last one."""
+        if self._console.is_dumb_terminal:
+            yield self._console.print, SCROLL_S
+            return
+        with self._console.screen(hide_cursor=True) as screen:
+            yield screen.update, DRAW_S
 
     def _take(self) -> None:
         while batch := self._poller.take():
@@ -204,40 +230,8 @@ class _Monitor:
         return f"{it.name} has stopped"
 
     def _stop_all(self, line: str) -> str:
-        return "; ".join(str(stopped) for stopped in self._poller.bus(line).stop_all().values())
-
-
-class _SideReader:
-    """Reads what is not polled of one drive, one register after another, for as long as it is looked at."""
-
-    def __init__(self, poller: Poller) -> None:
-        self._poller = poller
-        self._drive: Watched | None = None
-        self._found: dict[str, str] = {}
-        self._thread: threading.Thread | None = None
-
-    def read(self, it: Watched) -> dict[str, str]:
-        """What was found so far; goes on reading."""
-        if self._drive is not it:
-            self._drive, self._found = it, {}
-        if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._go_on, args=(it, self._found), daemon=True)
-            self._thread.start()
-        return self._found
-
-    def rest(self) -> None:
-        self._drive = None
-
-    def _go_on(self, it: Watched, found: dict[str, str]) -> None:
-        drive = it.polled.drive
-        polled = {poll.register.name for poll in it.polled.polls}
-        others = [reg for name, reg in drive.registers.items() if reg.readable and name not in polled]
-        bus = self._poller.bus(it.line.name)
-        for register in others:
-            if self._drive is not it:
-                return
-            try:
-                found[register.name] = told(register, bus.read(drive, register))
-            except BusError as failure:
-                found[register.name] = type(failure).__name__
-            time.sleep(SIDE_S)
+        """Those that are not seen to stand come first: they must not be cut off."""
+        found = self._poller.bus(line).stop_all().values()
+        doubtful = [str(it) for it in found if it.seen is not Seen.STOPPED]
+        stand = f"{len(found) - len(doubtful)} of {len(found)} drives on {line} have stopped"
+        return "; ".join([*doubtful, stand])

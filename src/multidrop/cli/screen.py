@@ -20,7 +20,7 @@ WIDE = 100  # has room for more columns
 OLD = 5.0  # s: an older value is marked
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 HELP = "up/down choose   Enter registers   s stop   S stop all   q quit"
-PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter/Esc back   s stop   S stop all   q quit"
+PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter back   s stop   S stop all   q quit"
 
 
 @dataclass
