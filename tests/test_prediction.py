@@ -12,6 +12,7 @@ from multidrop.plan import Planned, planned
 from multidrop.prediction import predict
 from multidrop.register import HOLDING, reading
 from multidrop.remedies import Remedies, duration_text, remedies
+from multidrop.schedule import TURN_SHARE
 
 BIT = 1 / 9600
 
@@ -87,11 +88,12 @@ def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
     assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
 
 
-def test_a_drive_may_be_left_nothing_by_the_others() -> None:
-    hasty, eager = Simple(1, name="hasty"), Simple(2, name="eager")
+def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> None:
+    hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
     found = predict([*asked(hasty, 0.02), *asked(eager)])
-    assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", False)]
-    assert found.rates[1].reached == 0
+    assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", True)]
+    assert found.rates[1].reached == pytest.approx(TURN_SHARE / (2 * (OWN + SILENCE)))
+    assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
 
 
 PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])

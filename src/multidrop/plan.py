@@ -69,6 +69,11 @@ def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
     return max(silence(before), silence(after)) + switched
 
 
+def kind(drive: Drive) -> tuple[float, str]:
+    """Drives of one kind follow each other in the least time."""
+    return silence(drive), str(drive.settings)
+
+
 def planned(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> list[Planned]:
     """The blocks that read these registers, each as often as is wanted.
 
@@ -94,13 +99,13 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:
-        kinds.setdefault((silence(drive), str(drive.settings)), []).append(drive)
+        kinds.setdefault(kind(drive), []).append(drive)
     cycle: list[Drive] = []  # one of each kind
-    for kind in sorted(kinds):
-        drive = kinds[kind][0]
+    for each in sorted(kinds):
+        drive = kinds[each][0]
         costs = [_detour(cycle[at - 1], drive, cycle[at], switching) for at in range(len(cycle))]
         cycle.insert(costs.index(min(costs)) if costs else 0, drive)
-    return [drive for first in cycle for drive in kinds[silence(first), str(first.settings)]]
+    return [drive for first in cycle for drive in kinds[kind(first)]]
 
 
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.ledger import Ledger
 from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
-from multidrop.plan import Block, alone, blocks, duration, in_order
+from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
@@ -32,6 +32,7 @@ from multidrop.statistics import LineStatistics
 
 LOOK_S = 0.05  # the longest that rows wait to be collected
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
+LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
@@ -77,6 +78,10 @@ class _Asked(Job):
     block: Block
     exchange: Exchange
     fields: core.Block
+
+    def expected_ns(self, response_delay: float) -> int:
+        """How long it takes from the end of the one before."""
+        return round((silence(self.owner) + sending(self.owner, self.block) + response_delay) * 1e9)
 
 
 class _Rows:
@@ -149,9 +154,10 @@ class _PolledLine:
         self._rows = rows
         self._codes = codes
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
-        self._average_ns = 0  # of what was queued last
+        self._ahead_ns = 0  # what is queued will take
+        self._learnt_ns = 0
         self._asked_of: list[tuple[Drive, Respondent]] = []
-        self._failures: list[int] = []  # of each of them, in a row, when they were looked at last
+        self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has and we have no outcome of
@@ -177,15 +183,18 @@ class _PolledLine:
 
     def _job(self, drive: Drive, block: Block, period_ns: int | None) -> _Asked:
         fields = self._codes.fields(drive, block)
-        return _Asked(
+        job = _Asked(
             drive=drive.address,
+            kind=kind(drive),
             period_ns=period_ns,
-            duration_ns=round(duration(drive, block) * 1e9),
+            duration_ns=0,
             owner=drive,
             block=block,
             exchange=exchange(drive, block.request(drive.address), self.bus.respondent(drive), fields),
             fields=fields,
         )
+        job.duration_ns = job.expected_ns(drive.response_delay)
+        return job
 
     def start(self) -> None:
         self.started_ns = self.ended_ns = now_ns()
@@ -213,7 +222,7 @@ class _PolledLine:
     def _collect(self, port: Port) -> int:
         count = self._rows.collect(port)
         for _ in range(count):
-            self._queued.popleft()
+            self._ahead_ns -= self._queued.popleft()[0].duration_ns
         return count
 
     def _lose(self, port: Port, now: int) -> None:
@@ -222,22 +231,33 @@ class _PolledLine:
         self._collect(port)
         self._miss(list(self._queued), Result.LINE_LOST)
         self._queued.clear()
+        self._ahead_ns = 0
         self.bus.line.close()
         self._reopen_ns = now
 
     def _observe(self, now: int) -> None:
-        failures = [respondent.failures for _, respondent in self._asked_of]
-        if failures == self._failures:
+        if now - self._learnt_ns >= LEARN_NS:
+            self._learn(now)
+        seen = [(respondent.failures, respondent.late_until_ns) for _, respondent in self._asked_of]
+        if seen == self._seen:
             return
-        self._failures = failures
-        for drive, respondent in self._asked_of:
+        self._seen = seen
+        for (drive, _), (failures, late_until_ns) in zip(self._asked_of, seen, strict=True):
             self.schedule.observe(
                 drive.address,
-                respondent.failures,
+                failures,
                 now,
-                late_until_ns=respondent.late_until_ns,
+                late_until_ns=late_until_ns,
                 cost_ns=round(drive.response_timeout * 1e9),
             )
+
+    def _learn(self, now: int) -> None:
+        """How long exchanges take, by the drives' own response delays."""
+        self._learnt_ns = now
+        delays = {drive: respondent.response_delay for drive, respondent in self._asked_of}
+        for job in self.schedule.jobs:
+            job.duration_ns = job.expected_ns(delays[job.owner] or job.owner.response_delay)
+        self._ahead_ns = sum(job.duration_ns for job, _ in self._queued)
 
     def _heed_refusals(self, now: int) -> None:
         """Registers that are refused together are asked for singly; a single one is set aside.
@@ -258,14 +278,13 @@ class _PolledLine:
                 self.schedule.add(part, now)
 
     def _top_up(self, port: Port, now: int) -> None:
-        pending = port.pending
-        start_ns = now + pending * self._average_ns
         room = port.room - len(self._queued)  # what is carried out keeps its place until it is collected
-        queued = self.schedule.take(now, start_ns, now + AHEAD_NS, room)
+        done_ns = max(now + self._ahead_ns, self._queued[-1][1] if self._queued else 0)
+        queued = self.schedule.take(now, done_ns, now + AHEAD_NS, room)
         if queued:
             port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
             self._queued += queued
-            self._average_ns = sum(job.duration_ns for job, _ in queued) // len(queued)
+            self._ahead_ns += sum(job.duration_ns for job, _ in queued)
         if self.schedule.unasked:
             self._miss(self.schedule.unasked, Result.NOT_ASKED)
             self.schedule.unasked = []

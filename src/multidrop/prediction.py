@@ -12,9 +12,9 @@ from functools import cache, partial
 from typing import Any
 
 from multidrop.drive import Drive
-from multidrop.plan import Planned, gap, in_order, sending, silence
+from multidrop.plan import Planned, gap, in_order, kind, sending, silence
 from multidrop.register import Register
-from multidrop.schedule import Job, Schedule
+from multidrop.schedule import TURN_SHARE, Job, Schedule
 
 ENOUGH = 0.97  # of a wanted rate: it counts as kept
 LEAST_EXCHANGES = 1000  # for so many the schedule is asked
@@ -34,7 +34,7 @@ class Rate:
 
     @property
     def fits(self) -> bool:
-        return self.reached > 0 if self.every is None else self.reached * self.every >= ENOUGH
+        return self.every is None or self.reached * self.every >= ENOUGH
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def predict(
     _run(jobs, switching)
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
-    turns = max(0.0, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
+    turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
     groups: dict[tuple[Drive, float | None], list[_Asked]] = {}
     for job in jobs:
         groups.setdefault((job.planned.drive, job.planned.every), []).append(job)
@@ -124,13 +124,15 @@ def _jobs(exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching
     return [
         _Asked(
             drive=drive.address,
+            kind=kind(drive),
             period_ns=None if it.every is None else round(it.every * 1e9),
-            duration_ns=0,  # the schedule is asked for one job at a time
+            duration_ns=round((silence(drive) + own) * 1e9),
             planned=it,
-            own=sending(drive, it.block) + delays.get(drive, drive.response_delay),
+            own=own,
         )
         for drive in in_order(of_drive, switching)
         for it in of_drive[drive]
+        for own in [sending(drive, it.block) + delays.get(drive, drive.response_delay)]
     ]
 
 

@@ -50,8 +50,7 @@ def remedies(
     exchanges: Sequence[Planned], prediction: Prediction, delays: Mapping[Drive, float] | None = None
 ) -> Remedies:
     """What would make these fit, of which this is predicted."""
-    timed = [rate for rate in prediction.rates if rate.every is not None]
-    tight = [rate for rate in timed if not rate.fits] or timed  # that leave the others nothing
+    tight = [rate for rate in prediction.rates if not rate.fits]
     return Remedies(
         _every(exchanges, tight, max(1.0, prediction.utilisation), delays or {}),
         _baudrate(exchanges, delays or {}),

@@ -1,15 +1,20 @@
 """Which exchange of a line is due next. Pure: time, in ns, comes in as an argument.
 
 The line is planned ahead, up to a horizon, so that it never waits for Python. A job with a period
-is due on its own grid: it never drifts, and a slot that could not be kept is counted and left out,
-never made up for in a burst. Jobs without a period fill what is left, in turn. A drive that stays
-silent is rested for longer and longer, and all silent drives together cost a small share of the
-line; it is back at its full rate with the first answer.
+has slots on its own grid, which never drifts. Of the slots that have begun the one goes first that
+ends first; where there is time for all of them, those of one kind go together. A slot that is over
+when its turn comes is counted and left out, never made up for in a burst; from then on, until the
+line has caught up, the job goes first that was not asked for longest, so that everybody gets a part.
+Jobs without a period fill what is left, each once in a round, and have a share of the line even where
+nothing is left. A drive that stays silent is rested for longer and longer; in the others' spare time,
+or that share, it is asked its shortest question, and all silent drives together cost a small part of
+the line. With its first answer it is back.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -17,17 +22,30 @@ SILENT_AFTER = 2  # failures in a row
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 10_000_000_000
 SILENT_SHARE = 0.02  # of the line, for asking silent drives
+TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
+CREDIT_NS = 50_000_000  # of it, that they use up in advance
 
 
 @dataclass(eq=False, kw_only=True)
 class Job:
-    """One exchange that is wanted again and again. `drive` tells whose rest it shares."""
+    """One exchange that is wanted again and again. `drive` tells whose rest it shares.
+
+    Jobs of one `kind` follow each other in the least time: they share line settings and silence.
+    """
 
     drive: int
     period_ns: int | None
     duration_ns: int
+    kind: Hashable = None
     due_ns: int = 0
+    asked_ns: int = 0
     skipped: int = 0  # slots left out because the line was busy
+    number: int = 0  # in the bus cycle
+
+    @property
+    def end_ns(self) -> int:
+        """When its slot is over."""
+        return self.due_ns + (self.period_ns or 0)
 
 
 J = TypeVar("J", bound=Job)
@@ -36,8 +54,10 @@ J = TypeVar("J", bound=Job)
 @dataclass
 class _Health:
     failures: int = 0
+    late_until_ns: int = 0
     rest_ns: int = 0
     asleep_until_ns: int = 0
+    cost_ns: int = 0  # of asking it in vain
 
 
 @dataclass
@@ -46,8 +66,13 @@ class Schedule(Generic[J]):
 
     jobs: list[J] = field(default_factory=list)
     unasked: list[tuple[J, int]] = field(default_factory=list)  # slots that passed, when each was due
-    _timed: list[tuple[int, int, J]] = field(default_factory=list)  # a heap of (due, number, job)
-    _turn: list[J] = field(default_factory=list)  # jobs without a period, the next one first
+    _waiting: list[tuple[int, int, J]] = field(default_factory=list)  # a heap of (due, number, job)
+    _begun: list[J] = field(default_factory=list)  # whose slot has begun
+    _turn: list[J] = field(default_factory=list)  # jobs without a period
+    _next: int = 0  # of them
+    _owed_ns: int = -CREDIT_NS  # to them
+    _is_late: bool = False  # a slot had to be left out since the line last had done all that was due
+    _kind: Hashable = None  # of the job that was taken last
     _health: dict[int, _Health] = field(default_factory=dict)
     _number: int = 0
     _ill: bool = False
@@ -55,124 +80,189 @@ class Schedule(Generic[J]):
     def add(self, job: J, now_ns: int) -> None:
         self.jobs.append(job)
         self._health.setdefault(job.drive, _Health())
-        job.due_ns = now_ns
+        self._number += 1
+        job.number, job.due_ns = self._number, now_ns
         if job.period_ns is None:
             self._turn.append(job)
         else:
-            self._push(job)
+            self._await(job)
 
     def remove(self, job: J) -> None:
         """No longer; what is queued of it is still carried out."""
         self.jobs.remove(job)
-        self._turn = [it for it in self._turn if it is not job]
-        self._timed = [it for it in self._timed if it[2] is not job]
-        heapq.heapify(self._timed)
+        self._begun = [it for it in self._begun if it is not job]
+        self._waiting = [it for it in self._waiting if it[2] is not job]
+        heapq.heapify(self._waiting)
+        if job in self._turn:
+            at = self._turn.index(job)
+            self._next -= at < self._next
+            self._turn.pop(at)
 
-    def _push(self, job: J) -> None:
-        self._number += 1
-        heapq.heappush(self._timed, (job.due_ns, self._number, job))
+    def _await(self, job: J) -> None:
+        heapq.heappush(self._waiting, (job.due_ns, job.number, job))
+
+    # ---- what comes next ----
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
         """What keeps the line busy from `start_ns`, when it has done all it was given, to the horizon.
 
         At most `most` jobs, in their order, each with the time before which it is not to be sent.
         """
-        if not self._timed and not self._ill:
-            return self._take_in_turn(start_ns, horizon_ns, most)
-        taken: list[tuple[J, int]] = []
         at = max(now_ns, start_ns)
+        if not self._ill and not self._waiting and not self._begun:
+            return self._take_in_turn(at, horizon_ns, most)
+        taken: list[tuple[J, int]] = []
         while len(taken) < most and at < horizon_ns:
-            job = self._due(at, now_ns) or self._in_turn(at) or self._due(horizon_ns, now_ns)
+            self._begin_slots(at)
+            job = (self._in_turn(at) if self._owed_ns > 0 else None) or self._due(at) or self._in_turn(at)
             if job is None:
-                break
-            due = job.due_ns if job.period_ns is not None else 0
-            taken.append((job, due))
-            at = max(at, due) + job.duration_ns
-            if job.period_ns is not None:
-                self._advance(job, now_ns)
-                self._push(job)
+                if not self._waiting or self._waiting[0][0] >= horizon_ns:
+                    break
+                at = max(at, self._waiting[0][0])
+                continue
+            due_ns = self._slot(job, at)
+            taken.append((job, due_ns))
+            at = max(at, due_ns) + self._duration_ns(job)
+            self._kind = job.kind
         return taken
 
-    def _take_in_turn(self, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
+    def _take_in_turn(self, at_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
         """The common case, that all are wanted as fast as the line allows and all answer."""
         if not self._turn:
             return []
         cycle_ns = sum(job.duration_ns for job in self._turn) or 1
-        wanted = -(-(horizon_ns - start_ns) * len(self._turn) // cycle_ns)
+        wanted = -(-(horizon_ns - at_ns) * len(self._turn) // cycle_ns)
         count = min(most, max(0, wanted))
-        rounds = -(-count // len(self._turn))
-        taken = [(job, 0) for job in (self._turn * rounds)[:count]]
-        first = count % len(self._turn)
-        self._turn = self._turn[first:] + self._turn[:first]
+        rounds = -(-(self._next + count) // len(self._turn))
+        taken = [(job, 0) for job in (self._turn * rounds)[self._next : self._next + count]]
+        self._next = (self._next + count) % len(self._turn)
         return taken
 
-    def _due(self, by_ns: int, now_ns: int) -> J | None:
-        """The job that is due first, if it is by then; slots of drives at rest pass."""
-        while self._timed and self._timed[0][0] <= by_ns:
-            job = heapq.heappop(self._timed)[2]
-            if self._may_ask(job, by_ns):
-                return job
-            self.unasked.append((job, job.due_ns))
-            self._advance(job, now_ns)
-            self._push(job)
-        return None
+    def _begin_slots(self, by_ns: int) -> None:
+        """Slots of drives at rest pass."""
+        while self._waiting and self._waiting[0][0] <= by_ns:
+            job = heapq.heappop(self._waiting)[2]
+            if self._is_asleep(job, by_ns):
+                self._pass(job)
+            else:
+                self._begun.append(job)
+
+    def _pass(self, job: J) -> None:
+        self.unasked.append((job, job.due_ns))
+        job.due_ns = job.end_ns
+        self._await(job)
+
+    def _due(self, at_ns: int) -> J | None:
+        """The job whose slot ends first; where all can wait for it, rather one of the kind that was last."""
+        if self._ill:
+            for job in [it for it in self._begun if self._is_asleep(it, at_ns)]:
+                self._begun.remove(job)
+                self._pass(job)
+        if not self._begun:
+            self._is_late = False
+            return None
+        if self._is_late:
+            return min(self._begun, key=lambda job: (job.asked_ns, job.number))
+        first = min(self._begun, key=lambda job: (job.end_ns, job.number))
+        if first.kind == self._kind:
+            return first
+        if at_ns + sum(job.duration_ns for job in self._begun) > first.end_ns:
+            return first
+        return min(self._begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
+
+    def _slot(self, job: J, at_ns: int) -> int:
+        """The job is asked at this time: in which of its slots. Those that are over are left out."""
+        if (
+            job.period_ns is None or self._health[job.drive].rest_ns
+        ):  # off any grid, to see whether it answers
+            self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
+            return 0
+        self._begun.remove(job)
+        over = max(0, (at_ns - job.due_ns) // job.period_ns)
+        job.skipped += over
+        self._is_late |= over > 0
+        due_ns = job.due_ns + over * job.period_ns
+        job.due_ns, job.asked_ns = due_ns + job.period_ns, at_ns
+        self._await(job)
+        self._owed_ns += round(job.duration_ns * TURN_SHARE / (1 - TURN_SHARE))
+        return due_ns
 
     def _in_turn(self, at_ns: int) -> J | None:
-        for number, job in enumerate(self._turn):
-            if self._may_ask(job, at_ns):
-                self._turn = [*self._turn[:number], *self._turn[number + 1 :], job]
-                return job
+        """A drive at rest whose turn it is to be asked, or the next of the jobs without a period."""
+        if self._ill and (probe := self._probe(at_ns)):
+            return probe
+        for step in range(len(self._turn)):
+            number = (self._next + step) % len(self._turn)
+            if not self._is_asleep(self._turn[number], at_ns):
+                self._next = (number + 1) % len(self._turn)
+                return self._turn[number]
+        self._owed_ns = -CREDIT_NS
         return None
 
-    def _may_ask(self, job: J, at_ns: int) -> bool:
-        """Not while its drive rests; one job when the rest is over, until its outcome is known."""
-        health = self._health[job.drive]
-        if at_ns < health.asleep_until_ns:
-            return False
-        if health.rest_ns:
-            health.asleep_until_ns = at_ns + health.rest_ns
-        return True
+    # ---- drives that are silent ----
 
-    def _advance(self, job: J, now_ns: int) -> None:
-        assert job.period_ns is not None
-        job.due_ns += job.period_ns
-        late = now_ns - job.due_ns
-        if late > 0:
-            slots = late // job.period_ns
-            job.skipped += slots
-            job.due_ns += slots * job.period_ns
+    def _is_asleep(self, job: J, at_ns: int) -> bool:
+        health = self._health[job.drive]
+        return health.rest_ns > 0 or at_ns < health.asleep_until_ns
+
+    def _probe(self, at_ns: int) -> J | None:
+        """The shortest question to a drive whose rest is over; then it rests until the outcome is known."""
+        for drive, health in self._health.items():
+            if health.rest_ns and at_ns >= health.asleep_until_ns:
+                health.asleep_until_ns = at_ns + health.rest_ns
+                own = (job for job in self.jobs if job.drive == drive)
+                return min(own, key=lambda job: job.duration_ns, default=None)
+        return None
+
+    def _duration_ns(self, job: J) -> int:
+        health = self._health[job.drive]
+        return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def observe(self, drive: int, failures: int, now_ns: int, *, late_until_ns: int, cost_ns: int) -> None:
         """How often in a row a drive has not answered by now, and what asking it in vain costs.
 
-        Until `late_until_ns` its answer to an earlier question may come, so it is asked nothing.
+        Until `late_until_ns` its answer to an earlier question may come, so it is asked nothing. When
+        that has come, late as it is, the drive can be asked at once.
         """
         health = self._health[drive]
-        if failures == health.failures:
-            return
-        health.failures = failures
-        if failures == 0:
+        has_answered_late = late_until_ns < health.late_until_ns
+        has_changed = failures != health.failures
+        health.failures, health.late_until_ns, health.cost_ns = failures, late_until_ns, cost_ns
+        if has_changed and failures:
+            self._rest(drive, now_ns)
+        elif has_changed:
             health.rest_ns = health.asleep_until_ns = 0
-        else:
-            if failures >= SILENT_AFTER:
-                health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
-            rest_ns = max(health.rest_ns, self._fair_rest_ns(cost_ns) if health.rest_ns else 0)
-            health.asleep_until_ns = max(late_until_ns, now_ns + rest_ns)
-            if rest_ns:  # jobs in turn have no slots: one row for each rest says why there is none
-                self.unasked += [(job, now_ns) for job in self._turn if job.drive == drive]
+        elif has_answered_late:
+            health.asleep_until_ns = now_ns
         self._ill = any(it.failures for it in self._health.values())
 
-    def _fair_rest_ns(self, cost_ns: int) -> int:
+    def _rest(self, drive: int, now_ns: int) -> None:
+        health = self._health[drive]
+        if health.failures >= SILENT_AFTER:
+            health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
+        rest_ns = max(health.rest_ns, self._fair_rest_ns()) if health.rest_ns else 0
+        health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
+        if rest_ns:  # jobs in turn have no slots: one row for each rest says why there is none
+            self.unasked += [(job, now_ns) for job in self._turn if job.drive == drive]
+
+    def _fair_rest_ns(self) -> int:
         """So long a rest that all silent drives together cost no more than their share."""
-        silent = sum(1 for it in self._health.values() if it.rest_ns)
-        return round(silent * cost_ns / SILENT_SHARE)
+        return round(sum(it.cost_ns for it in self._health.values() if it.rest_ns) / SILENT_SHARE)
+
+    # ---- when nothing is asked ----
+
+    def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
+        """Let every slot that begins by now pass, with the time at which each was due."""
+        while self._begun:
+            self._await(self._begun.pop())
+        passed = []
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            due_ns, _, job = heapq.heappop(self._waiting)
+            passed.append((job, due_ns))
+            job.due_ns = job.end_ns
+            self._await(job)
+        return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Let every slot up to now pass, with the time at which each was due; jobs in turn have one."""
-        passed = [(job, now_ns) for job in self._turn]
-        while self._timed and self._timed[0][0] <= now_ns:
-            due_ns, _, job = heapq.heappop(self._timed)
-            passed.append((job, due_ns))
-            job.due_ns += job.period_ns or 0
-            self._push(job)
-        return passed
+        """The same, and jobs without a period have one slot now."""
+        return [*((job, now_ns) for job in self._turn), *self.pass_slots(now_ns)]

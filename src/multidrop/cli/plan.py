@@ -53,16 +53,14 @@ def _plan(line: Line) -> _Plan:
 
 def _misfits(plan: _Plan) -> list[str]:
     """A sentence for each rate that is not kept."""
-    return [_misfit(rate) for rate in plan.prediction.rates if not rate.fits]
+    return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
 
 
-def _misfit(rate: Rate) -> str:
+def _misfit(rate: Rate, every: float) -> str:
     names = [it.name for it in rate.registers]
     told = ", ".join(names[:_NAMES]) + (f" and {len(names) - _NAMES} more" if len(names) > _NAMES else "")
     verb = "does" if len(names) == 1 else "do"
-    if rate.every is None:
-        return f"{rate.drive.name}: {told} {verb} not fit: the others leave no time on the line"
-    reached = f"{_number(rate.reached)} of {_number(1 / rate.every)} times per second"
+    reached = f"{_number(rate.reached)} of {_number(1 / every)} times per second"
     return f"{rate.drive.name}: {told} {verb} not fit: {reached}"
 
 
