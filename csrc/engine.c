@@ -182,6 +182,21 @@ static unsigned pending(struct md_port *port)
     return get(&port->progress.submitted) - port->progress.done;
 }
 
+/* Whether the line is so late that the same exchange's next slot is due already: none is made up for. */
+static int is_over(struct md_port *port, const struct slot *slot, int64_t now_ns)
+{
+    int64_t period_ns = slot->exchange->period_ns;
+    if (!period_ns || now_ns < slot->not_before_ns + period_ns)
+        return 0;
+    uint32_t submitted = get(&port->progress.submitted);
+    for (uint32_t at = port->progress.done + 1; at != submitted; at++) {
+        const struct slot *next = &port->slots[at & (port->room - 1)];
+        if (next->exchange == slot->exchange)
+            return now_ns >= next->not_before_ns;
+    }
+    return 0;
+}
+
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
 static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
@@ -209,6 +224,8 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
     }
     port->slot = slot;
     begin(port, slot->exchange, &slot->completion, now_ns);
+    if (is_over(port, slot, now_ns))
+        md_line_abandon(&port->line, MD_EXPIRED, 0);
     return 1;
 }
 

@@ -142,6 +142,7 @@ struct md_exchange {
     int64_t character_ns;  /* one character on the wire */
     int64_t silence_ns;    /* before the request and after its reply */
     int64_t turnaround_ns; /* after a broadcast */
+    int64_t period_ns;     /* between its slots in a queue; 0: it has none */
     struct md_drive *drive;
     struct md_block *block; /* what its reply holds; NULL: nobody makes rows of it */
 };
@@ -221,7 +222,8 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
 /* Nothing more is carried out, and the descriptor is the caller's again; what was can be reaped. */
 void md_port_stop(struct md_port *port);
 void md_port_free(struct md_port *port); /* a port that was stopped */
-/* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time. */
+/* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time.
+ * A slot that is late by a period is not sent either (MD_EXPIRED) when the same exchange's next is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
 /* How far the queue is: each number only grows, and wraps around. */

@@ -41,7 +41,12 @@ ONE_VALUE = Block([Field(0, Wire.U16, 0, 0, 1, 1)])
 
 
 def read(
-    start: int, *, timeout: float = 5.0, format: str = "8N1", respondent: Respondent | None = None
+    start: int,
+    *,
+    timeout: float = 5.0,
+    format: str = "8N1",
+    respondent: Respondent | None = None,
+    period: float = 0.0,
 ) -> Exchange:
     """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
     return Exchange(
@@ -53,6 +58,7 @@ def read(
         character=1e-6,
         silence=1e-4,
         turnaround=1e-4,
+        period=period,
         block=ONE_VALUE,
     )
 
@@ -154,6 +160,29 @@ def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
         port.submit(queued, due)
         sent = list(reaped(port, 2).array("sent"))
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
+
+
+def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) -> None:
+    """Of each exchange the last one that is due is sent, how late it may be."""
+    second = 1_000_000_000
+    fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        now = now_ns()
+        queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
+        port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
+        columns = reaped(port, len(queued))
+    said = [status_text(it) for it in columns.array("status")]
+    over = "not sent: expired"
+    assert said == [over, "ok", over, "ok", "ok", "ok"]
+    assert fast.respondent.tally().missed == {Result.EXPIRED: 2}
+
+
+def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        now = now_ns()
+        poll = read(1, period=1.0)
+        port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
+        assert list(reaped(port, 1).array("status")) == [0]
 
 
 def test_rows_wait_for_columns_with_room(drive: Drive) -> None:

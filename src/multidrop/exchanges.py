@@ -18,7 +18,12 @@ NO_ROWS = core.Block([])  # of a command: a poll's summary counts the values of 
 
 
 def exchange(
-    drive: Drive, request: Message, respondent: Respondent, block: core.Block | None = None
+    drive: Drive,
+    request: Message,
+    respondent: Respondent,
+    block: core.Block | None = None,
+    *,
+    period: float = 0.0,
 ) -> Exchange:
     """What the core needs to carry out a request to this drive."""
     settings = drive.settings
@@ -32,6 +37,7 @@ def exchange(
         # One bit more: the other side may still be sending its second stop bit.
         silence=drive.needed_silence() + settings.bit,
         turnaround=drive.turnaround_delay,
+        period=period,
         block=block,
     )
 

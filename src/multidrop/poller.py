@@ -183,6 +183,7 @@ class _PolledLine:
 
     def _job(self, drive: Drive, block: Block, period_ns: int | None) -> _Asked:
         fields = self._codes.fields(drive, block)
+        request, respondent = block.request(drive.address), self.bus.respondent(drive)
         job = _Asked(
             drive=drive.address,
             kind=kind(drive),
@@ -190,7 +191,7 @@ class _PolledLine:
             duration_ns=0,
             owner=drive,
             block=block,
-            exchange=exchange(drive, block.request(drive.address), self.bus.respondent(drive), fields),
+            exchange=exchange(drive, request, respondent, fields, period=(period_ns or 0) / 1e9),
             fields=fields,
         )
         job.duration_ns = job.expected_ns(drive.response_delay)

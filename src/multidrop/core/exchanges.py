@@ -52,7 +52,8 @@ class Exchange:
     """One request and all that is needed to carry it out; made once, run as often as wanted.
 
     Times are in seconds: `character` of one character, `silence` before the request and after
-    its reply, `turnaround` after a broadcast. `block` is what rows are made of.
+    its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
+    `block` is what rows are made of.
     """
 
     __slots__ = ("block", "c", "framing", "request", "respondent", "settings")
@@ -68,6 +69,7 @@ class Exchange:
         character: float,
         silence: float,
         turnaround: float = 0.1,
+        period: float = 0.0,
         block: Block | None = None,
     ) -> None:
         build_request(framing, request)  # raises for what no frame can say
@@ -85,6 +87,7 @@ class Exchange:
                 "character_ns": round(character * 1e9),
                 "silence_ns": round(silence * 1e9),
                 "turnaround_ns": round(turnaround * 1e9),
+                "period_ns": round(period * 1e9),
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
             },
