@@ -58,7 +58,7 @@ struct md_port {
     int watched;       /* epoll tells when it can be read */
     int emptied;       /* it was read empty a moment ago: nothing is there yet */
     int lost_error;
-    int closing, closed;
+    int ending, closing, closed;
 };
 
 struct md_engine {
@@ -210,6 +210,8 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
     }
     if (wish)
         *wake_ns = wish->not_before_ns;
+    if (port->ending)
+        return 0;
     if (!pending(port)) {
         atomic_store(&port->idle, 1);
         if (!pending(port))
@@ -472,6 +474,15 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
     free(slots);
     free(port);
     return NULL;
+}
+
+int md_port_end(struct md_port *port)
+{
+    pthread_mutex_lock(&port->engine->mutex);
+    port->ending = 1;
+    int is_under_way = port->slot != NULL;
+    pthread_mutex_unlock(&port->engine->mutex);
+    return is_under_way;
 }
 
 void md_port_stop(struct md_port *port)

@@ -43,7 +43,8 @@ enum md_result {
     MD_LATE_ANSWER_DUE = -13,  /* not sent: an earlier answer would be mistaken for its reply */
     MD_EXPIRED = -14,          /* not sent: its time was over before its turn came */
     /* of a value that was due (only seen in columns) */
-    MD_NOT_ASKED = -15         /* the drive is silent and was given a rest */
+    MD_NOT_ASKED = -15,        /* the drive is silent and was given a rest */
+    MD_POLL_ENDED = -16        /* before its answer was there, or its turn came */
 };
 
 /* One frame's meaning, whatever its framing. Which fields count depends on the function:
@@ -219,6 +220,8 @@ int md_engine_notice(struct md_engine *engine); /* a descriptor, readable when a
 /* `must_take`: which refusals (enum md_refusal) are failures; -1: a port without settings. `room`
  * for exchanges, a power of two. NULL: see errno. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room);
+/* Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are. */
+int md_port_end(struct md_port *port);
 /* Nothing more is carried out, and the descriptor is the caller's again; what was can be reaped. */
 void md_port_stop(struct md_port *port);
 void md_port_free(struct md_port *port); /* a port that was stopped */

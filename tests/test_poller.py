@@ -9,6 +9,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,17 @@ from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 
 # What a machine that has much else to do may add to what a test is about.
-HOST_LATE = {str(it) for it in (Result.NO_REPLY, Result.CUT_SHORT, Result.LATE_ANSWER_DUE, Result.NOT_ASKED)}
+HOST_LATE = {
+    str(it)
+    for it in (
+        Result.NO_REPLY,
+        Result.CUT_SHORT,
+        Result.LATE_ANSWER_DUE,
+        Result.NOT_ASKED,
+        Result.EXPIRED,
+        Result.POLL_ENDED,
+    )
+}
 
 
 class Quick(Toy):
@@ -383,6 +394,65 @@ def test_nothing_is_left_behind(port: str, end: str) -> None:
             os.close(master)
             polling.until("port lost")
     assert (descriptors(), threading.active_count()) == before
+
+
+class Patient(Toy):
+    """Answers within a minute."""
+
+    response_timeout = 60.0
+    response_delay = 15.0
+
+
+def patient(every: float | None) -> PolledDrive:
+    """Two requests, to two drives."""
+    polls = polled(Patient(1, name="pump-1"), [Patient.fault]).polls
+    return PolledDrive(Patient(1, name="pump-1"), tuple(replace(it, every=every) for it in polls))
+
+
+@pytest.fixture
+def far_end() -> Iterator[tuple[int, str]]:
+    """A line whose other end is the test's: its descriptor, and the path of the port."""
+    master, slave = os.openpty()
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
+def test_what_is_under_way_at_the_end_is_waited_for(far_end: tuple[int, str], every: float | None) -> None:
+    master, path = far_end
+    with Polling(line(path, patient(every))) as polling:
+        assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
+        answer = threading.Timer(0.05, os.write, (master, checksums.rtu("01 03 02 00 01")))
+        answer.start()
+    answer.join()
+    assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
+    polling.check_summary()
+
+
+def test_what_is_not_answered_by_the_end_has_a_row(
+    far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The request that is under way, the slot that waits behind it, and none that is not due yet."""
+    monkeypatch.setattr(poller_module, "PARTING_NS", 10_000_000)
+    master, path = far_end
+    waiting = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
+    with Polling(line(path, patient(30.0), waiting)) as polling:
+        assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
+    told = [(row.drive, row.value, row.status) for row in polling.rows]
+    assert told == [("pump-1", None, "poll ended"), ("pump-2", None, "poll ended")]
+    assert all(row.monotonic_ns > 0 for row in polling.rows)
+    polling.check_summary()
+
+
+def test_motors_are_stopped_before_the_port_is_closed(port: str, pump: SimulatedDrive) -> None:
+    with Polling(line(port, polled(drive(), ONE))) as polling:
+        bus = polling.poller.bus("line")
+        bus.stop_on_exit()
+        bus.drives[0].start()
+        assert pump["control"] == 1
+        polling.until("ok")
+    assert pump["control"] == 0
 
 
 def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) -> None:

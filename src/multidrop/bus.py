@@ -79,9 +79,13 @@ class Bus:
     ) -> None:
         self.close()
 
-    def close(self) -> None:
+    def part(self) -> None:
+        """What closing does as long as the port is open: stop the drives, if `stop_on_exit` was called."""
         if self._parting is not None:
             self._parting.now()
+
+    def close(self) -> None:
+        self.part()
         overruns = self.line.overruns()
         self.line.close()
         self._at_last = self._at_last or self._counted(overruns)

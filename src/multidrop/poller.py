@@ -32,6 +32,7 @@ from multidrop.statistics import LineStatistics
 
 LOOK_S = 0.05  # the longest that rows wait to be collected
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
+PARTING_NS = 1_000_000_000  # so long the end of the polling waits for what is under way
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
@@ -156,6 +157,7 @@ class _PolledLine:
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
         self._ahead_ns = 0  # what is queued will take
         self._learnt_ns = 0
+        self._left: int | None = None  # in the queue, with the one that was under way when it ended
         self._asked_of: list[tuple[Drive, Respondent]] = []
         self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
         self._reopening: threading.Thread | None = None
@@ -308,15 +310,40 @@ class _PolledLine:
         with suppress(LineError):
             self.bus.line.reopen()
 
-    def close(self) -> None:
+    def end(self) -> None:
+        """Begin nothing more; what is under way goes on."""
         if self._reopening:
             self._reopening.join()
+        self.ended_ns = now_ns()
+        port = self.bus.line.queue
+        if port and port.end():
+            self._left = port.pending
+
+    @property
+    def is_under_way(self) -> bool:
+        """An exchange that was begun is not over yet."""
+        port = self.bus.line.queue
+        return port is not None and port.pending == self._left
+
+    def close(self) -> None:
         port = self.bus.line.queue
         if port:
             port.stop()
-            self.ended_ns = now_ns()
             self._collect(port)
+            self._miss(self._unfinished(), Result.POLL_ENDED)
+        else:
+            self._miss(self.schedule.pass_slots(self.ended_ns), Result.LINE_LOST)
+        self.schedule = Schedule()
         self.bus.close()
+
+    def _unfinished(self) -> list[tuple[_Asked, int]]:
+        """What was due at the end: slots that had begun, and the first in the queue if it is under way."""
+        queued = list(self._queued)
+        if queued and len(queued) == self._left:
+            job, due_ns = queued[0]
+            queued[0] = job, due_ns or self.ended_ns
+        slots = [*queued, *self.schedule.pass_slots(self.ended_ns)]
+        return [(job, due_ns) for job, due_ns in slots if 0 < due_ns <= self.ended_ns]
 
     def summary(self) -> dict[str, Any]:
         seconds = max((self.ended_ns - self.started_ns) / 1e9, 1e-9)
@@ -394,10 +421,22 @@ class Poller:
         self.close()
 
     def close(self) -> None:
-        """Stop polling and close the ports; rows not yet taken can still be."""
+        """Stop polling and close the ports; rows not yet taken can still be.
+
+        What is under way is waited for, for a second at most; every slot that was due by now has a row.
+        """
+        if self._closing:
+            return
         self._closing = True
         if self._thread.is_alive():
             self._thread.join()
+        for line in self._lines:
+            line.bus.part()  # before the port is closed, on which it stops motors
+        for line in self._lines:
+            line.end()
+        given_up_ns = now_ns() + PARTING_NS
+        while any(line.is_under_way for line in self._lines) and now_ns() < given_up_ns:
+            sleep(0.001)
         for line in self._lines:
             line.close()
         self._rows.close()

@@ -48,6 +48,10 @@ class Port:
         self._stopped = False
         self._respondents: set[Respondent] = set()
 
+    def end(self) -> bool:
+        """Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are."""
+        return bool(lib.md_port_end(self.c))
+
     def stop(self) -> None:
         """Nothing more is carried out, and the descriptor is the caller's; what was can be reaped."""
         if not self._stopped:

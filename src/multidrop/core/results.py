@@ -26,6 +26,7 @@ class Result(IntEnum):
     LATE_ANSWER_DUE = lib.MD_LATE_ANSWER_DUE
     EXPIRED = lib.MD_EXPIRED
     NOT_ASKED = lib.MD_NOT_ASKED
+    POLL_ENDED = lib.MD_POLL_ENDED
 
     def __str__(self) -> str:
         return _REASONS[self]
@@ -48,6 +49,7 @@ _REASONS = {
     Result.LATE_ANSWER_DUE: "not asked: late reply due",
     Result.EXPIRED: "not sent: expired",
     Result.NOT_ASKED: "not asked: drive is silent",
+    Result.POLL_ENDED: "poll ended",
 }
 
 EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
