@@ -11,12 +11,11 @@ from time import monotonic, sleep
 from typing import Any
 
 from multidrop.batch import Row
-from multidrop.core import raw_value
 from multidrop.drive import Drive
 from multidrop.plant import Line, Plant, Polled, PolledDrive
 from multidrop.poller import Poller
-from multidrop.register import Carrier, Register
-from multidrop.sim import SimulatedDrive, Simulator, Wire, encoded, serve
+from multidrop.register import Register
+from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
 PATIENCE = 30.0  # s, for what comes at once but on a machine that has much else to do
 
@@ -94,15 +93,6 @@ def rows_of(poller: Poller) -> list[Row]:
 
 
 # ---- what a value proves ----
-
-
-def proof(drive: Drive, register: Register[Any]) -> float:
-    """What an EncodedDrive says there, as a row has it."""
-    at = range(register.address, register.address + register.words)
-    size = 2 if register.table.carrier is Carrier.WORD else 4
-    data = b"".join(encoded(drive.address, register.table, it).to_bytes(size) for it in at)
-    raw = raw_value(data, 0, register.wire)
-    return raw * register.scale.numerator / register.scale.denominator
 
 
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:

@@ -1,7 +1,7 @@
 """Drives that behave as their documents say, on ptys and TCP ports, at the pace of a real wire."""
 
 from multidrop.sim.drive import Counters, SimulatedDrive, Written
-from multidrop.sim.encoded import EncodedDrive, encoded
+from multidrop.sim.encoded import EncodedDrive, encoded, proof
 from multidrop.sim.families import simulated
 from multidrop.sim.faults import Faults, load_faults
 from multidrop.sim.hostile import HostileWire
@@ -25,6 +25,7 @@ __all__ = [
     "Written",
     "encoded",
     "load_faults",
+    "proof",
     "serve",
     "simulated",
 ]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from multidrop.register import Carrier, Table
+from typing import Any
+
+from multidrop.core import raw_value
+from multidrop.drive import Drive
+from multidrop.register import Carrier, Register, Table
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.memory import Cell
 
@@ -10,6 +14,15 @@ from multidrop.sim.memory import Cell
 def encoded(address: int, table: Table, register_address: int) -> int:
     """What an EncodedDrive holds there: it names drive, table and register (a coil has its lowest bit)."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
+
+
+def proof(drive: Drive, register: Register[Any]) -> float:
+    """The register's value on an EncodedDrive, as a row has it."""
+    at = range(register.address, register.address + register.words)
+    size = 2 if register.table.carrier is Carrier.WORD else 4
+    data = b"".join(encoded(drive.address, register.table, it).to_bytes(size) for it in at)
+    raw = raw_value(data, 0, register.wire)
+    return raw * register.scale.numerator / register.scale.denominator
 
 
 class EncodedDrive(SimulatedDrive):

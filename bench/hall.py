@@ -1,0 +1,133 @@
+"""Hostile lines with all families on them, in a process of their own, and what their values prove.
+
+The demo's eight variants hold values that name drive and register (EncodedDrive). A ninth drive on
+each line has a motor, so that its starts can bring noise.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+from threading import Thread
+
+from multidrop.cli.demo import DRIVES, OPTIONS
+from multidrop.drives import MODELS
+from multidrop.plant import Plant, load_plant
+from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, load_faults, proof, serve, simulated
+
+MOTOR = "fan"
+EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
+PATIENCE = 30.0  # s, until the simulator has started
+BEAT = 5e-3  # s
+
+
+def write_plant(directory: Path, lines: int) -> Path:
+    """A plant file; the last of several lines is a TCP port, which the simulator chooses."""
+    path = directory / "hall.toml"
+    tables = []
+    for number in range(1, lines + 1):
+        tcp = number == lines > 1
+        port = "socket://127.0.0.1:0" if tcp else directory / f"line-{number}"
+        tables.append(f'[[line]]\nname = "line-{number}"\nport = "{port}"\n')
+        for address, (name, model, framing) in enumerate([*DRIVES, (MOTOR, "yd1000", "rtu")], 1):
+            family = MODELS[model]
+            options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+            first, *others = (it.name for it in family.readings())
+            poll = ", ".join([f'{{ register = "{first}", every = "{EVERY:g} s" }}', *map(repr, others)])
+            tables.append(
+                f'[[line.drive]]\nname = "{name}-{number}"\nmodel = "{model}"\nframing = "{framing}"\n'
+                f"address = {address}\n{options}poll = [{poll}]\n"
+            )
+    path.write_text("\n".join(tables))
+    return path
+
+
+def proofs(plant: Plant) -> dict[tuple[str, str], float]:
+    """What every polled value must be, by names of drive and register; the motors' own are not known."""
+    return {
+        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
+        for line in plant.lines
+        for it in line.drives
+        if not is_motor(it.drive.name)
+        for poll in it.polls
+    }
+
+
+def is_motor(drive: str) -> bool:
+    return drive.startswith(MOTOR)
+
+
+@dataclass
+class Hall:
+    """A running simulator: where its lines are, and how it fares."""
+
+    ports: Sequence[str]
+    pid: int
+    _late: Synchronized[float]
+
+    def latest(self) -> float:
+        """The longest in s that the simulator was held up since this was asked last."""
+        with self._late.get_lock():
+            late, self._late.value = self._late.value, 0.0
+        return late
+
+
+@contextmanager
+def running(plant: Path, faults: Path) -> Iterator[Hall]:
+    """The plant's lines, simulated with these faults."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    late = context.Value("d", 0.0)
+    process = context.Process(target=_simulate, args=(plant, load_faults(faults), theirs, late), daemon=True)
+    process.start()
+    try:
+        if not ours.poll(PATIENCE):
+            raise TimeoutError("the simulator did not start")
+        yield Hall(ours.recv(), process.pid or 0, late)
+    finally:
+        process.terminate()
+        process.join()
+        process.close()
+        ours.close()
+        theirs.close()
+
+
+def _simulate(plant: Path, faults: Faults, connection: Connection, late: Synchronized[float]) -> None:
+    with suppress(OSError):  # so that the line keeps its time on a machine that has much else to do
+        os.nice(-10)
+    wires = [
+        HostileWire(
+            [
+                simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
+                for it in line.drives
+            ],
+            faults,
+            name=line.name,
+            port=line.port,
+        )
+        for line in load_plant(plant).lines
+    ]
+    Thread(target=_watch, args=(late,), daemon=True).start()
+
+    def announce(simulator: Simulator) -> None:
+        connection.send([wire.path for wire in simulator.wires])
+
+    serve(wires, announce)
+
+
+def _watch(late: Synchronized[float]) -> None:
+    """How long this process is held up: a drive that hears so late answers so late."""
+    before = time.monotonic()
+    while True:
+        time.sleep(BEAT)
+        now = time.monotonic()
+        with late.get_lock():
+            late.value = max(late.value, now - before - BEAT)
+        before = now
