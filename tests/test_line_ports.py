@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 from lines import line, plant, polled, rows_of, until
 from serial import rfc2217
-from toy import Toy
+from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
 from multidrop.errors import LineError
@@ -236,7 +236,7 @@ def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Calla
     thread = threading.Thread(target=hang_up)
     thread.start()
     with Bus(path) as bus:
-        toy = bus.attach(Toy, 1)
+        toy = bus.attach(PatientToy, 1)
         for _ in range(2):  # and it stays lost
             with pytest.raises(LineError) as caught:
                 bus.read(toy, toy.output_current)

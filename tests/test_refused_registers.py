@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from toy import Toy
+from toy import PatientToy, Toy
 
 from multidrop.plant import Line, Plant, Polled, PolledDrive
 from multidrop.poller import Poller
@@ -26,7 +26,7 @@ class Stubborn(SimulatedDrive):
 
 def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     with Simulator([Wire([Stubborn(Toy(1))], unpaced=True)]) as simulator:
-        drive = Toy(1, name="pump-1")
+        drive = PatientToy(1, name="pump-1")
         polls = tuple(Polled(drive.register(name), None) for name in POLLED)
         line = Line("hall-1", simulator.wires[0].path, None, None, (PolledDrive(drive, polls),))
         seen: dict[str, int] = {}

@@ -62,3 +62,9 @@ class Toy(Drive):
         """What the drive says of itself."""
         status = yield from read(Toy.status)
         return State(Condition.RUNNING if status & Status.RUNNING else Condition.STOPPED)
+
+
+class PatientToy(Toy):
+    """One that is waited for however busy the machine is."""
+
+    response_timeout = 60.0
