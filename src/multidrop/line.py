@@ -291,7 +291,7 @@ class Line:
             if self._bridge or not self._serial:
                 return None
             fcntl.ioctl(self._serial.fileno(), _TIOCGICOUNT, counts)
-        except (*_PORT_FAILURES, TypeError):  # it may be closed meanwhile
+        except (*_PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
             return None
         found = _ICOUNTER.unpack(counts)
         return int(found[_OVERRUN] + found[_BUF_OVERRUN])
