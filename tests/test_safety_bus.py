@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from halls import Hall, one
+from halls import Hall, is_write, one
+from motors import MAKE, STARTS
 
 from multidrop.audit import read_audit
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, State
-from multidrop.drives import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.drives import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.invt_che import Control, parameter
 from multidrop.errors import (
     DriveRefused,
@@ -26,6 +27,7 @@ from multidrop.errors import (
     Unconfirmed,
     Unsupported,
 )
+from multidrop.exchanges import READ_ATTEMPTS
 from multidrop.ledger import Ledger
 from multidrop.motion import ramp, start_staggered
 from multidrop.outcome import Effect
@@ -33,26 +35,7 @@ from multidrop.register import COIL, Kept, setting
 from multidrop.sim import PoweredDrive, simulated
 from multidrop.stopping import Seen
 
-MAKE: dict[str, Callable[[int], Drive]] = {
-    "erman-er-g-220": ErmanERG220,
-    "invt-che": lambda address: InvtCHE(address, maximum_frequency=50),
-    "innovert-ibd": InnovertIBD,
-    "delixi-modbus": lambda address: DelixiModbus(address, framing="rtu"),
-    "delixi-native": DelixiNative,
-    "yd1000": YD1000,
-}
-assert set(MAKE) == set(MODELS)
 every_family = pytest.mark.parametrize("model", MAKE)
-
-# What starts the motor, of each family, by address and value, in the documents' words.
-STARTS: dict[str, Callable[[Message], bool]] = {
-    "erman-er-g-220": lambda it: it.function in (5, 15) and it.start == 0 and it.data != b"\0\0",
-    "invt-che": lambda it: it.start == 0x1000 and it.data[-1] in (1, 2, 3, 4),
-    "innovert-ibd": lambda it: it.start == 0x2000 and bool(it.data[-1] & 2),
-    "delixi-modbus": lambda it: it.start == 0x2000 and bool(it.data[-1] & 2),
-    "delixi-native": lambda it: it.function == 2 and it.start in (2, 3),
-    "yd1000": lambda it: it.start == 0x1000 and (bool(it.data[0] & 0x05) or not it.data[0] & 0x80),
-}
 
 
 def starts(hall: Hall, model: str) -> list[str]:
@@ -346,6 +329,45 @@ def test_a_stop_whose_reply_is_lost_three_times_is_unconfirmed(
     hall.sleep(60)
     sim.pass_time(hall.seconds)
     assert not sim.motor.energised  # it had heard the first one
+
+
+@every_family
+@pytest.mark.parametrize("verb", ["start", "stop"])
+def test_a_drive_that_is_heard_no_more_after_its_command(
+    monkeypatch: pytest.MonkeyPatch, model: str, verb: str
+) -> None:
+    """What is confirmed and cannot be seen is unconfirmed: NoReply would say that nothing was sent."""
+    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(20)
+    if verb == "stop":
+        drive.start()
+    begun = len(hall.written)
+    hall.loses = lambda request: len(hall.written) > begun and not is_write(request)
+    with pytest.raises(
+        Unconfirmed, match=r"it was confirmed, but its effect could not be seen: .*not answer"
+    ):
+        getattr(drive, verb)()
+    assert len(starts(hall, model)) == 1
+    hall.sleep(60)
+    sim.pass_time(hall.seconds)
+    assert sim.motor.energised == (verb == "start")
+
+
+def test_noise_at_the_start_hides_a_look_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    spoilt: list[Message] = []
+
+    def loses(request: Message) -> bool:
+        if starts(hall, "invt-che") and len(spoilt) < 2 * READ_ATTEMPTS:
+            spoilt.append(request)
+        return bool(spoilt) and spoilt[-1] is request and not is_write(request)
+
+    hall.loses = loses
+    drive.start()
+    assert len(starts(hall, "invt-che")) == 1
+    assert len(spoilt) == 2 * READ_ATTEMPTS
+    assert sim.motor.energised
 
 
 def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:

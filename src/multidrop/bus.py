@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 from multidrop.audit import AuditLog
 from multidrop.core import Message, Respondent
 from multidrop.drive import Drive, Read, Script, State, Step, Wait, Write, carry_out
-from multidrop.errors import BusError, DriveRefused, Refused
+from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
 from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
 from multidrop.ledger import Ledger
 from multidrop.line import Line, now_ns, sleep
@@ -246,8 +246,28 @@ class Bus:
     # ---- verbs ----
 
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
-        """Carry out a verb's steps; the drive's verbs call this."""
-        return carry_out(script, lambda step: self._step(drive, step))
+        """Carry out a verb's steps; the drive's verbs call this.
+
+        A drive that is heard no more after something was written to it: Unconfirmed, because NoReply
+        says that nothing was.
+        """
+        written: list[Write] = []
+
+        def do(step: Step) -> Any:
+            result = self._step(drive, step)
+            if isinstance(step, Write):
+                written.append(step)
+            return result
+
+        try:
+            return carry_out(script, do)
+        except (NoReply, BadReply) as failure:
+            if not written:
+                raise
+            register, value = written[-1].register, written[-1].value
+            what = f"{register.name} = {register.format(value)}"
+            reason = f"it was confirmed, but its effect could not be seen: {failure}"
+            raise Unconfirmed(drive.name, what, reason) from failure
 
     def _step(self, drive: Drive, step: Step) -> Any:
         if isinstance(step, Wait):

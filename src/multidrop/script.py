@@ -9,8 +9,10 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
-from multidrop.errors import BusError, DriveRefused, Unconfirmed
+from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Unconfirmed
 from multidrop.register import Register
+
+MOST_UNHEARD = 3  # looks in a row
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -83,11 +85,23 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Look again and again until it is true; False when `limit` seconds have passed."""
+    """Look again and again until it is true; False when `limit` seconds have passed.
+
+    A motor that starts brings noise: a look at a drive that cannot be heard sees nothing, but for the
+    third in a row, whose failure is raised.
+    """
     waited = 0.0
-    while not (yield from look()):
+    unheard = 0
+    while True:
+        try:
+            if (yield from look()):
+                return True
+            unheard = 0
+        except (NoReply, BadReply):
+            unheard += 1
+            if unheard == MOST_UNHEARD:
+                raise
         if waited >= limit:
             return False
         yield from wait(every)
         waited += every
-    return True
