@@ -1,6 +1,8 @@
 /* What was overheard becomes columns, as fast as a disk delivers it. */
 #include "multidrop.h"
 
+#include <string.h>
+
 /* Requests with one key have replies that hold the same. A Delixi run command stands where other
  * requests have their address. */
 static uint64_t key_of(int framing, const struct md_message *request)
@@ -74,10 +76,24 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     decoder->block = known->block;
     decoder->asked_ns = span->time_ns;
     decoder->failure = MD_NO_REPLY;
+    decoder->completion.raw_len = 0;
     return MD_ALL_DECODED;
 }
 
-static int take(struct md_decoder *decoder, struct md_columns *columns)
+/* What came, but is not the reply, tells why there is none. */
+static void explain(struct md_decoder *decoder, const struct md_heard *heard)
+{
+    const struct md_span *span = &decoder->span;
+    struct md_completion *completion = &decoder->completion;
+    size_t room = sizeof completion->raw - completion->raw_len, len = span->len < room ? span->len : room;
+    if (span->side == MD_NOISE || len == 0)
+        return;
+    memcpy(completion->raw + completion->raw_len, heard->bytes + span->at, len);
+    completion->raw_len = (uint16_t)(completion->raw_len + len);
+    decoder->failure = md_reason(decoder->splitter.framing, &decoder->splitter.request, completion->raw, completion->raw_len);
+}
+
+static int take(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
     int is_request = span->kind == MD_REQUEST || span->kind == MD_EITHER;
@@ -90,10 +106,8 @@ static int take(struct md_decoder *decoder, struct md_columns *columns)
         return undone;
     if (is_request)
         decoder->is_sure = span->kind == MD_REQUEST;
-    if (span->kind == MD_STRAY)
-        decoder->failure = span->message.address != decoder->splitter.request.address ? MD_BAD_ADDRESS : MD_BAD_LENGTH;
-    if (span->kind == MD_JUNK)
-        decoder->failure = MD_NO_START;
+    if (decoder->block && (span->kind == MD_STRAY || span->kind == MD_JUNK))
+        explain(decoder, heard);
     decoder->frames += span->kind != MD_JUNK;
     decoder->exchanges += span->kind == MD_REPLY;
     decoder->strays += span->kind == MD_STRAY;
@@ -105,7 +119,7 @@ int md_decode(struct md_decoder *decoder, const struct md_heard *heard, struct m
 {
     while (decoder->is_due || md_split(&decoder->splitter, heard, &decoder->span)) {
         decoder->is_due = 1;
-        int undone = take(decoder, columns);
+        int undone = take(decoder, heard, columns);
         if (undone)
             return undone;
         decoder->is_due = 0;

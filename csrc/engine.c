@@ -485,6 +485,13 @@ int md_port_end(struct md_port *port)
     return is_under_way;
 }
 
+void md_port_tap(struct md_port *port, struct md_tap *tap)
+{
+    pthread_mutex_lock(&port->engine->mutex);
+    port->line.tap = tap;
+    pthread_mutex_unlock(&port->engine->mutex);
+}
+
 void md_port_stop(struct md_port *port)
 {
     struct md_engine *engine = port->engine;

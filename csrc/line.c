@@ -21,23 +21,6 @@ enum state {
     ENDING     /* the time-out is over: looks once more, because it may be late to look at all */
 };
 
-/* How much a reason says about what went wrong. The one that says most is reported, and of several
- * that say as much the first: a frame from another address may hold our own further on. */
-static int weight(int reason)
-{
-    static const uint8_t weights[] = {
-        [-MD_NO_START] = 1,
-        [-MD_BAD_ADDRESS] = 2,
-        [-MD_BAD_FUNCTION] = 2,
-        [-MD_BAD_LENGTH] = 3,
-        [-MD_BAD_CHARACTER] = 4,
-        [-MD_CUT_SHORT] = 5,
-        [-MD_BAD_CHECKSUM] = 6,
-        [-MD_BAD_ECHO] = 7,
-    };
-    return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
-}
-
 static int64_t later(int64_t a, int64_t b)
 {
     return a > b ? a : b;
@@ -101,9 +84,41 @@ static void count(const struct md_exchange *exchange, const struct md_completion
         drive->failures = 0;
 }
 
+static int is_copy(const struct md_line *line, size_t at)
+{
+    return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
+}
+
+/* Whether a part of the request at least has left. */
+static int is_under_way(const struct md_line *line)
+{
+    return line->state > SENDING || (line->state == SENDING && line->tx_at > 0);
+}
+
+static void tell(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
+{
+    if (is_under_way(line)) /* what came before was told when it came */
+        md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
+}
+
+/* What came since the request began to leave: the reply, or what came in its place, amid the rest. */
+static void tell_received(const struct md_line *line, int result, const uint8_t *raw, size_t raw_len)
+{
+    if (result <= 0 && is_copy(line, 0) && raw == line->rx && raw_len >= line->tx_len) {
+        raw += line->tx_len; /* the adapter's echo */
+        raw_len -= line->tx_len;
+    }
+    const struct md_completion *completion = line->completion;
+    size_t at = (size_t)(raw - line->rx);
+    tell(line, MD_NOISE, completion->first_ns, line->rx, at);
+    tell(line, result > 0 ? MD_ANSWERING : MD_FAILED, completion->first_ns, raw, raw_len);
+    tell(line, MD_NOISE, completion->last_ns, raw + raw_len, line->rx_len - at - raw_len);
+}
+
 static void finish(struct md_line *line, int result, const uint8_t *raw, size_t raw_len)
 {
     struct md_completion *completion = line->completion;
+    tell_received(line, result, raw, raw_len);
     if (raw_len > sizeof completion->raw) {
         raw += raw_len - sizeof completion->raw;
         raw_len = sizeof completion->raw;
@@ -142,11 +157,6 @@ static void measure(struct md_line *line, int reply_len)
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
 {
     return md_parse_reply(line->exchange->framing, line->rx + at, line->rx_len - at, &line->exchange->request, reply);
-}
-
-static int is_copy(const struct md_line *line, size_t at)
-{
-    return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
 }
 
 static void expect_late_answer(struct md_line *line)
@@ -221,19 +231,13 @@ static void time_out(struct md_line *line)
     size_t begin = is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
     if (begin > 0 && begin == line->rx_len)
         line->echoes = 1; /* nobody else says it again and no more */
-    int reason = begin == line->rx_len ? MD_NO_REPLY : MD_INCOMPLETE;
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
-    for (size_t at = begin; at < line->rx_len; at++) {
-        int why = parse_at(line, at, &reply);
-        if (why == MD_INCOMPLETE)
-            why = MD_CUT_SHORT;
-        if (weight(why) > weight(reason))
-            reason = why;
-    }
     /* Only a damaged frame of its own says that the drive has answered: others' and noise do not, and
      * what looks like one further on may be the inside of another. */
     if (first != MD_BAD_CHECKSUM && first != MD_BAD_CHARACTER)
         expect_late_answer(line);
+    const struct md_exchange *exchange = line->exchange;
+    int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
     finish(line, reason, line->rx, line->rx_len);
 }
 
@@ -252,6 +256,7 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 /* What is no part of this exchange, as far as anyone can tell from the rest. */
 static void cut_out(struct md_line *line, size_t at, size_t len)
 {
+    tell(line, MD_NOISE, line->completion->last_ns, line->rx + at, len);
     line->rx_len = (uint16_t)(line->rx_len - len);
     memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
 }
@@ -309,6 +314,7 @@ static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
+    tell(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->rx_len = (uint16_t)(line->rx_len - GONE);
     line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);
     memmove(line->rx, line->rx + GONE, line->rx_len);
@@ -383,8 +389,10 @@ int md_line_want(struct md_line *line, int64_t now_ns)
 /* What came while the request was leaving answers nothing, but may be the beginning of its echo. */
 static void keep_echo(struct md_line *line)
 {
-    if (line->rx_len > line->tx_len || memcmp(line->rx, line->tx, line->rx_len) != 0)
+    if (line->rx_len > line->tx_len || memcmp(line->rx, line->tx, line->rx_len) != 0) {
+        tell(line, MD_NOISE, line->completion->sent_ns, line->rx, line->rx_len);
         line->rx_len = 0;
+    }
     line->completion->stale -= line->rx_len;
     line->completion->skipped = line->rx_len;
 }
@@ -398,6 +406,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
         line->completion->sent_ns = now_ns;
         line->rx_len = 0;
     }
+    md_tap_put(line->tap, MD_ASKING, now_ns, line->tx + line->tx_at, len);
     line->quiet_ns = later(line->quiet_ns, now_ns) + (int64_t)len * exchange->character_ns;
     line->tx_at = (uint16_t)(line->tx_at + len);
     if (line->tx_at < line->tx_len)
@@ -433,6 +442,8 @@ static void take_stale(struct md_line *line, const uint8_t *bytes, size_t len, i
     line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
     if (line->state != IDLE)
         line->completion->stale += (uint32_t)len;
+    if (!is_under_way(line))
+        md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
     int is_unsent = line->state == LOOKING || (line->state == SENDING && line->tx_at == 0);
     if (is_unsent && now_ns < line->give_up_ns)
         line->state = SILENT;

@@ -102,6 +102,11 @@ int md_port_set(int fd, const struct md_settings *settings);
 /* Read the settings; 0 or -errno. */
 int md_port_get(int fd, struct md_settings *settings);
 
+/* ---- reason.c ---- */
+
+/* Why these bytes, which came in place of the reply, are none (enum md_result). */
+int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
+
 /* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
 
 enum { MD_DELAY_BUCKETS = 128 };
@@ -169,6 +174,8 @@ enum md_want {
     MD_READ   /* bytes, or to be asked again at wake_ns */
 };
 
+struct md_tap;
+
 struct md_line {
     int state;
     int64_t quiet_ns;   /* since when nobody has been sending */
@@ -184,6 +191,7 @@ struct md_line {
     int echoes;               /* the adapter echoes what it sends: learnt, never forgotten by failures */
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
     int looks;                /* how often the line was looked at since the request left */
+    struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */
     uint8_t tx[513], rx[1026];
 };
 
@@ -220,6 +228,8 @@ int md_engine_notice(struct md_engine *engine); /* a descriptor, readable when a
 /* `must_take`: which refusals (enum md_refusal) are failures; -1: a port without settings. `room`
  * for exchanges, a power of two. NULL: see errno. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room);
+/* Tell a tap of all that goes over the line from now on; it must outlive the port, or another tap be told. */
+void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are. */
 int md_port_end(struct md_port *port);
 /* Nothing more is carried out, and the descriptor is the caller's again; what was can be reaped. */
@@ -281,15 +291,49 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
  * Writes n + 1 offsets and the text; the text's length, or -1 when `room` is too small or a code has no name. */
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets,
                  size_t names, int32_t *out_offsets, uint8_t *out, size_t room);
-/* ---- heard.c: bytes that were overheard, in pieces ---- */
+/* ---- tap.c: what goes over a line, kept until it is taken as packets of a pcapng file ---- */
 
-enum md_side { MD_EITHER_SIDE, MD_ASKING, MD_ANSWERING };
+/* Who sent it, where that is known. Of the last two the master itself says that they are no frames. */
+enum md_side {
+    MD_EITHER_SIDE,
+    MD_ASKING,
+    MD_ANSWERING,
+    MD_FAILED, /* came in place of a reply */
+    MD_NOISE,  /* and this not even that: stray bytes, echo, late replies */
+    MD_SIDES
+};
+
+/* A ring with one who puts and one who takes. Zeroed but for `ring` and `room` it is empty. */
+struct md_tap {
+    uint8_t *ring;
+    uint32_t room;       /* bytes, a power of two */
+    uint32_t put, taken; /* each has one writer, only grows, and wraps around */
+    uint64_t lost;       /* bytes for which there was no room */
+};
+
+/* What stands before and behind the bytes of a packet. There are two for each side: of other
+ * frames, and of such that begin with ':'. */
+struct md_wrapping {
+    const uint8_t *head, *tail;
+    uint32_t head_len, tail_len; /* the tail's is a multiple of 4 */
+};
+
+void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
+/* Take whole packets as long as there is room; their length. */
+size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
+                   int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
+/* The packet with these bytes, of which the first tells what stands before them. */
+size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
+void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
+                   const uint8_t *bytes, size_t len, uint8_t *out);
+
+/* ---- heard.c: bytes that were overheard, in pieces ---- */
 
 /* Bytes that came together, from `at` up to the next piece. */
 struct md_piece {
     size_t at;
     int64_t time_ns;
-    uint8_t side;           /* enum md_side: who sent them, where that is known */
+    uint8_t side;           /* enum md_side */
     uint8_t is_after_pause; /* the line was silent before them: only a hint */
 };
 
@@ -320,7 +364,8 @@ enum md_kind {
 
 struct md_span {
     size_t at, len;
-    int64_t time_ns; /* of the piece in which it begins */
+    int64_t time_ns; /* of the piece in which it begins, */
+    int side;        /* as this is */
     int kind, framing;
     struct md_message message;
 };
@@ -354,7 +399,7 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* of the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* it was a request; why it has no reply, if that does not come */
+    int is_sure, failure;         /* it was a request; why it has no reply, if none comes */
     int is_due;                   /* `span` is still to be dealt with */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;

@@ -145,6 +145,12 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
     splitter->awaited = span->message.address != 0;
 }
 
+/* Bytes of which who captured them says that they are no frames. */
+static int is_ruled_out(const struct md_piece *piece)
+{
+    return piece->side == MD_FAILED || piece->side == MD_NOISE;
+}
+
 int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct md_span *span)
 {
     const struct md_piece *pieces = heard->pieces;
@@ -153,8 +159,12 @@ int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct 
     for (; at < heard->len; at++) {
         while (splitter->piece + 1 < heard->count && pieces[splitter->piece + 1].at <= at)
             splitter->piece++;
-        if (at == splitter->at)
+        if (at == splitter->at) {
             span->time_ns = pieces[splitter->piece].time_ns;
+            span->side = pieces[splitter->piece].side;
+        }
+        if (is_ruled_out(&pieces[splitter->piece]))
+            break;
         if (at >= end)
             end = end_of_run(heard, splitter->piece);
         /* A pause ends what begins amid junk: it must not swallow the good frame behind the pause. */
@@ -168,6 +178,13 @@ int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct 
     }
     span->at = splitter->at;
     span->len = at - splitter->at;
+    if (!span->len && at < heard->len && is_ruled_out(&pieces[splitter->piece])) {
+        span->kind = MD_JUNK; /* which says nothing of the frames around it */
+        size_t next = splitter->piece + 1;
+        splitter->at = next < heard->count ? pieces[next].at : heard->len;
+        span->len = splitter->at - span->at;
+        return 1;
+    }
     if (span->len)
         span->kind = MD_JUNK; /* the frame behind it is found again */
     else if (used <= 0)

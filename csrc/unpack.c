@@ -7,8 +7,12 @@ enum {
     ENHANCED_PACKET = 6,
     MOST_PACKET = 1 << 16,
     RTAC_HEADER = 12,
-    TAG_PORT_OF_SENDER = 25,
-    SERVER_PORT = 502
+    TAG_PORT_OF_SENDER = 25
+};
+
+/* The senders' ports in captures of ours. */
+static const struct { uint32_t port; uint8_t side; } senders[] = {
+    {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
 
 static uint32_t number(const struct md_capture *capture, const uint8_t *at, int bytes)
@@ -42,8 +46,9 @@ static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint
         at += 4;
         if (tag == 0)
             return at;
-        if (tag == TAG_PORT_OF_SENDER && size == 4 && at + 4 <= len)
-            *side = big_endian(packet + at, 4) == SERVER_PORT ? MD_ANSWERING : MD_ASKING;
+        for (size_t i = 0; tag == TAG_PORT_OF_SENDER && size == 4 && at + 4 <= len && i < 4; i++)
+            if (big_endian(packet + at, 4) == senders[i].port)
+                *side = senders[i].side;
         at += size;
     }
     return len;

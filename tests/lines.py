@@ -35,10 +35,10 @@ class Faulty(Wire):
         self, drives: Sequence[SimulatedDrive], fate: Callable[[bytes], bytes], **details: Any
     ) -> None:
         super().__init__(drives, **details)
-        self._fate = fate
+        self.fate = fate
 
     def distort(self, reply: bytes) -> bytes:
-        return self._fate(reply)
+        return self.fate(reply)
 
 
 # ---- in a process of their own ----

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SOURCES = [
     "tests/c/test_core.c",
-    *(f"csrc/{name}.c" for name in ("checksum", "frame", "line", "tally", "columns")),
+    *(f"csrc/{name}.c" for name in ("checksum", "frame", "reason", "tap", "line", "tally", "columns")),
 ]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]

@@ -346,7 +346,7 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
         capture.write(exchange.frame, Side.ANSWERING, 6, "hall-1")
     assert [(row.time, row.uncertainty_ns, row.value, row.status) for row in rows(tmp_path / "a.pcapng")] == [
         (1, None, None, "no reply"),
-        (2, None, None, "no frame in what was received"),
+        (2, None, None, "bad checksum"),
         (4, 2, 5000, "ok"),
     ]
 

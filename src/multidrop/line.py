@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, notice_fd
+from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, notice_fd
 from multidrop.errors import LineError
 
 __all__ = ["Line", "Wake", "await_notice", "now_ns", "sleep", "utc_minus_monotonic_ns"]
@@ -53,9 +53,26 @@ _OPEN_REASONS = {
 }
 
 
-def utc_minus_monotonic_ns() -> int:
-    """What to add to CLOCK_MONOTONIC to have UTC, as of now."""
-    return time.time_ns() - now_ns()
+class _UtcOffset:
+    """What to add to CLOCK_MONOTONIC to have UTC: kept as long as it is right to 0.1 ms.
+
+    So a moment has one time, in whichever recording it stands.
+    """
+
+    def __init__(self) -> None:
+        self._kept_ns = 0
+
+    def __call__(self) -> int:
+        before_ns, utc_ns, after_ns = now_ns(), time.time_ns(), now_ns()
+        offset_ns = utc_ns - before_ns
+        is_known = after_ns - before_ns < _WRONG_NS  # else this thread was interrupted meanwhile
+        if not self._kept_ns or (is_known and abs(offset_ns - self._kept_ns) > _WRONG_NS):
+            self._kept_ns = offset_ns
+        return self._kept_ns
+
+
+_WRONG_NS = 100_000
+utc_minus_monotonic_ns = _UtcOffset()
 
 
 def _reason(failure: BaseException) -> str:
@@ -174,6 +191,7 @@ class Line:
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
         self._serial: serial.SerialBase | None = None
         self._core: Port | None = None
+        self._tap: Tap | None = None
         self._lock = threading.RLock()  # one opens or closes at a time
         self._waiting = 0  # callers that wait for an exchange
         self._left = threading.Condition(self._lock)  # one of them has left
@@ -188,6 +206,8 @@ class Line:
                 port.exclusive = True
             port.open()
             self._core = self._drive(port)
+            if self._tap:
+                self._core.tap(self._tap)
             with suppress(*_PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except _PORT_FAILURES as failure:
@@ -224,6 +244,13 @@ class Line:
             if self._serial:
                 with suppress(*_PORT_FAILURES):
                     self._serial.close()
+
+    def tap(self, tap: Tap) -> None:
+        """Tell this tap, and no other any more, of all that goes over the line."""
+        with self._lock:
+            self._tap = tap
+            if self._core:
+                self._core.tap(tap)
 
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""

@@ -447,12 +447,16 @@ class Poller:
                 line.tend(now_ns())
             await_notice(LOOK_S)
 
+    @property
+    def buses(self) -> dict[str, Bus]:
+        """The lines' buses, by name."""
+        return {polled.name: polled.bus for polled in self._lines}
+
     def bus(self, line: str) -> Bus:
         """The bus of the line with this name."""
-        for polled in self._lines:
-            if polled.name == line:
-                return polled.bus
-        raise ValueError(f"there is no line {line!r}; there are {', '.join(it.name for it in self._lines)}")
+        if line not in self.buses:
+            raise ValueError(f"there is no line {line!r}; there are {', '.join(self.buses)}")
+        return self.buses[line]
 
     def fileno(self) -> int:
         """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""

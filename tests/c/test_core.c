@@ -1,7 +1,8 @@
 /* The C core against the documents' frames and against hostile lengths, without any framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
- *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/line.c csrc/columns.c -o test_core
+ *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c csrc/tally.c \
+ *      csrc/columns.c -o test_core
  *   ./test_core tests/data/frames.csv
  *
  * Without -fsanitize it also runs under valgrind: --error-exitcode=99 --leak-check=full. All bytes
@@ -350,6 +351,37 @@ static void check_spelling(void)
     CHECK(md_spell(codes, 4, names, offsets, NAMES - 1, ends, page_end() - 10, 10) == -1);
 }
 
+/* Packets as the pcapng draft has them, out of a ring whose end they cross; what finds no room is counted. */
+static void check_tap(void)
+{
+    enum { ROOM = 64, LEN = 5, SIZE = 28 + 8 + 4 + 4 }; /* head and bytes are 8 together, the tail 4 */
+    static const uint8_t said[] = {'a', 'b', 'c', 'd', 'e'};
+    static const uint8_t packet[SIZE] = {
+        6, 0, 0, 0, SIZE, 0, 0, 0, 7, 0, 0, 0, 1, 0, 0, 0, 105, 0, 0, 0, 8, 0, 0, 0, 8, 0, 0, 0,
+        'H', 'H', 'H', 'a', 'b', 'c', 'd', 'e', 'T', 'T', 'T', 'T', SIZE, 0, 0, 0,
+    };
+    static const struct md_wrapping wrappings[2 * MD_SIDES] = {
+        [2 * MD_ANSWERING] = {.head = (const uint8_t *)"HHH", .head_len = 3, .tail = (const uint8_t *)"TTTT", .tail_len = 4},
+    };
+    uint8_t ring[ROOM];
+    struct md_tap tap = {.ring = ring, .room = ROOM};
+    row = "tap";
+    for (int round = 0; round < 100; round++) {
+        for (int n = 0; n < 4; n++) /* each takes 21 bytes of the ring: three fit */
+            md_tap_put(&tap, MD_ANSWERING, INT64_C(0x100000000), said, LEN);
+        CHECK(tap.lost == (uint64_t)LEN * (uint64_t)(round + 1));
+        for (int n = 0; n < 3; n++) {
+            uint8_t *out = page_end() - SIZE;
+            CHECK(md_tap_take(&tap, wrappings, 7, 105, page_end() - SIZE + 1, SIZE - 1) == 0);
+            CHECK(md_tap_take(&tap, wrappings, 7, 105, out, SIZE) == SIZE && memcmp(out, packet, SIZE) == 0);
+        }
+        CHECK(md_tap_take(&tap, wrappings, 7, 105, page_end() - SIZE, SIZE) == 0);
+    }
+    CHECK(md_packet_length(wrappings, MD_ANSWERING, 'a', LEN) == SIZE);
+    md_put_packet(wrappings, 7, MD_ANSWERING, INT64_C(0x100000069), said, LEN, page_end() - SIZE);
+    CHECK(memcmp(page_end() - SIZE, packet, SIZE) == 0);
+}
+
 int main(int argc, char **argv)
 {
     if (argc != 2) {
@@ -362,6 +394,7 @@ int main(int argc, char **argv)
     check_values();
     check_columns();
     check_spelling();
+    check_tap();
     printf("%d checks, %d failures\n", checks, failures);
     return failures != 0;
 }

@@ -1,7 +1,8 @@
 /* Hostile bytes for the parsers and the line.
  *
  *   clang -std=c11 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -Icsrc \
- *      tests/fuzz/fuzz_frame.c csrc/checksum.c csrc/frame.c csrc/line.c -o fuzz_frame
+ *      tests/fuzz/fuzz_frame.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c csrc/tally.c \
+ *      -o fuzz_frame
  *   ./fuzz_frame -max_total_time=60 -max_len=1500 -len_control=0 CORPUS_DIRECTORY
  *
  * An input is a header (struct header) and what comes back from the line. Without the mutator below,
@@ -69,13 +70,39 @@ static int listens(struct md_line *line, int64_t now)
     return want == MD_READ || want == MD_WAIT;
 }
 
+static uint32_t number(const uint8_t *at)
+{
+    return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
+}
+
+/* A tap is told of what went over the line, byte for byte. */
+static void check_tap(struct md_tap *tap, const struct md_line *line, const uint8_t *bytes, size_t len)
+{
+    enum { BYTES_AT = 28 };
+    static struct md_wrapping bare[2 * MD_SIDES];
+    for (size_t i = 0; i < sizeof bare / sizeof *bare; i++)
+        bare[i].head = bare[i].tail = (const uint8_t *)"";
+    static uint8_t packets[1 << 16], told[MD_MOST_FRAME + MOST_RECEIVED];
+    size_t used = md_tap_take(tap, bare, 0, 0, packets, sizeof packets), have = 0;
+    for (size_t at = 0; at < used; at += number(packets + at + 4)) {
+        must(number(packets + at + number(packets + at + 4) - 4) == number(packets + at + 4));
+        memcpy(told + have, packets + at + BYTES_AT, number(packets + at + 20));
+        have += number(packets + at + 20);
+    }
+    must(tap->lost == 0 && tap->taken == tap->put && have == line->tx_len + len);
+    must(memcmp(told, line->tx, line->tx_len) == 0 && memcmp(told + line->tx_len, bytes, len) == 0);
+}
+
 static void check_line(int framing, const uint8_t *bytes, size_t len, size_t chunk, const struct md_message *request)
 {
     static struct md_line line;
     static struct md_completion done;
     struct md_drive drive = {.least_timeout_ns = 100, .most_timeout_ns = 1000};
     struct md_exchange exchange = {.framing = framing, .request = *request, .character_ns = 1, .drive = &drive};
+    static uint8_t ring[1 << 15];
+    static struct md_tap tap = {.ring = ring, .room = sizeof ring}; /* where in its ring it is, differs */
     md_line_init(&line, 1);
+    line.tap = &tap;
     for (int round = 0; round < 2; round++) {
         md_line_begin(&line, &exchange, &done, 10 * (round + 1));
         int64_t now = 1000 * (round + 1);
@@ -99,6 +126,7 @@ static void check_line(int framing, const uint8_t *bytes, size_t len, size_t chu
         for (int wants = 0; wants < 3 && md_line_want(&line, now) != MD_DONE; wants++)
             now = line.wake_ns;
         must(md_line_want(&line, now) == MD_DONE);
+        check_tap(&tap, &line, bytes, fed);
         if (done.result > 0) {
             must(done.skipped + (uint32_t)done.result == fed && done.raw_len == done.result);
             struct md_message again;

@@ -1,7 +1,7 @@
 /* Hostile bytes, as overheard on a line and as a capture file.
  *
  *   clang -std=c11 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all -Icsrc \
- *      tests/fuzz/fuzz_split.c csrc/checksum.c csrc/frame.c csrc/columns.c csrc/heard.c csrc/split.c \
+ *      tests/fuzz/fuzz_split.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/columns.c csrc/heard.c csrc/split.c \
  *      csrc/decode.c csrc/unpack.c -lm -o fuzz_split
  *   ./fuzz_split -max_total_time=60 -max_len=2048 -len_control=0 CORPUS_DIRECTORY
  *
@@ -78,7 +78,8 @@ static struct md_piece piece_of(const uint8_t *data, size_t left, size_t *len)
     *len = data[0] & 63;
     if (*len > left - 1)
         *len = left - 1;
-    struct md_piece piece = {.side = data[0] >= 0xC0 ? MD_ASKING : MD_EITHER_SIDE, .is_after_pause = (data[0] >> 6) & 1};
+    static const uint8_t sides[] = {MD_EITHER_SIDE, MD_EITHER_SIDE, MD_NOISE, MD_ASKING};
+    struct md_piece piece = {.side = sides[data[0] >> 6], .is_after_pause = (data[0] >> 6) & 1};
     return piece;
 }
 

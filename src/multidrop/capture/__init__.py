@@ -9,6 +9,9 @@ from replies where both look alike (functions 05, 06 and 08):
 
 Broadcasts, ASCII frames, Delixi's own and what is no frame are shown as the bytes they are.
 
+`Tapped` taps lines that are polled: what goes over them goes into a capture, or is kept by a
+`FlightRecorder`, which writes the last minutes when something goes wrong.
+
 `Capture` reads these, and pcap and pcapng files of others: link type 250 (RTAC serial), 252, and
 frames without a header under any other, such as the user link types 147 to 162. Frames need not lie
 in packets one by one.
@@ -18,8 +21,10 @@ from __future__ import annotations
 
 from multidrop.capture.columns import Decoding
 from multidrop.capture.exchanges import Heard, Junk, Overheard, Pairing
+from multidrop.capture.flight import FlightRecorder
 from multidrop.capture.pcapng import CaptureWriter
 from multidrop.capture.reader import Capture, CaptureError
+from multidrop.capture.tapped import Tapped
 from multidrop.core import Side
 
 __all__ = [
@@ -27,9 +32,11 @@ __all__ = [
     "CaptureError",
     "CaptureWriter",
     "Decoding",
+    "FlightRecorder",
     "Heard",
     "Junk",
     "Overheard",
     "Pairing",
     "Side",
+    "Tapped",
 ]

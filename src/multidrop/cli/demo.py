@@ -49,6 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
     """The monitor shows more than a table does, where there is a terminal and its library."""
+    if arguments.capture or arguments.flight_recorder:
+        return False
     return not arguments.json and is_possible() and find_spec("rich") is not None
 
 

@@ -9,3 +9,10 @@ def refuse_overwriting(path: Path) -> None:
     """Raise ValueError when there is a file at this path."""
     if path.is_file():
         raise ValueError(f"{path} is there already: name another file, or remove it first")
+
+
+def check_capture(path: Path) -> None:
+    """Raise ValueError when no capture can be written there."""
+    if path.suffix != ".pcapng":
+        raise ValueError(f"{path}: a capture's name ends in .pcapng")
+    refuse_overwriting(path)

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from multidrop.batch import Rows
 from multidrop.cli.comparison import compared, comparison_text
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.live import LiveTable
-from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.overwriting import check_capture, refuse_overwriting
+from multidrop.cli.tapping import Tapping, tapping_text
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import aligned
 from multidrop.plant import Plant, load_plant
@@ -42,6 +43,15 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
     parser.add_argument(
         "--out", metavar="FILE", type=Path, default=out, help=f"recording, by suffix; {out or 'none'}"
     )
+    parser.add_argument(
+        "--capture", metavar="FILE.pcapng", type=Path, help="all that goes over the lines, for Wireshark"
+    )
+    parser.add_argument(
+        "--flight-recorder",
+        metavar="DIR",
+        type=Path,
+        help="when something goes wrong, a capture of the last minutes is written there",
+    )
     add_json_argument(parser)
 
 
@@ -53,6 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def follow(plant: Plant, arguments: argparse.Namespace) -> int:
     """Poll the plant as `add_polling_arguments` says, and tell what became of it."""
+    if arguments.capture:
+        check_capture(arguments.capture)
     show = not arguments.json and sys.stdout.isatty()
     table = LiveTable(plant, sys.stdout) if show else None
     with ExitStack() as stack:
@@ -60,15 +72,18 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
         takers: list[Callable[[Rows], None]] = [table.add] if table else []
         if arguments.out:
             takers.append(stack.enter_context(open_writer(arguments.out, plant.metadata())).write)
-        with Poller(plant) as poller:
+        poller = stack.enter_context(closing(Poller(plant)))
+        tapping = stack.enter_context(Tapping(poller, arguments.capture, arguments.flight_recorder))
+        with poller:
             for _ in _ticks(arguments.seconds, interruption):
                 _hand_out(poller, takers)
+                tapping.collect()
                 if table:
                     table.draw_if_due(time.monotonic())
         _hand_out(poller, takers)  # what came while it closed
     if table:
         table.draw()
-    return conclude(plant, poller.summary(), arguments)
+    return conclude(plant, poller.summary() | tapping.summary(), arguments)
 
 
 def conclude(plant: Plant, told: Mapping[str, Any], arguments: argparse.Namespace) -> int:
@@ -111,6 +126,7 @@ def _text(summary: dict[str, Any]) -> str:
     into = f" in {summary['recording']}" if summary["recording"] else ""
     dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ""
     lines.append(f"{summary['samples']} samples and {summary['misses']} misses{into}{dropped}")
+    lines += tapping_text(summary)
     return "\n".join(lines)
 
 

@@ -14,7 +14,7 @@ from multidrop.capture.meaning import line_of
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.listening import Listener
 from multidrop.cli.overheard import Ear, replay, summary
-from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.overwriting import check_capture
 from multidrop.cli.target import add_json_argument
 from multidrop.plant import Line, Plant, load_plant
 from multidrop.timing import Settings
@@ -39,9 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.port is None) == (arguments.replay is None):
         raise ValueError("name a PORT to listen to, or a capture with --replay FILE")
     if arguments.out:
-        if arguments.out.suffix != ".pcapng":
-            raise ValueError(f"{arguments.out}: a capture's name ends in .pcapng")
-        refuse_overwriting(arguments.out)
+        check_capture(arguments.out)
     plant = load_plant(arguments.plant) if arguments.plant else None
     with ExitStack() as stack:
         if arguments.replay:

@@ -32,6 +32,7 @@ from multidrop.core.ports import Port, notice_fd, now_ns
 from multidrop.core.results import EXCEPTION_STATUS, STATUSES, Result, status_text
 from multidrop.core.settings import REFUSALS, get_settings, set_settings
 from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
+from multidrop.core.taps import Tap, Wrappings
 
 __all__ = [
     "COLUMNS",
@@ -58,9 +59,11 @@ __all__ = [
     "Span",
     "Splitter",
     "Tally",
+    "Tap",
     "Unpacked",
     "Unpacker",
     "Wire",
+    "Wrappings",
     "build_reply",
     "build_request",
     "completion",

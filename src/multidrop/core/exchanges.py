@@ -29,6 +29,11 @@ class Respondent:
         self.unasked: Counter[Result] = Counter()  # values that its client did not ask for, by reason
 
     @property
+    def exchanges(self) -> int:
+        """How many there were."""
+        return int(self.c.tally.exchanges)
+
+    @property
     def failures(self) -> int:
         """Exchanges in a row without an answer."""
         return int(self.c.failures)

@@ -12,11 +12,13 @@ from multidrop.core.frames import Framing, Message, from_c
 
 
 class Side(IntEnum):
-    """Who sent what was overheard, where that is known."""
+    """Who sent what was overheard, where that is known (enum md_side)."""
 
     EITHER = lib.MD_EITHER_SIDE
     ASKING = lib.MD_ASKING
     ANSWERING = lib.MD_ANSWERING
+    FAILED = lib.MD_FAILED  # came in place of a reply, as the master itself says
+    NOISE = lib.MD_NOISE  # not even that: stray bytes, echo, late replies
 
 
 class Kind(IntEnum):

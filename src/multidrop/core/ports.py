@@ -8,6 +8,7 @@ from functools import cache
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Columns
 from multidrop.core.exchanges import Completion, Exchange, Respondent, completion
+from multidrop.core.taps import Tap
 
 now_ns = lib.md_now_ns
 
@@ -47,6 +48,11 @@ class Port:
         self._progress = lib.md_port_progress(self.c)
         self._stopped = False
         self._respondents: set[Respondent] = set()
+
+    def tap(self, tap: Tap) -> None:
+        """Tell this tap, and no other any more, of all that goes over the line."""
+        lib.md_port_tap(self.c, tap.c)
+        self._tap = tap
 
     def end(self) -> bool:
         """Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are."""

@@ -1,0 +1,33 @@
+/* Why a request has no reply, told from what came in its place. */
+#include "multidrop.h"
+
+/* How much a reason says about what went wrong. The one that says most is reported, and of several
+ * that say as much the first: a frame from another address may hold our own further on. */
+static int weight(int reason)
+{
+    static const uint8_t weights[] = {
+        [-MD_NO_START] = 1,
+        [-MD_BAD_ADDRESS] = 2,
+        [-MD_BAD_FUNCTION] = 2,
+        [-MD_BAD_LENGTH] = 3,
+        [-MD_BAD_CHARACTER] = 4,
+        [-MD_CUT_SHORT] = 5,
+        [-MD_BAD_CHECKSUM] = 6,
+        [-MD_BAD_ECHO] = 7,
+    };
+    return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
+}
+
+int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len)
+{
+    struct md_message reply;
+    int reason = len ? MD_INCOMPLETE : MD_NO_REPLY;
+    for (size_t at = 0; at < len; at++) {
+        int why = md_parse_reply(framing, bytes + at, len - at, request, &reply);
+        if (why == MD_INCOMPLETE)
+            why = MD_CUT_SHORT;
+        if (weight(why) > weight(reason))
+            reason = why;
+    }
+    return reason;
+}

@@ -1,0 +1,129 @@
+/* What goes over a line, kept until somebody takes it as packets of a pcapng file.
+ *
+ * The line's thread puts, one other takes, and neither waits for the other: what finds no room is
+ * counted. */
+#include "multidrop.h"
+
+#include <string.h>
+
+enum {
+    ENHANCED_PACKET = 6,
+    PACKET_HEAD = 28,
+    BLOCK_END = 4
+};
+
+/* Stands in the ring before the bytes. */
+struct mark {
+    int64_t time_ns;
+    uint32_t len, side;
+};
+
+static uint32_t get(const uint32_t *counter)
+{
+    return __atomic_load_n(counter, __ATOMIC_ACQUIRE);
+}
+
+static void set(uint32_t *counter, uint32_t value)
+{
+    __atomic_store_n(counter, value, __ATOMIC_RELEASE);
+}
+
+/* How much of it lies before the ring's end. */
+static size_t unbroken(const struct md_tap *tap, uint32_t at, size_t len)
+{
+    size_t left = tap->room - (at & (tap->room - 1));
+    return len < left ? len : left;
+}
+
+static void copy_in(const struct md_tap *tap, uint32_t at, const void *from, size_t len)
+{
+    size_t first = unbroken(tap, at, len);
+    memcpy(tap->ring + (at & (tap->room - 1)), from, first);
+    memcpy(tap->ring, (const uint8_t *)from + first, len - first);
+}
+
+static void copy_out(const struct md_tap *tap, uint32_t at, void *to, size_t len)
+{
+    size_t first = unbroken(tap, at, len);
+    memcpy(to, tap->ring + (at & (tap->room - 1)), first);
+    memcpy((uint8_t *)to + first, tap->ring, len - first);
+}
+
+void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
+{
+    if (!tap || len == 0)
+        return;
+    uint32_t put = tap->put;
+    struct mark mark = {.time_ns = time_ns, .len = (uint32_t)len, .side = (uint32_t)side};
+    if (tap->room - (put - get(&tap->taken)) < sizeof mark + len) {
+        __atomic_fetch_add(&tap->lost, len, __ATOMIC_RELAXED);
+        return;
+    }
+    copy_in(tap, put, &mark, sizeof mark);
+    copy_in(tap, put + (uint32_t)sizeof mark, bytes, len);
+    set(&tap->put, put + (uint32_t)(sizeof mark + len));
+}
+
+static uint8_t *put32(uint8_t *at, uint32_t value)
+{
+    for (int i = 0; i < 4; i++)
+        *at++ = (uint8_t)(value >> 8 * i);
+    return at;
+}
+
+/* Write all of a packet but its bytes, for which room is left; where they belong. */
+static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len, uint8_t *out)
+{
+    uint32_t packet = wrapping->head_len + len, padding = -packet & 3;
+    uint32_t size = PACKET_HEAD + packet + padding + wrapping->tail_len + BLOCK_END;
+    const uint32_t head[] = {ENHANCED_PACKET, size, interface, (uint32_t)((uint64_t)time_ns >> 32), (uint32_t)time_ns, packet, packet};
+    for (size_t i = 0; i < sizeof head / sizeof *head; i++)
+        out = put32(out, head[i]);
+    memcpy(out, wrapping->head, wrapping->head_len);
+    uint8_t *bytes = out + wrapping->head_len;
+    memset(bytes + len, 0, padding);
+    memcpy(bytes + len + padding, wrapping->tail, wrapping->tail_len);
+    put32(bytes + len + padding + wrapping->tail_len, size);
+    return bytes;
+}
+
+static const struct md_wrapping *wrapping_of(const struct md_wrapping *wrappings, uint32_t side, uint8_t first)
+{
+    return &wrappings[2 * side + (first == ':')];
+}
+
+size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len)
+{
+    const struct md_wrapping *wrapping = wrapping_of(wrappings, (uint32_t)side, first);
+    return PACKET_HEAD + ((wrapping->head_len + len + 3) & ~(size_t)3) + wrapping->tail_len + BLOCK_END;
+}
+
+void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
+                   const uint8_t *bytes, size_t len, uint8_t *out)
+{
+    const struct md_wrapping *wrapping = wrapping_of(wrappings, (uint32_t)side, len ? *bytes : 0);
+    memcpy(wrap(wrapping, interface, time_ns, (uint32_t)len, out), bytes, len);
+}
+
+size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
+                   int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room)
+{
+    uint32_t taken = tap->taken, put = get(&tap->put);
+    size_t used = 0;
+    while (taken != put) {
+        struct mark mark;
+        uint8_t first;
+        copy_out(tap, taken, &mark, sizeof mark);
+        copy_out(tap, taken + (uint32_t)sizeof mark, &first, 1);
+        size_t size = md_packet_length(wrappings, (int)mark.side, first, mark.len);
+        if (room - used < size)
+            break;
+        const struct md_wrapping *wrapping = wrapping_of(wrappings, mark.side, first);
+        uint8_t *bytes = wrap(wrapping, interface, mark.time_ns + utc_minus_monotonic_ns, mark.len, out + used);
+        copy_out(tap, taken + (uint32_t)sizeof mark, bytes, mark.len);
+        used += size;
+        taken += (uint32_t)(sizeof mark + mark.len);
+    }
+    set(&tap->taken, taken);
+    return used;
+}
