@@ -15,6 +15,7 @@ from multidrop.core import (
     Exchange,
     Field,
     Framing,
+    Inbox,
     Message,
     Port,
     Respondent,
@@ -25,7 +26,6 @@ from multidrop.core import (
     parse_reply,
     set_settings,
 )
-from multidrop.line import await_notice
 
 EXCHANGES = 256
 READ_TEN = Message(1, 3, 0, 10)
@@ -73,20 +73,22 @@ def fd(responder: str) -> Any:
     os.close(opened)
 
 
-def carry_out(port: Port, exchanges: list[Exchange], columns: Columns) -> None:
-    """Queue them all, and collect their rows as the poller does."""
-    columns.clear()
+def carry_out(port: Port, exchanges: list[Exchange], inbox: Inbox) -> Columns:
+    """Queue them all, and take their rows."""
     port.submit(exchanges, [0] * len(exchanges))
-    left = len(exchanges)
-    while left:
-        await_notice(0.02)
-        left -= port.reap(columns, 0)
+    while port.pending:
+        inbox.await_calls(0.02)
+    columns = inbox.take()
+    assert columns is not None
+    return columns
 
 
 def test_256_exchanges_and_their_2560_values(benchmark: Any, fd: int) -> None:
-    columns = Columns(10 * EXCHANGES)
     with closing(Port(fd, -1, room=EXCHANGES)) as port:
-        benchmark(carry_out, port, [unhurried(READ_TEN)] * EXCHANGES, columns)
+        inbox = Inbox()
+        port.report_to(inbox, 0)
+        columns = benchmark(carry_out, port, [unhurried(READ_TEN)] * EXCHANGES, inbox)
+    assert len(columns) == 10 * EXCHANGES
     assert set(columns.array("status")) == {0}
     assert columns.array("value")[0] == 0x0304 / 10
 

@@ -2,6 +2,7 @@
 #include "multidrop.h"
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 static const uint8_t wire_bytes[] = {
@@ -47,6 +48,34 @@ double md_value(const uint8_t *data, size_t len, size_t at, int wire)
     case MD_F32_SWAPPED: return as_float(two << 16 | one);
     default: return one;
     }
+}
+
+struct md_columns *md_columns_new(size_t room)
+{
+    enum { WIDE = 4, NARROW = 3 }; /* columns of 8 and of 2 bytes */
+    struct md_columns *columns = malloc(sizeof *columns + room * (WIDE * 8 + NARROW * 2) + (room + 7) / 8);
+    if (!columns)
+        return NULL;
+    int64_t *wide = (int64_t *)(columns + 1);
+    uint16_t *narrow = (uint16_t *)(wide + WIDE * room);
+    *columns = (struct md_columns){
+        .time = wide,
+        .sent = wide + room,
+        .uncertainty = wide + 2 * room,
+        .value = (double *)(wide + 3 * room),
+        .drive = narrow,
+        .reg = narrow + room,
+        .status = narrow + 2 * room,
+        .valid = (uint8_t *)(narrow + NARROW * room),
+        .room = room,
+    };
+    memset(columns->valid, 0, (room + 7) / 8);
+    return columns;
+}
+
+void md_columns_free(struct md_columns *columns)
+{
+    free(columns);
 }
 
 static void set_bit(uint8_t *bits, size_t at, int on)

@@ -1,33 +1,35 @@
 /* The thread that runs every line of the process. It never takes the interpreter lock.
  *
- * Exchanges come to a port through a ring, are carried out in its slots, and are reaped from them:
- * each of the ring's counters has one writer, and nothing is copied. An urgent exchange goes ahead
- * of the ring, and whoever wants it waits for it. */
+ * Exchanges come to a port through a ring, or stay with it and are repeated; what became of them goes
+ * to the client's inbox. An urgent exchange goes ahead of all, and whoever wants it waits for it. So a
+ * line that is polled as fast as it allows needs nobody but this thread. */
 #define _GNU_SOURCE
 #include "multidrop.h"
+#include "waiter.h"
 
 #include <errno.h>
 #include <pthread.h>
+#include <sched.h>
 #include <stdatomic.h>
 #include <stdlib.h>
-#include <sys/epoll.h>
-#include <sys/eventfd.h>
+#ifdef __linux__
 #include <sys/prctl.h>
+#endif
 #include <time.h>
 #include <unistd.h>
 
 enum {
-    EVENTS = 256,           /* taken from epoll at a time */
+    READY = 256,              /* ports that are dealt with at a time */
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
     MOST_LATENESS = 60000     /* ns of a wake-up that are reckoned with */
 };
 static const int64_t NEVER = INT64_MAX;
 static const int64_t RETRY_WRITE_NS = 1000000;
 
+/* An exchange that is queued. */
 struct slot {
     const struct md_exchange *exchange;
     int64_t not_before_ns;
-    struct md_completion completion;
 };
 
 /* An urgent exchange; it lives where its caller waits. */
@@ -39,33 +41,43 @@ struct wish {
     int done;
 };
 
+/* Whose exchange is under way. */
+enum turn { NOBODYS, WISHED, QUEUED, REPEATED };
+
 struct md_port {
     struct md_engine *engine;
     unsigned index; /* among the engine's ports */
     int fd, must_take;
     struct md_settings settings; /* in force; baudrate 0: not yet set */
-    struct md_line line;
 
     struct slot *slots;
     unsigned room; /* a power of two */
     struct md_progress progress; /* its counters have one writer each, and are read atomically */
     atomic_int idle;    /* the thread waits to be told of more */
     struct wish *wishes;
+    const struct md_exchange *const *round; /* what is repeated */
+    unsigned round_len, round_at;
+    struct md_inbox *inbox;
+    uint32_t number; /* there */
 
-    struct slot *slot; /* under way, or */
-    struct wish *wish; /* under way */
+    enum turn turn;
+    uint32_t failures; /* of the drive, before its exchange */
     int blind;         /* nothing is worth reading before the port's waking time */
-    int watched;       /* epoll tells when it can be read */
+    int watched;       /* the waiter tells when it can be read */
     int emptied;       /* it was read empty a moment ago: nothing is there yet */
     int lost_error;
     int ending, closing, closed;
+    struct md_line line;
+    struct md_completion completion;
 };
 
 struct md_engine {
     pthread_t thread;
     pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the wishes */
+    atomic_int callers;     /* clients that want the mutex, whom the thread lets in */
     pthread_cond_t changed; /* a wish was granted, a port closed */
-    int epoll, bell, notice;
+    struct md_waiter *waiter;
+    struct md_bell bell;
     struct md_port **ports;
     int64_t *wakes; /* when each port wants to be looked at, whatever happens */
     unsigned count, room;
@@ -90,35 +102,36 @@ static void put(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_SEQ_CST);
 }
 
-static void ring(int eventfd)
-{
-    uint64_t one = 1;
-    (void)!write(eventfd, &one, sizeof one);
-}
-
-static void silence(int eventfd)
-{
-    uint64_t count;
-    (void)!read(eventfd, &count, sizeof count);
-}
-
 /* ---- one port, on the engine's thread ---- */
+
+static void call(struct md_port *port)
+{
+    if (port->inbox)
+        md_inbox_call(port->inbox, port->number);
+}
 
 static void watch(struct md_port *port, int watched)
 {
     if (port->watched == watched || port->progress.lost)
         return;
-    struct epoll_event event = {.events = watched ? EPOLLIN : 0, .data.ptr = port};
-    epoll_ctl(port->engine->epoll, EPOLL_CTL_MOD, port->fd, &event);
+    md_waiter_change(port->engine->waiter, port->fd, port, watched);
     port->watched = watched;
+}
+
+static void stop_repeating(struct md_port *port)
+{
+    port->round_len = 0;
+    put(&port->progress.repeating, 0);
+    call(port);
 }
 
 static void lose(struct md_port *port, int error)
 {
     port->lost_error = error;
     put(&port->progress.lost, 1);
-    epoll_ctl(port->engine->epoll, EPOLL_CTL_DEL, port->fd, NULL); /* a port that hung up is ready for ever */
+    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is ready for ever */
     md_line_abandon(&port->line, MD_LINE_LOST, error);
+    stop_repeating(port);
 }
 
 static int is_transient(int error)
@@ -126,17 +139,20 @@ static int is_transient(int error)
     return error == EAGAIN || error == EWOULDBLOCK || error == EINTR;
 }
 
-static void pump_in(struct md_port *port)
+/* When it was read. */
+static int64_t pump_in(struct md_port *port)
 {
     uint8_t bytes[1024];
     ssize_t got = read(port->fd, bytes, sizeof bytes);
+    int64_t now_ns = md_now_ns();
     port->emptied = got < (ssize_t)sizeof bytes;
     if (got > 0)
-        md_line_received(&port->line, bytes, (size_t)got, md_now_ns());
+        md_line_received(&port->line, bytes, (size_t)got, now_ns);
     else if (got == 0)
         lose(port, 0);
     else if (!is_transient(errno))
         lose(port, errno);
+    return now_ns;
 }
 
 /* Whether the port took anything. */
@@ -170,8 +186,11 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
         port->settings = *settings;
 }
 
-static void begin(struct md_port *port, const struct md_exchange *exchange, struct md_completion *completion, int64_t now_ns)
+static void begin(struct md_port *port, enum turn turn, const struct md_exchange *exchange,
+                  struct md_completion *completion, int64_t now_ns)
 {
+    port->turn = turn;
+    port->failures = exchange->drive->failures;
     md_line_begin(&port->line, exchange, completion, now_ns);
     if (port->progress.lost)
         md_line_abandon(&port->line, MD_LINE_LOST, port->lost_error);
@@ -197,64 +216,93 @@ static int is_over(struct md_port *port, const struct slot *slot, int64_t now_ns
     return 0;
 }
 
+/* Take up what is queued, or say when; whether there is anything to carry out now. */
+static int take_from_queue(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
+{
+    const struct slot *slot = &port->slots[port->progress.done & (port->room - 1)];
+    if (now_ns >= slot->not_before_ns) {
+        begin(port, QUEUED, slot->exchange, &port->completion, now_ns);
+        if (is_over(port, slot, now_ns))
+            md_line_abandon(&port->line, MD_EXPIRED, 0);
+        return 1;
+    }
+    if (slot->not_before_ns < *wake_ns)
+        *wake_ns = slot->not_before_ns;
+    return 0;
+}
+
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
 static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
     struct wish *wish = port->wishes;
     if (wish && now_ns >= wish->not_before_ns) {
-        port->wish = wish;
-        begin(port, wish->exchange, wish->completion, now_ns);
+        begin(port, WISHED, wish->exchange, wish->completion, now_ns);
         if (wish->expires_ns && now_ns > wish->expires_ns)
             md_line_abandon(&port->line, MD_EXPIRED, 0);
         return 1;
     }
-    if (wish)
-        *wake_ns = wish->not_before_ns;
+    *wake_ns = wish ? wish->not_before_ns : NEVER;
     if (port->ending)
         return 0;
+    if (pending(port) && take_from_queue(port, wake_ns, now_ns))
+        return 1;
+    if (port->round_len) {
+        const struct md_exchange *next = port->round[port->round_at];
+        port->round_at = (port->round_at + 1) % port->round_len;
+        begin(port, REPEATED, next, &port->completion, now_ns);
+        return 1;
+    }
     if (!pending(port)) {
         atomic_store(&port->idle, 1);
-        if (!pending(port))
-            return 0;
-        atomic_store(&port->idle, 0);
+        if (pending(port)) /* it came just now */
+            *wake_ns = now_ns;
     }
-    struct slot *slot = &port->slots[port->progress.done & (port->room - 1)];
-    if (now_ns < slot->not_before_ns) {
-        if (slot->not_before_ns < *wake_ns)
-            *wake_ns = slot->not_before_ns;
-        return 0;
-    }
-    port->slot = slot;
-    begin(port, slot->exchange, &slot->completion, now_ns);
-    if (is_over(port, slot, now_ns))
-        md_line_abandon(&port->line, MD_EXPIRED, 0);
-    return 1;
+    return 0;
+}
+
+/* Hand over what became of an exchange that nobody waits for. */
+static void report(struct md_port *port)
+{
+    const struct md_exchange *exchange = port->line.exchange;
+    const struct md_completion *completion = &port->completion;
+    if (port->inbox)
+        md_inbox_add(port->inbox, exchange->block, completion);
+    int is_refusal = completion->result > 0 && completion->reply.exception;
+    if (exchange->block && completion->result > 0)
+        exchange->block->refusals = is_refusal ? exchange->block->refusals + 1 : 0;
+    if (is_refusal || exchange->drive->failures != port->failures)
+        call(port);
 }
 
 static void finish(struct md_port *port)
 {
-    if (port->wish) {
-        port->wishes = port->wish->next;
-        port->wish->done = 1;
-        port->wish = NULL;
+    enum turn turn = port->turn;
+    port->turn = NOBODYS;
+    if (turn == WISHED) {
+        struct wish *wish = port->wishes;
+        port->wishes = wish->next;
+        wish->done = 1;
         pthread_cond_broadcast(&port->engine->changed);
         return;
     }
-    port->slot = NULL;
-    put(&port->progress.done, port->progress.done + 1);
-    unsigned left = pending(port);
-    if (left == port->room / 4 || left == 0)
-        ring(port->engine->notice);
+    report(port);
+    if (turn == QUEUED) {
+        put(&port->progress.done, port->progress.done + 1);
+        unsigned left = pending(port);
+        if (left == port->room / 4 || left == 0)
+            call(port);
+    } else if (port->completion.result < 0 && !port->completion.sent_ns) {
+        stop_repeating(port); /* it would be tried again at once */
+    }
 }
 
 /* Carry on until there is nothing to do but to wait. */
-static void advance(struct md_port *port)
+static void advance(struct md_port *port, int64_t now_ns)
 {
     struct md_line *line = &port->line;
-    int64_t wake_ns = NEVER;
+    int64_t wake_ns;
     for (;;) {
-        int64_t now_ns = md_now_ns();
-        if (!port->slot && !port->wish && !take_up(port, &wake_ns, now_ns))
+        if (port->turn == NOBODYS && !take_up(port, &wake_ns, now_ns))
             break;
         int want = md_line_want(line, now_ns);
         if (want == MD_DONE) {
@@ -264,7 +312,8 @@ static void advance(struct md_port *port)
         wake_ns = line->wake_ns;
         if (want == MD_WRITE) {
             apply_settings(port, &line->exchange->settings);
-            if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, md_now_ns()))
+            now_ns = md_now_ns();
+            if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, now_ns))
                 continue;
             wake_ns = now_ns + RETRY_WRITE_NS;
             break;
@@ -272,14 +321,14 @@ static void advance(struct md_port *port)
         if (want == MD_READ && (port->blind || now_ns >= wake_ns)) {
             port->blind = 0;
             if (!port->emptied)
-                pump_in(port);
+                now_ns = pump_in(port);
             continue;
         }
         port->blind = want == MD_WAIT;
         break;
     }
     port->emptied = 0;
-    if (port->blind && wake_ns - md_now_ns() > WORTH_BLINDNESS)
+    if (port->blind && wake_ns - now_ns > WORTH_BLINDNESS)
         watch(port, 0);
     else if (!port->blind)
         watch(port, 1);
@@ -299,15 +348,12 @@ static int64_t earliest(const struct md_engine *engine)
 
 /* Sleeping processors wake late, and by much the same time again and again: the sleep is shortened
  * by what is usual, and what is then too early is spun away. */
-static int wait_for_events(struct md_engine *engine, struct epoll_event *events, int64_t until_ns)
+static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 {
     if (until_ns == NEVER)
-        return epoll_pwait2(engine->epoll, events, EVENTS, NULL, NULL);
+        return md_waiter_wait(engine->waiter, ready, READY, -1);
     int64_t left = until_ns - engine->lateness_ns - md_now_ns();
-    struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
-    if (left <= 0)
-        span = (struct timespec){0};
-    int n = epoll_pwait2(engine->epoll, events, EVENTS, &span, NULL);
+    int n = md_waiter_wait(engine->waiter, ready, READY, left > 0 ? left : 0);
     if (n == 0 && left > 0) {
         int64_t late = md_now_ns() - (until_ns - engine->lateness_ns);
         engine->lateness_ns += (late - engine->lateness_ns) / 8;
@@ -326,8 +372,12 @@ static void close_ports(struct md_engine *engine)
         struct md_port *port = engine->ports[i];
         if (!port->closing)
             continue;
+        if (port->ending && port->turn != NOBODYS && port->turn != WISHED) {
+            md_line_abandon(&port->line, MD_POLL_ENDED, 0);
+            finish(port);
+        }
         if (!port->progress.lost)
-            epoll_ctl(engine->epoll, EPOLL_CTL_DEL, port->fd, NULL);
+            md_waiter_remove(engine->waiter, port->fd);
         struct md_port *last = engine->ports[--engine->count];
         engine->ports[i] = last;
         engine->wakes[i] = engine->wakes[engine->count];
@@ -344,7 +394,7 @@ static void close_ports(struct md_engine *engine)
 static void *run(void *argument)
 {
     struct md_engine *engine = argument;
-    struct epoll_event events[EVENTS];
+    void *ready[READY];
 #ifdef __linux__
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
 #endif
@@ -352,26 +402,26 @@ static void *run(void *argument)
     while (!engine->stopping) {
         int64_t until_ns = earliest(engine);
         pthread_mutex_unlock(&engine->mutex);
-        int n = wait_for_events(engine, events, until_ns);
+        while (atomic_load(&engine->callers)) /* a mutex is had by who asks first, and that is us */
+            sched_yield();
+        int n = wait_until(engine, ready, until_ns);
         pthread_mutex_lock(&engine->mutex);
         int told = 0;
         for (int i = 0; i < n; i++) {
-            struct md_port *port = events[i].data.ptr;
-            if (!port) {
+            struct md_port *port = ready[i];
+            if (port)
+                advance(port, pump_in(port));
+            else
                 told = 1;
-                continue;
-            }
-            pump_in(port);
-            advance(port);
         }
         if (told) {
-            silence(engine->bell);
+            md_bell_silence(&engine->bell);
             close_ports(engine);
         }
         int64_t now_ns = md_now_ns();
         for (unsigned i = 0; i < engine->count; i++)
-            if (engine->wakes[i] <= now_ns || (told && !engine->ports[i]->slot && !engine->ports[i]->wish))
-                advance(engine->ports[i]);
+            if (engine->wakes[i] <= now_ns || (told && engine->ports[i]->turn == NOBODYS))
+                advance(engine->ports[i], now_ns);
     }
     pthread_mutex_unlock(&engine->mutex);
     return NULL;
@@ -379,17 +429,16 @@ static void *run(void *argument)
 
 /* ---- the client's side ---- */
 
-static void release(struct md_engine *engine)
+static void enter(struct md_engine *engine)
 {
-    int fds[] = {engine->epoll, engine->bell, engine->notice};
-    for (int i = 0; i < 3; i++)
-        if (fds[i] >= 0)
-            close(fds[i]);
-    pthread_mutex_destroy(&engine->mutex);
-    pthread_cond_destroy(&engine->changed);
-    free(engine->ports);
-    free(engine->wakes);
-    free(engine);
+    atomic_fetch_add(&engine->callers, 1);
+    pthread_mutex_lock(&engine->mutex);
+    atomic_fetch_sub(&engine->callers, 1);
+}
+
+static void leave(struct md_engine *engine)
+{
+    pthread_mutex_unlock(&engine->mutex);
 }
 
 struct md_engine *md_engine_start(void)
@@ -399,31 +448,35 @@ struct md_engine *md_engine_start(void)
         return NULL;
     pthread_mutex_init(&engine->mutex, NULL);
     pthread_cond_init(&engine->changed, NULL);
-    engine->epoll = epoll_create1(EPOLL_CLOEXEC);
-    engine->bell = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    engine->notice = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    struct epoll_event event = {.events = EPOLLIN, .data.ptr = NULL};
-    if (engine->epoll >= 0 && engine->bell >= 0 && engine->notice >= 0 &&
-        epoll_ctl(engine->epoll, EPOLL_CTL_ADD, engine->bell, &event) == 0 &&
-        pthread_create(&engine->thread, NULL, run, engine) == 0)
-        return engine;
-    release(engine);
+    engine->waiter = md_waiter_new();
+    if (engine->waiter && md_bell_make(&engine->bell) == 0) {
+        if (md_waiter_add(engine->waiter, engine->bell.fd, NULL) == 0 &&
+            pthread_create(&engine->thread, NULL, run, engine) == 0)
+            return engine;
+        md_bell_destroy(&engine->bell);
+    }
+    if (engine->waiter)
+        md_waiter_free(engine->waiter);
+    pthread_mutex_destroy(&engine->mutex);
+    pthread_cond_destroy(&engine->changed);
+    free(engine);
     return NULL;
 }
 
 void md_engine_stop(struct md_engine *engine)
 {
-    pthread_mutex_lock(&engine->mutex);
+    enter(engine);
     engine->stopping = 1;
-    pthread_mutex_unlock(&engine->mutex);
-    ring(engine->bell);
+    leave(engine);
+    md_bell_ring(&engine->bell);
     pthread_join(engine->thread, NULL);
-    release(engine);
-}
-
-int md_engine_notice(struct md_engine *engine)
-{
-    return engine->notice;
+    md_bell_destroy(&engine->bell);
+    md_waiter_free(engine->waiter);
+    pthread_mutex_destroy(&engine->mutex);
+    pthread_cond_destroy(&engine->changed);
+    free(engine->ports);
+    free(engine->wakes);
+    free(engine);
 }
 
 /* Make room for one more port; 0 when there is no memory. */
@@ -454,21 +507,25 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
         errno = ENOMEM;
         return NULL;
     }
-    *port = (struct md_port){.engine = engine, .fd = fd, .must_take = must_take, .slots = slots, .room = room, .idle = 1, .watched = 1};
+    port->engine = engine;
+    port->fd = fd;
+    port->must_take = must_take;
+    port->slots = slots;
+    port->room = room;
+    port->idle = port->watched = 1;
     md_line_init(&port->line, md_now_ns());
     /* Raw before it is first read: a terminal at VMIN 0 looks like one that hung up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
-    struct epoll_event event = {.events = EPOLLIN, .data.ptr = port};
-    pthread_mutex_lock(&engine->mutex);
-    int added = grow(engine) && epoll_ctl(engine->epoll, EPOLL_CTL_ADD, fd, &event) == 0;
+    enter(engine);
+    int added = grow(engine) && md_waiter_add(engine->waiter, fd, port) == 0;
     if (added) {
         port->index = engine->count;
         engine->wakes[engine->count] = NEVER;
         engine->ports[engine->count++] = port;
     }
-    pthread_mutex_unlock(&engine->mutex);
+    leave(engine);
     if (added)
         return port;
     free(slots);
@@ -478,10 +535,10 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
 
 int md_port_end(struct md_port *port)
 {
-    pthread_mutex_lock(&port->engine->mutex);
+    enter(port->engine);
     port->ending = 1;
-    int is_under_way = port->slot != NULL;
-    pthread_mutex_unlock(&port->engine->mutex);
+    int is_under_way = port->turn != NOBODYS && port->turn != WISHED;
+    leave(port->engine);
     return is_under_way;
 }
 
@@ -495,12 +552,12 @@ void md_port_tap(struct md_port *port, struct md_tap *tap)
 void md_port_stop(struct md_port *port)
 {
     struct md_engine *engine = port->engine;
-    pthread_mutex_lock(&engine->mutex);
+    enter(engine);
     port->closing = 1;
-    ring(engine->bell);
+    md_bell_ring(&engine->bell);
     while (!port->closed)
         pthread_cond_wait(&engine->changed, &engine->mutex);
-    pthread_mutex_unlock(&engine->mutex);
+    leave(engine);
 }
 
 void md_port_free(struct md_port *port)
@@ -509,10 +566,18 @@ void md_port_free(struct md_port *port)
     free(port);
 }
 
+void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t number)
+{
+    enter(port->engine);
+    port->inbox = inbox;
+    port->number = number;
+    leave(port->engine);
+}
+
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns, int n)
 {
     unsigned submitted = port->progress.submitted;
-    unsigned free_slots = port->room - (submitted - port->progress.reaped);
+    unsigned free_slots = port->room - (submitted - get(&port->progress.done));
     int taken = 0;
     for (; taken < n && (unsigned)taken < free_slots; taken++) {
         struct slot *slot = &port->slots[(submitted + (unsigned)taken) & (port->room - 1)];
@@ -521,8 +586,19 @@ int md_port_submit(struct md_port *port, const struct md_exchange *const *exchan
     }
     put(&port->progress.submitted, submitted + (unsigned)taken);
     if (taken && atomic_exchange(&port->idle, 0))
-        ring(port->engine->bell);
+        md_bell_ring(&port->engine->bell);
     return taken;
+}
+
+void md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n)
+{
+    enter(port->engine);
+    port->round = exchanges;
+    port->round_len = port->progress.lost ? 0 : n;
+    port->round_at = 0;
+    put(&port->progress.repeating, port->round_len > 0);
+    leave(port->engine);
+    md_bell_ring(&port->engine->bell);
 }
 
 const struct md_progress *md_port_progress(struct md_port *port)
@@ -530,29 +606,12 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->progress;
 }
 
-int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns)
-{
-    unsigned reaped = port->progress.reaped, done = get(&port->progress.done);
-    int count = 0;
-    for (; reaped != done; reaped++, count++) {
-        const struct slot *slot = &port->slots[reaped & (port->room - 1)];
-        const struct md_completion *completion = &slot->completion;
-        struct md_block *block = slot->exchange->block;
-        if (md_columns_add(columns, block, completion, utc_minus_monotonic_ns) == 0)
-            break;
-        if (completion->result > 0)
-            block->refusals = completion->reply.exception ? block->refusals + 1 : 0;
-    }
-    put(&port->progress.reaped, reaped);
-    return count;
-}
-
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion)
 {
     struct md_engine *engine = port->engine;
     struct wish wish = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns, .completion = completion};
-    pthread_mutex_lock(&engine->mutex);
+    enter(engine);
     if (port->closing) { /* nobody would grant it any more */
         *completion = (struct md_completion){.result = MD_LINE_LOST};
         wish.done = 1;
@@ -561,9 +620,9 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
         while (*last)
             last = &(*last)->next;
         *last = &wish;
-        ring(engine->bell);
+        md_bell_ring(&engine->bell);
     }
     while (!wish.done)
         pthread_cond_wait(&engine->changed, &engine->mutex);
-    pthread_mutex_unlock(&engine->mutex);
+    leave(engine);
 }

@@ -68,6 +68,7 @@ static int is_failure(int result)
     case MD_LATE_ANSWER_DUE:
     case MD_EXPIRED:
     case MD_LINE_LOST:
+    case MD_POLL_ENDED:
         return 0;
     default:
         return result < 0;

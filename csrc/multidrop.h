@@ -115,8 +115,8 @@ enum { MD_DELAY_BUCKETS = 128 };
 struct md_tally {
     uint64_t exchanges, answered, values;
     uint64_t sent;        /* requests that began to leave */
-    uint64_t ended[16];   /* exchanges that were not answered, by -result; 0: broadcasts */
-    uint64_t missed[16];  /* values, by -result */
+    uint64_t ended[17];   /* exchanges that were not answered, by -result; 0: broadcasts */
+    uint64_t missed[17];  /* values, by -result */
     uint32_t refused[256]; /* values, by exception code */
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7, 6 */
     uint64_t late;        /* answers that came after their time-out */
@@ -218,38 +218,60 @@ int64_t md_delay_edge(int bucket);
 
 struct md_engine;
 struct md_port; /* a descriptor with its line */
-struct md_columns;
+struct md_inbox;
 
 int64_t md_now_ns(void); /* CLOCK_MONOTONIC */
 struct md_engine *md_engine_start(void); /* NULL: see errno */
 void md_engine_stop(struct md_engine *engine); /* when all its ports are closed */
-int md_engine_notice(struct md_engine *engine); /* a descriptor, readable when a port wants more */
 
 /* `must_take`: which refusals (enum md_refusal) are failures; -1: a port without settings. `room`
  * for exchanges, a power of two. NULL: see errno. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room);
 /* Tell a tap of all that goes over the line from now on; it must outlive the port, or another tap be told. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
-/* Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are. */
+/* Nothing more of what is queued or repeated is begun; whether one of that is under way. Urgent
+ * exchanges still are. */
 int md_port_end(struct md_port *port);
-/* Nothing more is carried out, and the descriptor is the caller's again; what was can be reaped. */
+/* Nothing more is carried out, and the descriptor is the caller's again. What is under way after
+ * md_port_end() is MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);
 void md_port_free(struct md_port *port); /* a port that was stopped */
+/* Who has the rows of what is carried out, and is called, by this number, when the port is to be looked at. */
+void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t number);
 /* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time.
  * A slot that is late by a period is not sent either (MD_EXPIRED) when the same exchange's next is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
+/* Carry these out one after the other, and again, while nothing that is queued is due; until they are
+ * replaced, the port is lost, or one of them could not be sent. */
+void md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 /* How far the queue is: each number only grows, and wraps around. */
 struct md_progress {
-    uint32_t submitted, done, reaped;
-    uint32_t lost; /* the descriptor failed: all that comes is MD_LINE_LOST */
+    uint32_t submitted, done;
+    uint32_t lost;      /* the descriptor failed: all that comes is MD_LINE_LOST */
+    uint32_t repeating; /* exchanges are carried out again and again */
 };
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Make rows of what was carried out; how many exchanges, fewer when the columns are full. */
-int md_port_reap(struct md_port *port, struct md_columns *columns, int64_t utc_minus_monotonic_ns);
 /* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
+
+/* ---- inbox.c: what the thread leaves for a client: rows, and calls to look at a port ---- */
+
+/* Rows are kept in so many chunks; those that come when all are full are dropped, and counted. */
+struct md_inbox *md_inbox_new(size_t chunk_rows, size_t most_chunks); /* NULL: see errno */
+void md_inbox_free(struct md_inbox *inbox); /* when no port reports to it */
+/* Make rows of what became of an exchange, where it has a block. */
+void md_inbox_add(struct md_inbox *inbox, const struct md_block *block, const struct md_completion *completion);
+/* The oldest rows, the caller's to free; NULL when there are none. */
+struct md_columns *md_inbox_take(struct md_inbox *inbox);
+size_t md_inbox_chunks(struct md_inbox *inbox); /* that hold rows; the newest is still being filled */
+uint64_t md_inbox_dropped(struct md_inbox *inbox); /* rows */
+enum { MD_MOST_NUMBERS = 65536 };
+/* Call the client that waits, about whatever it gave this number. */
+void md_inbox_call(struct md_inbox *inbox, uint32_t number);
+/* Wait for a call, no longer than that; the numbers that were called, each once, and how many. */
+int md_inbox_await(struct md_inbox *inbox, int64_t timeout_ns, uint32_t *numbers, int room);
 
 /* ---- columns.c: completions become columns ---- */
 
@@ -269,7 +291,7 @@ struct md_field {
 struct md_block {
     const struct md_field *fields;
     int count;
-    uint32_t refusals; /* exceptions in a row, among the replies that were reaped */
+    uint32_t refusals; /* exceptions in a row */
 };
 
 /* Rows; all arrays have room for the same number. `valid` is a bitmap, least significant bit first. */
@@ -282,6 +304,10 @@ struct md_columns {
     uint8_t *valid;                     /* value and uncertainty exist */
     size_t rows, room;
 };
+
+/* Columns without rows; NULL when there is no memory. */
+struct md_columns *md_columns_new(size_t room);
+void md_columns_free(struct md_columns *columns);
 
 /* Append one row for each of the block's fields; the number of rows, or 0 when there is no room. */
 int md_columns_add(struct md_columns *columns, const struct md_block *block,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import socket
 import threading
@@ -22,6 +23,7 @@ from multidrop.core import (
     Exchange,
     Field,
     Framing,
+    Inbox,
     Message,
     Port,
     Respondent,
@@ -68,11 +70,23 @@ def wait_until(look: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
-def reaped(port: Port, exchanges: int) -> Columns:
-    """The rows of so many exchanges."""
-    columns = Columns(exchanges)
-    wait_until(lambda: port.reap(columns, 0) >= 0 and len(columns) == exchanges)
-    return columns
+class Rows:
+    """What comes of a port's exchanges, in the order in which they were carried out."""
+
+    def __init__(self, port: Port) -> None:
+        self.inbox = Inbox()
+        self._columns: list[Columns] = []
+        port.report_to(self.inbox, 0)
+
+    def of(self, name: str, rows: int) -> list[int]:
+        """A column, when there are so many rows."""
+        wait_until(lambda: self._taken() >= rows)
+        return [it for columns in self._columns for it in columns.array(name)]
+
+    def _taken(self) -> int:
+        while columns := self.inbox.take():
+            self._columns.append(columns)
+        return sum(map(len, self._columns))
 
 
 def echo_start(request: Message) -> bytes:
@@ -134,12 +148,12 @@ Drive = Callable[[Callable[[Message], bytes]], int]
 
 def test_queued_exchanges_are_carried_out_in_turn(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS, room=128)) as port:
+        rows = Rows(port)
         queued = [read(start) for start in range(100)]
         assert port.submit(queued, [0] * 100) == 100
-        columns = reaped(port, 100)
-    assert list(columns.array("value")) == list(range(100))
-    assert list(columns.array("status")) == [0] * 100
-    sent = list(columns.array("sent"))
+        assert rows.of("value", 100) == list(range(100))
+    assert rows.of("status", 100) == [0] * 100
+    sent = rows.of("sent", 100)
     assert sent == sorted(sent)
     assert queued[0].respondent.tally().values == 1
 
@@ -156,9 +170,10 @@ def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
 def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
+        rows = Rows(port)
         queued = [read(0), read(1)]
         port.submit(queued, due)
-        sent = list(reaped(port, 2).array("sent"))
+        sent = rows.of("sent", 2)
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
@@ -167,11 +182,10 @@ def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) 
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        now = now_ns()
+        rows, now = Rows(port), now_ns()
         queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
         port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
-        columns = reaped(port, len(queued))
-    said = [status_text(it) for it in columns.array("status")]
+        said = [status_text(it) for it in rows.of("status", len(queued))]
     over = "not sent: expired"
     assert said == [over, "ok", over, "ok", "ok", "ok"]
     assert fast.respondent.tally().missed == {Result.EXPIRED: 2}
@@ -179,20 +193,111 @@ def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) 
 
 def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        now = now_ns()
+        rows, now = Rows(port), now_ns()
         poll = read(1, period=1.0)
         port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
-        assert list(reaped(port, 1).array("status")) == [0]
+        assert rows.of("status", 1) == [0]
 
 
-def test_rows_wait_for_columns_with_room(drive: Drive) -> None:
+def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        queued = [read(start) for start in range(5)]
-        port.submit(queued, [0] * 5)
+        rows = Rows(port)
+        port.repeat([read(0), read(1), read(2)])
+        assert port.repeating
+        assert rows.of("value", 30)[:30] == [0, 1, 2] * 10
+        port.repeat([read(7)])
+        so_far = len(rows.of("value", 30))
+        assert rows.of("value", so_far + 10)[-1] == 7
+        port.repeat([])
+        assert not port.repeating
+        assert port.carry_out(read(9)).status == 0
+
+
+def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(0)])
+        queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
+        port.submit(queued, [due_ns, due_ns])
         wait_until(lambda: port.pending == 0)
-        first, second = Columns(3), Columns(3)
-        assert (port.reap(first, 0), port.reap(second, 0)) == (3, 2)
-        assert [*first.array("value"), *second.array("value")] == [0, 1, 2, 3, 4]
+        port.stop()
+        values, sent = rows.of("value", 3), rows.of("sent", 3)
+    assert values[0] == 0  # nobody waited for what was not due
+    at = values.index(1)
+    assert values[at + 1] == 2
+    assert sent[at] >= due_ns
+
+
+def test_what_cannot_be_sent_is_not_tried_again_and_again(drive: Drive) -> None:
+    slow = Respondent(least_timeout=0.01, most_timeout=0.02)
+    with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(1, respondent=slow), read(2, respondent=slow)])
+        wait_until(lambda: not port.repeating)
+        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+
+
+def test_the_client_is_called_when_a_drive_fails_and_when_it_is_back(drive: Drive) -> None:
+    silent = threading.Event()
+    silent.set()
+    respondent = Respondent(least_timeout=0.01, most_timeout=0.3)
+    fd = drive(lambda request: b"" if silent.is_set() else echo_start(request))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        inbox = Inbox()
+        port.report_to(inbox, 17)
+        asked = [read(0, respondent=respondent)]
+        port.submit(asked, [0])
+        assert inbox.await_calls(60) == [17]
+        assert respondent.failures == 1
+        silent.clear()
+        wait_until(lambda: now_ns() > respondent.late_until_ns)
+        port.repeat(asked)
+        assert inbox.await_calls(60) == [17]
+        assert respondent.failures == 0
+
+
+def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        inbox = Inbox()
+        port.report_to(inbox, 3)
+        queued = [read(0), read(1), read(2)]
+        port.submit(queued, [0, 0, now_ns() + 60_000_000_000])
+        far.recv(1024)
+        far.send(build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
+        assert inbox.await_calls(60) == [3]
+        far.close()
+        wait_until(lambda: port.lost)
+        assert inbox.await_calls(60) == [3]
+    near.close()
+
+
+def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        inbox = Inbox(chunk_rows=10, most_chunks=2)
+        port.report_to(inbox, 0)
+        queued = [read(start) for start in range(35)]
+        port.submit(queued, [0] * 35)
+        wait_until(lambda: port.pending == 0)
+        assert (inbox.chunks, inbox.dropped) == (2, 20)
+        kept = [columns for columns in (inbox.take(), inbox.take()) if columns]
+        assert [it for columns in kept for it in columns.array("value")] == [*range(10), *range(30, 35)]
+
+
+def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        inbox = Inbox()
+        port.report_to(inbox, 0)
+        queued = [read(start) for start in range(100)]
+        port.submit(queued, [0] * 100)
+        wait_until(lambda: port.pending == 0)
+        columns = inbox.take()
+        assert columns is not None
+        values = columns.array("value")
+        del columns, inbox
+        gc.collect()
+        assert list(values) == list(range(100))
 
 
 def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
@@ -227,18 +332,20 @@ def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
 def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:
+        rows = Rows(port)
         queued = [read(0), read(1, timeout=0.02), read(2)]
         port.submit(queued, [0] * 3)
-        assert list(reaped(port, 3).array("status")) == [0, -Result.NO_REPLY, 0]
+        assert rows.of("status", 3) == [0, -Result.NO_REPLY, 0]
 
 
 def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> None:
     slow = Respondent(least_timeout=0.01, most_timeout=0.02)
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:
+        rows = Rows(port)
         queued = [read(1, respondent=slow), read(2, respondent=slow)]
         port.submit(queued, [0] * 2)
-        assert list(reaped(port, 2).array("status")) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
         assert slow.failures == 1
         wait_until(lambda: now_ns() > slow.late_until_ns)
         assert port.carry_out(queued[1]).result == 7
@@ -272,10 +379,11 @@ def test_all_that_is_queued_on_a_lost_port_says_so() -> None:
     near, far = socket.socketpair()
     near.setblocking(False)
     with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        rows = Rows(port)
         far.close()
         queued = [read(0), read(1), read(2)]
         port.submit(queued, [0] * 3)
-        assert list(reaped(port, 3).array("status")) == [-Result.LINE_LOST] * 3
+        assert rows.of("status", 3) == [-Result.LINE_LOST] * 3
         assert port.lost
         assert port.carry_out(read(0)).result == Result.LINE_LOST
     near.close()

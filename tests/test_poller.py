@@ -20,7 +20,7 @@ from toy import Toy
 
 from multidrop import poller as poller_module
 from multidrop.batch import Row
-from multidrop.core import Result
+from multidrop.core import Inbox, Result
 from multidrop.errors import LineError
 from multidrop.plant import Line, PolledDrive
 from multidrop.poller import Poller
@@ -205,13 +205,12 @@ def test_an_asyncio_program_needs_no_second_api(port: str) -> None:
 
 
 def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(poller_module, "MOST_CHUNKS", 2)
-    monkeypatch.setattr(poller_module, "CHUNK_ROWS", poller_module.MOST_FIELDS + 50)
+    monkeypatch.setattr(poller_module, "Inbox", lambda: Inbox(chunk_rows=200, most_chunks=2))
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         until(lambda: poller.summary()["dropped"] > 0)
     rows = rows_of(poller)
     summary = poller.summary()
-    assert len(rows) <= 2 * poller_module.CHUNK_ROWS
+    assert len(rows) <= 400
     assert len(rows) + summary["dropped"] == summary["samples"] + summary["misses"]
 
 

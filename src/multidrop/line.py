@@ -7,7 +7,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import select
 import socket
 import struct
 import termios
@@ -18,10 +17,10 @@ from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, notice_fd
+from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap
 from multidrop.errors import LineError
 
-__all__ = ["Line", "Wake", "await_notice", "now_ns", "sleep", "utc_minus_monotonic_ns"]
+__all__ = ["Line", "Wake", "now_ns", "sleep", "utc_minus_monotonic_ns"]
 
 sleep = time.sleep
 
@@ -121,13 +120,6 @@ class Wake:
             self._closed = True
             os.close(self._reader)
             os.close(self._writer)
-
-
-def await_notice(seconds: float) -> None:
-    """Until a port's queue wants more, or for so long."""
-    fd = notice_fd()
-    if select.select([fd], [], [], seconds)[0]:
-        os.read(fd, 8)
 
 
 def _make(port: serial.SerialBase, settings: tuple[int, str]) -> None:

@@ -1,8 +1,9 @@
 """Poller: plan, schedule and lines together, turned into batches of columns.
 
-One thread for all lines tops up the core's queues, many exchanges at a time and some way ahead, and
-collects what became of them; the lines themselves are kept busy by the core's own thread, which
-waits for nobody. Rows gather in chunks of bounded number; whoever takes them gets the oldest first.
+The lines are kept busy by the core's own thread, which waits for nobody. Where all drives of a line
+answer and are polled as fast as it allows, that thread repeats the bus cycle by itself; else one
+thread for all lines tops up the core's queues, many exchanges at a time and some way ahead. Rows
+gather in the core, in chunks of bounded number; whoever takes them gets the oldest first.
 """
 
 from __future__ import annotations
@@ -19,27 +20,26 @@ from typing import Any
 from multidrop import core, plant
 from multidrop.batch import Batch
 from multidrop.bus import Bus, exchange
-from multidrop.core import EXCEPTION_STATUS, STATUSES, Columns, Exchange, Field, Port, Respondent, Result
+from multidrop.core import EXCEPTION_STATUS, STATUSES, Exchange, Field, Inbox, Port, Respondent, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.ledger import Ledger
-from multidrop.line import Wake, await_notice, now_ns, sleep, utc_minus_monotonic_ns
+from multidrop.line import Wake, now_ns, sleep
 from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
 from multidrop.statistics import LineStatistics
 
-LOOK_S = 0.05  # the longest that rows wait to be collected
+LOOK_S = 0.05  # the longest that a line waits to be tended, or whoever wants rows to be told of them
+REST_S = 0.5  # the same, where nobody waits for either
+FILLING_NS = 10_000_000  # so long new rows gather before they are taken from a chunk that is not full
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
 PARTING_NS = 1_000_000_000  # so long the end of the polling waits for what is under way
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
-CHUNK_ROWS = 1 << 12
-MOST_FIELDS = 2000  # of a block: as many bits as one reply holds
-MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
 
 
 class _Codes:
@@ -85,84 +85,30 @@ class _Asked(Job):
         return round((silence(self.owner) + sending(self.owner, self.block) + response_delay) * 1e9)
 
 
-class _Rows:
-    """The rows that nobody has taken yet, in chunks."""
-
-    def __init__(self, codes: _Codes) -> None:
-        self.wake = Wake()
-        self.dropped = 0
-        self._codes = codes
-        self._lock = threading.Lock()
-        self._chunks = deque([Columns(CHUNK_ROWS)])
-
-    def collect(self, port: Port) -> int:
-        """Make rows of all that a port has carried out; how many exchanges that were."""
-        offset = utc_minus_monotonic_ns()
-        count = 0
-        with self._lock:
-            while True:
-                columns = self._last()
-                count += port.reap(columns, offset)
-                if CHUNK_ROWS - len(columns) >= MOST_FIELDS:
-                    break
-        if count:
-            self.wake.set()
-        return count
-
-    def add_misses(self, slots: Iterable[tuple[_Asked, int]], why: Result) -> None:
-        offset = utc_minus_monotonic_ns()
-        with self._lock:
-            for job, due_ns in slots:
-                self._last().add_miss(job.fields, why, due_ns, offset)
-        self.wake.set()
-
-    def _last(self) -> Columns:
-        """A chunk with room for any block; when too many wait, the newest one's rows are dropped."""
-        if CHUNK_ROWS - len(self._chunks[-1]) < MOST_FIELDS:
-            if len(self._chunks) < MOST_CHUNKS:
-                self._chunks.append(Columns(CHUNK_ROWS))
-            else:
-                self.dropped += len(self._chunks[-1])
-                self._chunks[-1].clear()
-        return self._chunks[-1]
-
-    def take(self) -> Batch | None:
-        with self._lock:
-            oldest = self._chunks[0]
-            if not len(oldest):
-                self.wake.clear()
-                return None
-            self._chunks.popleft()
-            if not self._chunks:
-                self._chunks.append(Columns(CHUNK_ROWS))
-        return Batch(oldest, self._codes.drives, self._codes.registers)
-
-    def close(self) -> None:
-        """No more rows will come; those that wait can still be taken."""
-        with self._lock:
-            self.wake.close()
-
-
 class _PolledLine:
-    """A line's bus, its schedule, and what is queued on it."""
+    """A line's bus, its schedule, and what is queued on it. `number` is what the core calls it by."""
 
-    def __init__(self, declared: plant.Line, bus: Bus, rows: _Rows, codes: _Codes) -> None:
+    def __init__(self, declared: plant.Line, number: int, bus: Bus, inbox: Inbox, codes: _Codes) -> None:
         self.name = declared.name
         self.bus = bus
         self.schedule: Schedule[_Asked] = Schedule()
-        self.started_ns = self.ended_ns = now_ns()
+        self.started_ns = now_ns()
+        self.ended_ns: int | None = None
         self.set_aside: list[_Asked] = []  # a single register that the drive refuses again and again
-        self._rows = rows
+        self._number = number
+        self._inbox = inbox
         self._codes = codes
+        self._port: Port | None = None  # that was tended last
+        self._done = 0  # exchanges on it, when it was tended last
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
         self._ahead_ns = 0  # what is queued will take
         self._learnt_ns = 0
-        self._left: int | None = None  # in the queue, with the one that was under way when it ended
         self._asked_of: list[tuple[Drive, Respondent]] = []
         self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
-        self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has and we have no outcome of
+        self._cycle: list[_Asked] = []  # what the core repeats
+        self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has not carried out yet
         try:
             for polled in declared.drives:
                 self.bus.attach(polled.drive)
@@ -200,40 +146,47 @@ class _PolledLine:
         return job
 
     def start(self) -> None:
-        self.started_ns = self.ended_ns = now_ns()
+        self.started_ns = now_ns()
         self.bus.reset_statistics()
         place = {drive: at for at, drive in enumerate(in_order(self.bus.drives))}
         for job in sorted(self._jobs, key=lambda job: place[job.owner]):
             self.schedule.add(job, self.started_ns)
 
+    @property
+    def is_steady(self) -> bool:
+        """Nothing is to be done for it until the core calls."""
+        return bool(self._cycle)
+
     def tend(self, now: int) -> None:
-        """Collect what was carried out, and queue what comes next."""
-        self.ended_ns = now
+        """See what became of what was queued, and queue what comes next."""
         port = self.bus.line.queue
         if port is None:
             self._regain(now)
             return
-        count = self._collect(port)
+        if port is not self._port:
+            self._port, self._done = port, 0
+            port.report_to(self._inbox, self._number)
+        self._forget_done(port)
         if port.lost:
             self._lose(port, now)
             return
-        if count or port.pending == 0:
-            self._observe(now)
-            self._heed_refusals(now)
-            self._top_up(port, now)
+        self._observe(now)
+        self._heed_refusals(now)
+        self._keep_busy(port, now)
 
-    def _collect(self, port: Port) -> int:
-        count = self._rows.collect(port)
-        for _ in range(count):
+    def _forget_done(self, port: Port) -> None:
+        done = port.done
+        for _ in range((done - self._done) & 0xFFFF_FFFF):
             self._ahead_ns -= self._queued.popleft()[0].duration_ns
-        return count
+        self._done = done
 
     def _lose(self, port: Port, now: int) -> None:
         """The port failed: what was queued on it is missed."""
         port.stop()
-        self._collect(port)
+        self._forget_done(port)
         self._miss(list(self._queued), Result.LINE_LOST)
         self._queued.clear()
+        self._cycle = []
         self._ahead_ns = 0
         self.bus.line.close()
         self._reopen_ns = now
@@ -280,22 +233,29 @@ class _PolledLine:
                 self._jobs.append(part)
                 self.schedule.add(part, now)
 
-    def _top_up(self, port: Port, now: int) -> None:
-        room = port.room - len(self._queued)  # what is carried out keeps its place until it is collected
-        done_ns = max(now + self._ahead_ns, self._queued[-1][1] if self._queued else 0)
-        queued = self.schedule.take(now, done_ns, now + AHEAD_NS, room)
-        if queued:
-            port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
-            self._queued += queued
-            self._ahead_ns += sum(job.duration_ns for job, _ in queued)
+    def _keep_busy(self, port: Port, now: int) -> None:
+        cycle = self.schedule.cycle()
+        if not cycle:
+            self._top_up(port, now)
+        if cycle != self._cycle or port.repeating != bool(cycle):
+            port.repeat([job.exchange for job in cycle])
+            self._cycle = cycle
         if self.schedule.unasked:
             self._miss(self.schedule.unasked, Result.NOT_ASKED)
             self.schedule.unasked = []
 
+    def _top_up(self, port: Port, now: int) -> None:
+        done_ns = max(now + self._ahead_ns, self._queued[-1][1] if self._queued else 0)
+        queued = self.schedule.take(now, done_ns, now + AHEAD_NS, port.room - len(self._queued))
+        if queued:
+            port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
+            self._queued += queued
+            self._ahead_ns += sum(job.duration_ns for job, _ in queued)
+
     def _miss(self, slots: list[tuple[_Asked, int]], why: Result) -> None:
-        for job, _ in slots:
+        for job, due_ns in slots:
             job.exchange.respondent.unasked[why] += job.fields.count
-        self._rows.add_misses(slots, why)
+            self._inbox.add_miss(job.fields, why, due_ns)
 
     def _regain(self, now: int) -> None:
         """Until the port is back every value that is due is missed because of it."""
@@ -311,42 +271,32 @@ class _PolledLine:
             self.bus.line.reopen()
 
     def end(self) -> None:
-        """Begin nothing more; what is under way goes on."""
+        """No port is opened again; what is under way goes on."""
         if self._reopening:
             self._reopening.join()
         self.ended_ns = now_ns()
-        port = self.bus.line.queue
-        if port and port.end():
-            self._left = port.pending
 
     @property
     def is_under_way(self) -> bool:
         """An exchange that was begun is not over yet."""
         port = self.bus.line.queue
-        return port is not None and port.pending == self._left
+        return port is not None and port.end()
 
     def close(self) -> None:
+        ended_ns = self.ended_ns or now_ns()
         port = self.bus.line.queue
         if port:
             port.stop()
-            self._collect(port)
-            self._miss(self._unfinished(), Result.POLL_ENDED)
+            self._forget_done(port)
+            slots = [*self._queued, *self.schedule.pass_slots(ended_ns)]
+            self._miss([(job, due_ns) for job, due_ns in slots if 0 < due_ns <= ended_ns], Result.POLL_ENDED)
         else:
-            self._miss(self.schedule.pass_slots(self.ended_ns), Result.LINE_LOST)
+            self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
         self.schedule = Schedule()
         self.bus.close()
 
-    def _unfinished(self) -> list[tuple[_Asked, int]]:
-        """What was due at the end: slots that had begun, and the first in the queue if it is under way."""
-        queued = list(self._queued)
-        if queued and len(queued) == self._left:
-            job, due_ns = queued[0]
-            queued[0] = job, due_ns or self.ended_ns
-        slots = [*queued, *self.schedule.pass_slots(self.ended_ns)]
-        return [(job, due_ns) for job, due_ns in slots if 0 < due_ns <= self.ended_ns]
-
     def summary(self) -> dict[str, Any]:
-        seconds = max((self.ended_ns - self.started_ns) / 1e9, 1e-9)
+        seconds = max(((self.ended_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
         drives = {drive.name: self._told(drive, seconds) for drive in self.bus.drives}
         tallies = [self.bus.respondent(drive).tally() for drive in self.bus.drives]
         misses: Counter[str] = sum((Counter(it["misses"]) for it in drives.values()), Counter())
@@ -393,15 +343,18 @@ class Poller:
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
     ) -> None:
-        codes = _Codes()
-        self._rows = _Rows(codes)
+        self._codes = _Codes()
+        self._inbox = Inbox()
+        self._wake = Wake()
+        self._taken_ns = 0  # the newest rows
+        self._is_watched = False  # somebody waits for `fileno`
         self._lines: list[_PolledLine] = []
         self._closing = False
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         try:
-            for declared in plant.lines:
+            for number, declared in enumerate(plant.lines):
                 bus = Bus(declared.port, ledger=ledger, audit=audit)
-                self._lines.append(_PolledLine(declared, bus, self._rows, codes))
+                self._lines.append(_PolledLine(declared, number, bus, self._inbox, self._codes))
         except BaseException:
             self.close()
             raise
@@ -429,6 +382,7 @@ class Poller:
             return
         self._closing = True
         if self._thread.is_alive():
+            self._inbox.call(0)
             self._thread.join()
         for line in self._lines:
             line.bus.part()  # before the port is closed, on which it stops motors
@@ -439,13 +393,18 @@ class Poller:
             sleep(0.001)
         for line in self._lines:
             line.close()
-        self._rows.close()
+        self._wake.close()
 
     def _poll(self) -> None:
+        called: Iterable[_PolledLine] = self._lines
         while not self._closing:
-            for line in self._lines:
+            for line in called:
                 line.tend(now_ns())
-            await_notice(LOOK_S)
+            if self._is_watched and self._inbox.chunks:
+                self._wake.set()
+            restless = [line for line in self._lines if not line.is_steady]
+            seconds = LOOK_S if restless or self._is_watched else REST_S
+            called = dict.fromkeys([*restless, *(self._lines[it] for it in self._inbox.await_calls(seconds))])
 
     @property
     def buses(self) -> dict[str, Bus]:
@@ -460,11 +419,20 @@ class Poller:
 
     def fileno(self) -> int:
         """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
-        return self._rows.wake.fileno()
+        self._is_watched = True
+        self._inbox.call(0)
+        return self._wake.fileno()
 
     def take(self) -> Batch | None:
-        """The oldest rows that wait, at once; None when there are none."""
-        return self._rows.take()
+        """The oldest rows that wait, at once; None when there are none, or only just a few new ones."""
+        now, chunks = now_ns(), self._inbox.chunks
+        if chunks < 2:
+            self._wake.clear()
+            if now - self._taken_ns < FILLING_NS and not self._closing:
+                return None
+            self._taken_ns = now
+        columns = self._inbox.take()
+        return Batch(columns, self._codes.drives, self._codes.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Batches as they come, about one `every` s, for `seconds` s or until the caller leaves off."""
@@ -490,5 +458,5 @@ class Poller:
             "lines": lines,
             "samples": sum(line["samples"] for line in lines.values()),
             "misses": sum(sum(line["misses"].values()) for line in lines.values()),
-            "dropped": self._rows.dropped,
+            "dropped": self._inbox.dropped,
         }

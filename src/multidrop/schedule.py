@@ -103,14 +103,16 @@ class Schedule(Generic[J]):
 
     # ---- what comes next ----
 
+    def cycle(self) -> list[J]:
+        """What is to be carried out again and again, where that is all: no slots, and all drives answer."""
+        return [] if self._ill or self._waiting or self._begun else list(self._turn)
+
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
         """What keeps the line busy from `start_ns`, when it has done all it was given, to the horizon.
 
         At most `most` jobs, in their order, each with the time before which it is not to be sent.
         """
         at = max(now_ns, start_ns)
-        if not self._ill and not self._waiting and not self._begun:
-            return self._take_in_turn(at, horizon_ns, most)
         taken: list[tuple[J, int]] = []
         while len(taken) < most and at < horizon_ns:
             self._begin_slots(at)
@@ -124,18 +126,6 @@ class Schedule(Generic[J]):
             taken.append((job, due_ns))
             at = max(at, due_ns) + self._duration_ns(job)
             self._kind = job.kind
-        return taken
-
-    def _take_in_turn(self, at_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
-        """The common case, that all are wanted as fast as the line allows and all answer."""
-        if not self._turn:
-            return []
-        cycle_ns = sum(job.duration_ns for job in self._turn) or 1
-        wanted = -(-(horizon_ns - at_ns) * len(self._turn) // cycle_ns)
-        count = min(most, max(0, wanted))
-        rounds = -(-(self._next + count) // len(self._turn))
-        taken = [(job, 0) for job in (self._turn * rounds)[self._next : self._next + count]]
-        self._next = (self._next + count) % len(self._turn)
         return taken
 
     def _begin_slots(self, by_ns: int) -> None:

@@ -16,6 +16,7 @@ from multidrop.core.frames import (
     reply_length,
     sum8,
 )
+from multidrop.core.inbox import Inbox
 from multidrop.core.overheard import (
     HEARD_ROOM,
     Decoded,
@@ -28,7 +29,7 @@ from multidrop.core.overheard import (
     Unpacked,
     Unpacker,
 )
-from multidrop.core.ports import Port, notice_fd, now_ns
+from multidrop.core.ports import Port, now_ns
 from multidrop.core.results import EXCEPTION_STATUS, STATUSES, Result, status_text
 from multidrop.core.settings import REFUSALS, get_settings, set_settings
 from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
@@ -50,6 +51,7 @@ __all__ = [
     "Field",
     "Framing",
     "Heard",
+    "Inbox",
     "Kind",
     "Message",
     "Port",
@@ -72,7 +74,6 @@ __all__ = [
     "get_settings",
     "lrc",
     "new_completion",
-    "notice_fd",
     "now_ns",
     "parse_reply",
     "parse_request",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from functools import lru_cache
 from itertools import accumulate
+from struct import calcsize
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
@@ -57,19 +58,14 @@ class Block:
         return int(self.c.refusals)
 
 
-COLUMNS = {
-    "time": "int64_t[]",
-    "sent": "int64_t[]",
-    "uncertainty": "int64_t[]",
-    "drive": "uint16_t[]",
-    "reg": "uint16_t[]",
-    "status": "uint16_t[]",
-    "value": "double[]",
-}
-_ITEMS: dict[str, tuple[int, Literal["q", "H", "d"]]] = {
-    "int64_t[]": (8, "q"),
-    "uint16_t[]": (2, "H"),
-    "double[]": (8, "d"),
+COLUMNS: dict[str, Literal["q", "H", "d"]] = {
+    "time": "q",
+    "sent": "q",
+    "uncertainty": "q",
+    "drive": "H",
+    "reg": "H",
+    "status": "H",
+    "value": "d",
 }
 
 
@@ -77,9 +73,23 @@ class Columns:
     """Rows in the core's own memory: one array a column (struct md_columns)."""
 
     def __init__(self, room: int) -> None:
-        self._arrays = {name: ffi.new(kind, room) for name, kind in COLUMNS.items()}
-        self._arrays["valid"] = ffi.new("uint8_t[]", (room + 7) // 8)
-        self.c = ffi.new("struct md_columns *", {**self._arrays, "rows": 0, "room": room})
+        self._own(lib.md_columns_new(room))
+
+    @classmethod
+    def of(cls, made: Any) -> Columns:
+        """What the core made, and gives away."""
+        columns = cls.__new__(cls)
+        columns._own(made)
+        return columns
+
+    def _own(self, made: Any) -> None:
+        if made == ffi.NULL:
+            raise MemoryError("no memory for rows")
+        self.c = ffi.gc(made, lib.md_columns_free)
+        first = ffi.cast("uint8_t *", made)
+        self._at = {name: ffi.cast("uint8_t *", getattr(made, name)) - first for name in (*COLUMNS, "valid")}
+        # One piece, which is there for as long as any view of it.
+        self._memory = memoryview(ffi.buffer(self.c, self._at["valid"] + (made.room + 7) // 8))
 
     def __len__(self) -> int:
         return int(self.c.rows)
@@ -90,8 +100,7 @@ class Columns:
 
     def add_miss(self, block: Block, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
         """Append rows for values that were due at `due_ns` but never asked for."""
-        missed = ffi.new("struct md_completion *", {"result": result, "sent_ns": due_ns})
-        return bool(lib.md_columns_add(self.c, block.c, missed, utc_minus_monotonic_ns))
+        return bool(lib.md_columns_add(self.c, block.c, miss(result, due_ns), utc_minus_monotonic_ns))
 
     def clear(self) -> None:
         """Forget all rows."""
@@ -99,11 +108,16 @@ class Columns:
 
     def array(self, name: str) -> memoryview[Any]:
         """A column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
-        rows = len(self)
+        rows, at = len(self), self._at[name]
         if name == "valid":
-            return memoryview(ffi.buffer(self._arrays[name], (rows + 7) // 8))
-        size, kind = _ITEMS[COLUMNS[name]]
-        return memoryview(ffi.buffer(self._arrays[name], rows * size)).cast(kind)
+            return self._memory[at : at + (rows + 7) // 8]
+        kind = COLUMNS[name]
+        return self._memory[at : at + rows * calcsize(kind)].cast(kind)
+
+
+def miss(result: Result, due_ns: int) -> Any:
+    """What became of an exchange that was due and never asked for (struct md_completion)."""
+    return ffi.new("struct md_completion *", {"result": result, "begun_ns": due_ns})
 
 
 @lru_cache(maxsize=64)

@@ -1,4 +1,4 @@
-"""Lines driven on descriptors by the core's own thread: exchanges are queued, and reaped."""
+"""Lines driven on descriptors by the core's own thread: exchanges are queued, or repeated."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from functools import cache
 
 from multidrop._core import ffi, lib
-from multidrop.core.columns import Columns
 from multidrop.core.exchanges import Completion, Exchange, Respondent, completion
+from multidrop.core.inbox import Inbox
 from multidrop.core.taps import Tap
 
 now_ns = lib.md_now_ns
@@ -27,11 +27,6 @@ def _engine() -> _Engine:
     return _Engine()
 
 
-def notice_fd() -> int:
-    """A descriptor that is readable when a port wants more exchanges; one client reads it empty."""
-    return int(lib.md_engine_notice(_engine().c))
-
-
 class Port:
     """A line driven on a descriptor by the core's thread (struct md_port).
 
@@ -47,7 +42,9 @@ class Port:
         # Read in place: a call of the core would let go of the interpreter, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
         self._stopped = False
-        self._respondents: set[Respondent] = set()
+        self._kept: set[Exchange | Respondent] = set()  # at which the core may still look
+        self._inbox: Inbox | None = None
+        self._round: object = None
 
     def tap(self, tap: Tap) -> None:
         """Tell this tap, and no other any more, of all that goes over the line."""
@@ -59,16 +56,37 @@ class Port:
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
-        """Nothing more is carried out, and the descriptor is the caller's; what was can be reaped."""
+        """Nothing more is carried out, and the descriptor is the caller's."""
         if not self._stopped:
             lib.md_port_stop(self.c)
             self._stopped = True
 
     def close(self) -> None:
-        """Stop, and forget what was not reaped."""
+        """Stop, and let go of its memory."""
         self.stop()
         lib.md_port_free(self.c)
         self.c = self._progress = None
+
+    def report_to(self, inbox: Inbox, number: int) -> None:
+        """Whose rows are what becomes of exchanges, and who is called when the port is to be looked at:
+
+        when little is queued, when the port was lost or repeats nothing any more, and when a drive
+        refuses, fails to answer, or answers again.
+        """
+        self._inbox = inbox
+        lib.md_port_report(self.c, inbox.c, number)
+
+    def repeat(self, exchanges: Sequence[Exchange]) -> None:
+        """Carry these out again and again while nothing that is queued is due, until they are replaced."""
+        self._kept.update(exchanges)  # one of them may be under way when they are replaced
+        rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
+        lib.md_port_repeat(self.c, rounds, len(exchanges))
+        self._round = rounds
+
+    @property
+    def repeating(self) -> bool:
+        """It does so; it does not any more when the port was lost, or an exchange could not be sent."""
+        return bool(self._progress.repeating)
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
         """Queue exchanges, none to be sent before its time; how many there was room for."""
@@ -82,17 +100,18 @@ class Port:
         return int(self._progress.submitted - self._progress.done) & 0xFFFF_FFFF
 
     @property
+    def done(self) -> int:
+        """How many queued exchanges were carried out; it wraps around at 2^32."""
+        return int(self._progress.done)
+
+    @property
     def lost(self) -> bool:
         """The descriptor failed, and nothing more is carried out on it."""
         return bool(self._progress.lost)
 
-    def reap(self, columns: Columns, utc_minus_monotonic_ns: int) -> int:
-        """Make rows of what was carried out; how many exchanges, fewer when the columns are full."""
-        return int(lib.md_port_reap(self.c, columns.c, utc_minus_monotonic_ns))
-
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
-        self._respondents.add(exchange.respondent)  # the core still looks at it when a late answer comes
+        self._kept.add(exchange.respondent)  # the core still looks at it when a late answer comes
         found = ffi.new("struct md_completion *")
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
         return completion(found)

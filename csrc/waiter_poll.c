@@ -1,0 +1,108 @@
+/* Waiting for many descriptors at once, by what every POSIX system has. */
+#ifdef __linux__
+#define _GNU_SOURCE
+#endif
+#include "waiter.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+struct md_waiter {
+    struct pollfd *fds; /* looked away from: the complement of the descriptor, which poll() ignores */
+    void **whose;
+    int count, room;
+};
+
+static int grow(struct md_waiter *waiter)
+{
+    if (waiter->count < waiter->room)
+        return 1;
+    int room = waiter->room ? 2 * waiter->room : 16;
+    struct pollfd *fds = realloc(waiter->fds, (size_t)room * sizeof *fds);
+    if (fds)
+        waiter->fds = fds;
+    void **whose = realloc(waiter->whose, (size_t)room * sizeof *whose);
+    if (whose)
+        waiter->whose = whose;
+    if (!fds || !whose)
+        return 0;
+    waiter->room = room;
+    return 1;
+}
+
+static int find(const struct md_waiter *waiter, int fd)
+{
+    int at = waiter->count;
+    while (at-- > 0 && waiter->fds[at].fd != fd && waiter->fds[at].fd != ~fd)
+        ;
+    return at;
+}
+
+struct md_waiter *md_waiter_new(void)
+{
+    return calloc(1, sizeof(struct md_waiter));
+}
+
+void md_waiter_free(struct md_waiter *waiter)
+{
+    free(waiter->fds);
+    free(waiter->whose);
+    free(waiter);
+}
+
+int md_waiter_add(struct md_waiter *waiter, int fd, void *whose)
+{
+    struct pollfd entry = {.fd = fd, .events = POLLIN};
+    if (fd < 0 || poll(&entry, 1, 0) < 0 || entry.revents & POLLNVAL)
+        errno = EBADF;
+    else if (!grow(waiter))
+        errno = ENOMEM;
+    else {
+        waiter->fds[waiter->count] = entry;
+        waiter->whose[waiter->count++] = whose;
+        return 0;
+    }
+    return -1;
+}
+
+void md_waiter_change(struct md_waiter *waiter, int fd, void *whose, int watched)
+{
+    int at = find(waiter, fd);
+    if (at < 0)
+        return;
+    waiter->fds[at].fd = watched ? fd : ~fd;
+    waiter->whose[at] = whose;
+}
+
+void md_waiter_remove(struct md_waiter *waiter, int fd)
+{
+    int at = find(waiter, fd);
+    if (at < 0)
+        return;
+    waiter->fds[at] = waiter->fds[--waiter->count];
+    waiter->whose[at] = waiter->whose[waiter->count];
+}
+
+/* Where there is no ppoll(), what is left of a millisecond is for the caller to wait. */
+static int wait_for_any(struct md_waiter *waiter, int64_t timeout_ns)
+{
+#ifdef __linux__
+    struct timespec span = {.tv_sec = timeout_ns / 1000000000, .tv_nsec = timeout_ns % 1000000000};
+    return ppoll(waiter->fds, (nfds_t)waiter->count, timeout_ns < 0 ? NULL : &span, NULL);
+#else
+    int64_t ms = timeout_ns < 0 ? -1 : timeout_ns / 1000000;
+    return poll(waiter->fds, (nfds_t)waiter->count, ms > 1000 ? 1000 : (int)ms);
+#endif
+}
+
+int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns)
+{
+    int left = wait_for_any(waiter, timeout_ns), n = 0;
+    for (int at = 0; at < waiter->count && n < left && n < room; at++)
+        if (waiter->fds[at].fd >= 0 && waiter->fds[at].revents)
+            ready[n++] = waiter->whose[at];
+    return left < 0 ? left : n;
+}
