@@ -15,7 +15,6 @@
 #ifdef __linux__
 #include <sys/prctl.h>
 #endif
-#include <time.h>
 #include <unistd.h>
 
 enum {
@@ -84,13 +83,6 @@ struct md_engine {
     int64_t lateness_ns; /* of the thread's waking, as is usual */
     int stopping;
 };
-
-int64_t md_now_ns(void)
-{
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
-}
 
 static uint32_t get(const uint32_t *counter)
 {

@@ -86,9 +86,7 @@ static void ask_clock(struct md_inbox *inbox, int64_t now_ns)
     if (inbox->asked_ns && now_ns - inbox->asked_ns < CLOCK_HOLDS_NS)
         return;
     inbox->asked_ns = now_ns;
-    struct timespec utc;
-    clock_gettime(CLOCK_REALTIME, &utc);
-    inbox->utc_minus_monotonic_ns = utc.tv_sec * INT64_C(1000000000) + utc.tv_nsec - md_now_ns();
+    inbox->utc_minus_monotonic_ns = md_utc_minus_monotonic_ns();
 }
 
 static struct md_columns *newest(struct md_inbox *inbox)

@@ -102,6 +102,13 @@ int md_port_set(int fd, const struct md_settings *settings);
 /* Read the settings; 0 or -errno. */
 int md_port_get(int fd, struct md_settings *settings);
 
+/* ---- clock.c ---- */
+
+int64_t md_now_ns(void); /* CLOCK_MONOTONIC */
+/* What to add to it to have UTC: kept as long as it is right to 0.1 ms, so that a moment has one time,
+ * in whichever recording it stands. */
+int64_t md_utc_minus_monotonic_ns(void);
+
 /* ---- reason.c ---- */
 
 /* Why these bytes, which came in place of the reply, are none (enum md_result). */
@@ -220,7 +227,6 @@ struct md_engine;
 struct md_port; /* a descriptor with its line */
 struct md_inbox;
 
-int64_t md_now_ns(void); /* CLOCK_MONOTONIC */
 struct md_engine *md_engine_start(void); /* NULL: see errno */
 void md_engine_stop(struct md_engine *engine); /* when all its ports are closed */
 

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap
+from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError
 
 __all__ = ["Line", "Wake", "now_ns", "sleep", "utc_minus_monotonic_ns"]
@@ -50,28 +50,6 @@ _OPEN_REASONS = {
     errno.EISDIR: "it is a directory, not a serial port",
     errno.ECONNREFUSED: "nothing listens there",
 }
-
-
-class _UtcOffset:
-    """What to add to CLOCK_MONOTONIC to have UTC: kept as long as it is right to 0.1 ms.
-
-    So a moment has one time, in whichever recording it stands.
-    """
-
-    def __init__(self) -> None:
-        self._kept_ns = 0
-
-    def __call__(self) -> int:
-        before_ns, utc_ns, after_ns = now_ns(), time.time_ns(), now_ns()
-        offset_ns = utc_ns - before_ns
-        is_known = after_ns - before_ns < _WRONG_NS  # else this thread was interrupted meanwhile
-        if not self._kept_ns or (is_known and abs(offset_ns - self._kept_ns) > _WRONG_NS):
-            self._kept_ns = offset_ns
-        return self._kept_ns
-
-
-_WRONG_NS = 100_000
-utc_minus_monotonic_ns = _UtcOffset()
 
 
 def _reason(failure: BaseException) -> str:

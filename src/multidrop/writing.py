@@ -29,7 +29,7 @@ from multidrop.rules import conditions, is_harmless, raw_count, refused, wears
 
 
 def utc_ns() -> int:
-    return int(now_ns()) + utc_minus_monotonic_ns()
+    return int(now_ns() + utc_minus_monotonic_ns())
 
 
 class Writer:

@@ -11,6 +11,7 @@ from multidrop.core.inbox import Inbox
 from multidrop.core.taps import Tap
 
 now_ns = lib.md_now_ns
+utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class _Engine:
