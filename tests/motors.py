@@ -1,4 +1,4 @@
-"""A drive of each family, and what starts its motor."""
+"""A drive of each family, what starts its motor, and what a simulated one hears."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Callable
 from multidrop.core import Message
 from multidrop.drive import Drive
 from multidrop.drives import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.sim import PoweredDrive
+from multidrop.sim.receiver import Frame
 
 MAKE: dict[str, Callable[[int], Drive]] = {
     "erman-er-g-220": ErmanERG220,
@@ -27,3 +29,33 @@ STARTS: dict[str, Callable[[Message], bool]] = {
     "delixi-native": lambda it: it.function == 2 and it.start in (2, 3),
     "yd1000": lambda it: it.start == 0x1000 and (bool(it.data[0] & 0x05) or not it.data[0] & 0x80),
 }
+WRITES = (5, 6, 15, 16)
+DELIXI_WRITES = (2, 4, 5, 6)
+
+
+class Heard:
+    """What a simulated drive hears; `loses(request)` says whether its reply is lost."""
+
+    def __init__(self, sim: PoweredDrive) -> None:
+        self.sim = sim
+        self.requests: list[Message] = []
+        self.loses: Callable[[Message], bool] = lambda request: False
+        self._hear = sim.hear
+        vars(sim)["hear"] = self.hear
+
+    def hear(self, frame: Frame) -> Message | None:
+        request = frame.message
+        if request is None or not frame.intact:
+            return self._hear(frame)
+        self.requests.append(request)
+        reply = self._hear(frame)
+        return None if self.loses(request) else reply
+
+    @property
+    def writes(self) -> list[Message]:
+        own = DELIXI_WRITES if self.sim.drive.model == "delixi-native" else WRITES
+        return [it for it in self.requests if it.function in own]
+
+    @property
+    def starts(self) -> list[Message]:
+        return [it for it in self.writes if STARTS[self.sim.drive.model](it)]

@@ -5,26 +5,22 @@ The same cases as on a clock of the test's own (test_safety_bus.py); here the dr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
 from lines import until
-from motors import MAKE, STARTS
+from motors import MAKE, Heard
 
 from multidrop import exchanges
 from multidrop.bus import Bus
-from multidrop.core import Message
 from multidrop.drive import Condition, Drive, read
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
 from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
-from multidrop.sim.receiver import Frame
 
 every_family = pytest.mark.parametrize("model", MAKE)
-WRITES = (5, 6, 15, 16)
-DELIXI_WRITES = (2, 4, 5, 6)
 GOODRIVE = 0x010A
 PATIENCE = 0.3  # s, with a machine that has much else to do
 
@@ -32,34 +28,6 @@ PATIENCE = 0.3  # s, with a machine that has much else to do
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
-
-
-class Heard:
-    """What a simulated drive hears; `loses(request)` says whether its reply is lost."""
-
-    def __init__(self, sim: PoweredDrive) -> None:
-        self.sim = sim
-        self.requests: list[Message] = []
-        self.loses: Callable[[Message], bool] = lambda request: False
-        self._hear = sim.hear
-        vars(sim)["hear"] = self.hear
-
-    def hear(self, frame: Frame) -> Message | None:
-        request = frame.message
-        if request is None or not frame.intact:
-            return self._hear(frame)
-        self.requests.append(request)
-        reply = self._hear(frame)
-        return None if self.loses(request) else reply
-
-    @property
-    def writes(self) -> list[Message]:
-        own = DELIXI_WRITES if self.sim.drive.model == "delixi-native" else WRITES
-        return [it for it in self.requests if it.function in own]
-
-    @property
-    def starts(self) -> list[Message]:
-        return [it for it in self.writes if STARTS[self.sim.drive.model](it)]
 
 
 @contextmanager
