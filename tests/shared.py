@@ -66,7 +66,7 @@ class SharedPair:
             tty.setraw(fd)
         for fd in self._sides:
             os.set_blocking(fd, False)
-        self.sent: list[bytes] = []
+        self.sent = b""
         self.collisions = 0
         self.holds: Callable[[bytes], bool] = lambda said: False
         self.says = b""
@@ -95,7 +95,7 @@ class SharedPair:
         """Everyone hears what the others said in this slot, as it was spoilt."""
         ours = said.get(self._our_side)
         if ours:
-            self.sent.append(ours)
+            self.sent += ours
             if self.holds(ours):
                 del said[self._our_side]
                 said[self._their_side] = self.says

@@ -353,6 +353,18 @@ def test_a_drive_that_is_heard_no_more_after_its_command(
     assert sim.motor.energised == (verb == "start")
 
 
+def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """DriveRefused would say that it did not start."""
+    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
+    hall.answers = lambda request: busy if starts(hall, "invt-che") and not is_write(request) else None
+    with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*code 06H"):
+        drive.start()
+    assert len(starts(hall, "invt-che")) == 1
+    assert sim.motor.energised
+
+
 def test_noise_at_the_start_hides_a_look_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)

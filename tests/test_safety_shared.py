@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from time import sleep
 from typing import Any
 
@@ -20,6 +20,7 @@ from lines import until
 from motors import MAKE, STARTS, Heard
 from shared import SharedPair, shared
 
+from multidrop import exchanges
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request
 from multidrop.drives import InvtCHE
@@ -50,10 +51,14 @@ def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]
 
 
 def requests(pair: SharedPair) -> list[Message]:
-    """What left our port."""
-    found = [parse_request(Framing.RTU, it) for it in pair.sent]
-    assert all(used == len(frame) for (used, _), frame in zip(found, pair.sent, strict=True))
-    return [message for _, message in found if message is not None]
+    """What left our port: whole requests, one after another."""
+    found, sent = [], pair.sent
+    while sent:
+        used, message = parse_request(Framing.RTU, sent)
+        assert message is not None
+        found.append(message)
+        sent = sent[used:]
+    return found
 
 
 def attempt(act: Callable[[], object]) -> BusError | None:
@@ -105,11 +110,9 @@ class Stranger:
 
 @pytest.mark.parametrize("model", RTU_FAMILIES)
 def test_starts_and_stops_while_another_client_talks(model: str) -> None:
-    with (
-        hall(model, seed=1) as (drive, pair, (first, second)),
-        Stranger(pair.theirs, model, seed=2) as stranger,
-    ):
-        until(lambda: attempt(lambda: drive.set_frequency(20)) is None)
+    with hall(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
+        drive.set_frequency(20)
+        stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
         for _ in range(ROUNDS):
             sent, carried_out = len(starts(pair, model)), len(first.starts)
             failure = attempt(drive.start)
@@ -132,6 +135,15 @@ def starts(pair: SharedPair, model: str) -> list[Message]:
 
 # ---- at the worst moment: ours is lost, and this is heard within our time-out ----
 
+PATIENCE = 0.1  # s, with a machine that has much else to do
+
+
+@pytest.fixture
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
+
+
+patient = pytest.mark.usefixtures("_patient")
 START, STOP, RESET, JOG = (f"01 06 10 00 00 {command:02X}" for command in (1, 5, 7, 3))
 SAYS: dict[str, bytes] = {
     "nothing": b"",
@@ -151,8 +163,15 @@ FAILURES = {"ours with one bit turned": DriveRefused}  # a CHE answers it with e
 PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 
-@pytest.mark.parametrize("says", SAYS)
-@pytest.mark.parametrize("verb", PULSES)
+MOMENTS = [("start", says) for says in SAYS] + [
+    (verb, says)
+    for verb in ("jog", "reset_fault")
+    for says in ("nothing", "a read of the same drive, which it answers", "a write to the other drive")
+]
+
+
+@patient
+@pytest.mark.parametrize(("verb", "says"), MOMENTS)
 def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
     with hall("invt-che", seed=3) as (drive, pair, heard):
         drive.set_frequency(20)
@@ -167,6 +186,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
         assert heard[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
 
 
+@patient
 @pytest.mark.parametrize("says", SAYS)
 def test_what_another_client_says_confirms_no_stop(says: str) -> None:
     with hall("invt-che", seed=3) as (drive, pair, heard):
@@ -181,6 +201,7 @@ def test_what_another_client_says_confirms_no_stop(says: str) -> None:
         assert heard[0].sim.motor.energised == (says != "a stop of all")
 
 
+@patient
 def test_the_same_stop_of_another_client_is_one_too() -> None:
     """It looks like the drive's confirmation of ours, and the motor stops all the same."""
     with hall("invt-che", seed=3) as (drive, pair, heard):
@@ -192,6 +213,7 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
         assert not heard[0].sim.motor.energised
 
 
+@patient
 def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
     with hall("invt-che", seed=3) as (drive, pair, heard), Bus(pair.theirs) as other:
         drive.set_frequency(20)

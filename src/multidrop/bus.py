@@ -248,21 +248,27 @@ class Bus:
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
         """Carry out a verb's steps; the drive's verbs call this.
 
-        A drive that is heard no more after something was written to it: Unconfirmed, because NoReply
-        says that nothing was.
+        What fails to be read after something was written is Unconfirmed: NoReply would say that nothing
+        was, and DriveRefused that the drive did not do it.
         """
         written: list[Write] = []
+        unseen: list[BusError] = []  # why something was not read
 
         def do(step: Step) -> Any:
-            result = self._step(drive, step)
+            try:
+                result = self._step(drive, step)
+            except BusError as failure:
+                if isinstance(step, Read):
+                    unseen.append(failure)
+                raise
             if isinstance(step, Write):
                 written.append(step)
             return result
 
         try:
             return carry_out(script, do)
-        except (NoReply, BadReply) as failure:
-            if not written:
+        except (NoReply, BadReply, DriveRefused) as failure:
+            if not written or failure not in unseen:
                 raise
             register, value = written[-1].register, written[-1].value
             what = f"{register.name} = {register.format(value)}"
