@@ -12,13 +12,16 @@ from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import Framing, Message, build_request
 from multidrop.look.recorded import Array, Look, Series
-from multidrop.look.style import COLOURS, days, line_style, new_figure, tell_time, time_edges
+from multidrop.look.style import COLOURS, TEXT, days, line_style, new_figure, tell_time, time_edges
 from multidrop.timing import Settings
 
 MOST_REASONS = 6  # in a picture; the rest are one
 LEAST_IN_BIN = 20  # values, before a share of misses means something
 BINS = 12  # of the output frequency
 FREQUENCY = "output_frequency"
+ROOM = 2.0  # times the longest delay but one of a hundred: so much a picture shows
+SHORTEST_AXIS = 0.001  # s
+UNASKED = "not "  # so begin the reasons of misses that no request left for
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,11 @@ def draw_delays(found: Sequence[Delays]) -> Figure:
         flierprops={"marker": ".", "markersize": 2.5, "alpha": 0.4, "markeredgecolor": COLOURS[0]},
     )
     axes.invert_yaxis()
-    axes.set_xlim(left=0)
-    axes.set_xlabel("response delay, ms", loc="left")
+    limit = ROOM * max(it.quantile(0.99) for it in found) + SHORTEST_AXIS
+    longer = sum(int((it.seconds > limit).sum()) for it in found)
+    axes.set_xlim(0, limit * 1e3 if longer else None)
+    note = f" ({longer} longer beyond the right edge)" if longer else ""
+    axes.set_xlabel(f"response delay, ms{note}", loc="left")
     return figure
 
 
@@ -110,7 +116,7 @@ def draw_rates(look: Look) -> Figure:
         misses.legend(fontsize=8, frameon=False, loc="upper left", ncols=3)
         misses.set_ylim(0, 1.35 * float(np.sum(list(stacked.values()), axis=0).max()))
     else:
-        misses.text(0.5, 0.5, "none", transform=misses.transAxes, ha="center", va="center", color="#555555")
+        misses.text(0.5, 0.5, "none", transform=misses.transAxes, ha="center", va="center", color=TEXT)
         misses.set_ylim(0, 1)
     figure.legend(*rates.get_legend_handles_labels(), loc="outside upper left", ncols=6, frameon=False)
     tell_time(misses)
@@ -142,20 +148,22 @@ def reasons_of(look: Look, drive: str) -> Counter[str]:
 def miss_shares(look: Look, drive: str) -> tuple[Array, Array] | None:
     """Output frequencies in Hz, and which share of the drive's values is missed near each of them.
 
-    The frequency at a miss is the last one seen. None where nothing was missed, and where the drive
-    tells no frequency or keeps one.
+    The frequency at a miss is the last one seen. What was not asked for says nothing of noise. None
+    where nothing was missed, and where the drive tells no frequency or keeps one.
     """
     (frequency, *_) = (*look.of(drive, FREQUENCY), None)
-    if frequency is None or frequency.missed.all() or not reasons_of(look, drive):
+    reasons = [it for it in reasons_of(look, drive) if not it.startswith(UNASKED)]
+    if frequency is None or frequency.missed.all() or not reasons:
         return None
     known_time, known = frequency.time[~frequency.missed], frequency.value[~frequency.missed]
     if known.max() - known.min() < 1.0:
         return None
     edges = np.linspace(known.min(), known.max(), BINS + 1)
     missed, asked = np.zeros(BINS), np.zeros(BINS)
+    unasked = [at for at, status in enumerate(look.series[0].statuses) if status.startswith(UNASKED)]
     for it in look.of(drive):
         last = np.searchsorted(known_time, it.time, side="right") - 1
-        there = last >= 0
+        there = (last >= 0) & ~np.isin(it.status, unasked)
         place = np.clip(np.searchsorted(edges, known[last[there]], side="right") - 1, 0, BINS - 1)
         asked += np.bincount(place, minlength=BINS)
         missed += np.bincount(place[it.missed[there]], minlength=BINS)

@@ -128,7 +128,8 @@ def _used(found: Sequence[Used], look: Look) -> Iterator[str]:
         return
     yield (
         "<p>What the answered exchanges had to take of the line: silence, request, response delay and "
-        "reply. The plan reckons with the response delays that the drives' documents state.</p>"
+        "reply. What else was sent meanwhile, such as commands, is not recorded. The plan reckons with "
+        "the response delays that the drives' documents state.</p>"
     )
     yield _image(draw_used(found, look), "utilisation over time")
     rows = []

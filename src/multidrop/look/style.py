@@ -17,7 +17,7 @@ from multidrop.look.recorded import Array
 # Okabe and Ito's, without black and yellow; then the same once more, dashed.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
-MISS = "#B00020"
+TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
 FEWEST_BUCKETS, MOST_BUCKETS = 10, 120  # of the time axis

@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from multidrop.look.recorded import RAW, Array, Look, Series
-from multidrop.look.style import FAULT, GRID, MISS, day, days, line_style, new_figure, tell_time
+from multidrop.look.style import FAULT, GRID, TEXT, day, days, line_style, new_figure, tell_time
 
 FIRST = (  # shown before others when there are more than fit
     "output_frequency",
@@ -55,7 +56,7 @@ def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) 
     axes[-1].set_xlim(day(look.begin), day(max(look.end, look.begin + 1_000_000)))
     handles = [Line2D([], [], label=name, **line_style(look.drives.index(name))) for name in names]
     if any(it.missed.any() for it in chosen):
-        handles.append(Line2D([], [], color=MISS, marker="|", linestyle="", label="missed"))
+        handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
     figure.legend(handles=handles, loc="outside upper left", ncols=min(6, len(handles)), frameon=False)
     return figure, [_title(panel) for panel in left]
 
@@ -87,16 +88,30 @@ def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], look: Look) 
         drawstyle = "steps-post" if it.names else "default"
         marker = "." if len(time) < FEW_POINTS else ""
         axes.plot(days(time), value, linewidth=1.3, drawstyle=drawstyle, marker=marker, markersize=3, **style)
-    _mark_misses(axes, series)
+    _mark_misses(axes, series, look)
     _name_values(axes, series)
     if not any(it.names for it in series):
-        low, high = axes.get_ylim()
-        if 0 < low < 0.6 * high:
-            axes.set_ylim(bottom=0)
+        _fit(axes, series)
 
 
-def _mark_misses(axes: Axes, series: Sequence[Series]) -> None:
-    """A tick at the foot of the panel for every value that was due and is not there."""
+def _fit(axes: Axes, series: Sequence[Series]) -> None:
+    """Counts stand at whole numbers; a value that never changes is no tiny span; 0 is there if it is near."""
+    seen = np.concatenate([it.value[~it.missed] for it in series])
+    if not len(seen):
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "no value", transform=axes.transAxes, ha="center", va="center", color=TEXT)
+        return
+    if all(it.unit in ("", RAW) for it in series):
+        axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    if seen.min() == seen.max():
+        axes.set_ylim(min(0.0, 1.2 * seen.min()), max(1.0, 1.2 * seen.max()))
+    low, high = axes.get_ylim()
+    if 0 < low < 0.6 * high:
+        axes.set_ylim(bottom=0)
+
+
+def _mark_misses(axes: Axes, series: Sequence[Series], look: Look) -> None:
+    """A tick at the foot of the panel, in the drive's colour, for every value that was due and missed."""
     for it in series:
         time = it.time[it.missed]
         if len(time):
@@ -107,9 +122,9 @@ def _mark_misses(axes: Axes, series: Sequence[Series]) -> None:
                 days(time),
                 foot,
                 "|",
-                color=MISS,
-                markersize=6,
-                alpha=0.7,
+                color=line_style(look.drives.index(it.drive))["color"],
+                markersize=7,
+                markeredgewidth=1.2,
                 transform=axes.get_xaxis_transform(),
             )
 
