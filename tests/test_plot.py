@@ -293,6 +293,24 @@ def test_drives_and_registers_can_be_chosen(look: Look) -> None:
     assert "output_frequency, Hz" in [axes.get_title(loc="left") for axes in figure.axes]
 
 
+def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
+    rows = [row(at, "pump", name, 0) for at in range(3) for name in ("fault", "output_frequency")]
+    look = load(record(tmp_path / "it.arrows", rows))
+
+    def titles(registers: list[str]) -> list[str]:
+        return [axes.get_title(loc="left") for axes in plot(look, [], registers)[0].axes]
+
+    assert titles([]) == ["output_frequency, Hz"]
+    assert titles(["fault"]) == ["faults: none"]
+
+
+def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
+    (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
+    low, high = axes.get_ylim()
+    assert low <= 0 < 50 < high
+
+
 def test_what_has_no_room_is_named(tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))

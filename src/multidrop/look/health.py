@@ -120,6 +120,7 @@ def draw_rates(look: Look) -> Figure:
         misses.set_ylim(0, 1)
     figure.legend(*rates.get_legend_handles_labels(), loc="outside upper left", ncols=6, frameon=False)
     tell_time(misses)
+    misses.set_xlim(*days(edges[[0, -1]].astype(np.int64)))
     return figure
 
 

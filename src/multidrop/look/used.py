@@ -98,5 +98,6 @@ def draw_used(found: Sequence[Used], look: Look) -> Figure:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_ylabel("utilisation")
     tell_time(axes)
+    axes.set_xlim(*days(edges[[0, -1]].astype(np.int64)))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=6, frameon=False)
     return figure

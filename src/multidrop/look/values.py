@@ -37,12 +37,13 @@ def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) 
     _check("drive", drives, look.drives)
     chosen = [it for it in look.series if not drives or it.drive in drives]
     _check("register", registers, tuple(dict.fromkeys(it.register for it in chosen)))
-    faults = [it for it in chosen if it.register == FAULTS]
-    panels = _panels([it for it in chosen if it not in faults], registers)
+    panels = _panels([it for it in chosen if it.register != FAULTS], registers)
     shown, left = panels[:MOST_PANELS], panels[MOST_PANELS:]
     if registers:
         shown, left = panels, []
     names = sorted({it.drive for it in chosen}, key=look.drives.index)
+    told = [it for it in chosen if it.register == FAULTS]
+    faults = [it for it in told if it.faults()] or ([] if shown else told)
     strip = [0.35 + 0.22 * len(faults)] if faults else []
     figure, axes = new_figure([*strip, *([1.9] * len(shown))], sharex=True)
     spans = [(it, span) for it in faults for span in it.faults()]
@@ -89,9 +90,8 @@ def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], look: Look) 
         marker = "." if len(time) < FEW_POINTS else ""
         axes.plot(days(time), value, linewidth=1.3, drawstyle=drawstyle, marker=marker, markersize=3, **style)
     _mark_misses(axes, series, look)
+    _fit(axes, series)
     _name_values(axes, series)
-    if not any(it.names for it in series):
-        _fit(axes, series)
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
@@ -104,7 +104,8 @@ def _fit(axes: Axes, series: Sequence[Series]) -> None:
     if all(it.unit in ("", RAW) for it in series):
         axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     if seen.min() == seen.max():
-        axes.set_ylim(min(0.0, 1.2 * seen.min()), max(1.0, 1.2 * seen.max()))
+        low, high = min(0.0, 1.2 * seen.min()), max(1.0, 1.2 * seen.max())
+        axes.set_ylim(low - 0.05 * (high - low), high)
     low, high = axes.get_ylim()
     if 0 < low < 0.6 * high:
         axes.set_ylim(bottom=0)
@@ -139,8 +140,8 @@ def _name_values(axes: Axes, series: Sequence[Series]) -> None:
 
 
 def _draw_faults(axes: Axes, series: Sequence[Series], look: Look) -> None:
-    """A row for each drive that has a fault register; a bar with its name while there is a fault."""
-    axes.set_title("faults", loc="left", fontsize=10)
+    """A row for each drive; a bar with its name while there is one."""
+    axes.set_title("faults" if any(it.faults() for it in series) else "faults: none", loc="left", fontsize=10)
     for row, it in enumerate(series):
         for span in it.faults():
             begin, end = day(span.begin), day(span.end)
