@@ -343,7 +343,7 @@ def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture
     for words, status, sentence in (
         (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE"),
         (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
-        (["decode", none], 1, f"{none}: No such file or directory"),
+        (["decode", none], 2, f"{none}: No such file or directory"),
         (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
         (
             ["decode", capture, "--out", capture],

@@ -342,9 +342,22 @@ def test_names_cannot_break_the_page(tmp_path: Path) -> None:
 
 def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
-    page = report_page(load(record(tmp_path / "it.arrows", rows)))
+    look = load(record(tmp_path / "it.arrows", rows))
+    page = report_page(look)
     assert "No drive ever answered." in page
     assert "100.00%" in page
+
+
+def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
+    rows += [row(at, "fan", "output_frequency", 5.0) for at in range(3)]
+    path = record(tmp_path / "it.arrows", rows)
+    assert run("plot", path, "--drive", "pump") == (
+        2,
+        "",
+        "multidrop: there is no value to draw, only misses: no reply 3; `multidrop report` tells more\n",
+    )
+    assert run("plot", path)[0] == 0
 
 
 def test_a_single_row_has_a_report(tmp_path: Path) -> None:

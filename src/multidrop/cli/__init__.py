@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from multidrop.errors import BusError, Refused, Unsupported
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
+_MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # name: its module here, and what it does
     "demo": ("demo", "poll simulated drives of every family on one line"),
@@ -92,7 +93,7 @@ def _guarded(command: str, words: list[str]) -> int:
             return _say(str(failure), FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
-        return _say(f"{where}{failure.strerror}", FAILED)
+        return _say(f"{where}{failure.strerror}", MISTAKE if isinstance(failure, _MISNAMED) else FAILED)
     except BusError as failure:
         return _say(str(failure), FAILED)
     return status

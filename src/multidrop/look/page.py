@@ -41,7 +41,6 @@ def plot_page(look: Look, figure: Figure) -> str:
 
 def report_page(look: Look) -> str:
     """All that the recording tells of itself."""
-    figure, left = plot(look)
     parts = [_about(look), *_drives(look), *_used(used(look), look), "<h2>Rates and misses</h2>"]
     parts += [_image(draw_rates(look), "values and misses a second"), *_misses(look)]
     shares = draw_miss_shares(look)
@@ -52,13 +51,7 @@ def report_page(look: Look) -> str:
             f"<p>{text}</p>",
             _image(shares, "misses against output frequency"),
         ]
-    parts += [*_delays(delays(look)), *_faults(look), "<h2>Values</h2>"]
-    if left:
-        parts.append(
-            f"<p>Not shown: {html.escape('; '.join(left))}. "
-            "<code>multidrop plot --register NAME</code> shows each.</p>"
-        )
-    parts.append(_image(figure, "values over time"))
+    parts += [*_delays(delays(look)), *_faults(look), "<h2>Values</h2>", *_values(look)]
     return _page(f"Report on {look.path.name}", parts)
 
 
@@ -201,6 +194,17 @@ def _faults(look: Look) -> Iterator[str]:
         yield "<p>None was seen.</p>"
     else:
         yield "<p>No register called fault was polled.</p>"
+
+
+def _values(look: Look) -> Iterator[str]:
+    if not any(it.has_values for it in look.series):
+        yield "<p>There is none.</p>"
+        return
+    figure, left = plot(look)
+    if left:
+        names = html.escape("; ".join(left))
+        yield f"<p>Not shown: {names}. <code>multidrop plot --register NAME</code> shows each.</p>"
+    yield _image(figure, "values over time")
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -46,6 +46,10 @@ class Series:
         return np.asarray(np.isnan(self.value))
 
     @property
+    def has_values(self) -> bool:
+        return not self.missed.all()
+
+    @property
     def names(self) -> dict[int, str]:
         """What its counts mean, where they have names."""
         return {number: name for name, number in (self.meaning.get("values") or {}).items()}

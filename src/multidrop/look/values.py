@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,10 +34,17 @@ Panel = tuple[str, str]  # register, unit
 
 
 def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) -> tuple[Figure, list[str]]:
-    """The picture, and the registers that had no room in it. Raises ValueError for unknown names."""
+    """The picture, and the registers that had no room in it.
+
+    Raises ValueError for unknown names, and where all that was to be drawn is missing.
+    """
     _check("drive", drives, look.drives)
     chosen = [it for it in look.series if not drives or it.drive in drives]
     _check("register", registers, tuple(dict.fromkeys(it.register for it in chosen)))
+    if not any(it.has_values for it in chosen if not registers or it.register in registers):
+        raise ValueError(
+            f"there is no value to draw, only misses: {_told(chosen)}; `multidrop report` tells more"
+        )
     panels = _panels([it for it in chosen if it.register != FAULTS], registers)
     shown, left = panels[:MOST_PANELS], panels[MOST_PANELS:]
     if registers:
@@ -66,6 +74,11 @@ def _check(what: str, given: Sequence[str], known: Sequence[str]) -> None:
     for name in given:
         if name not in known:
             raise ValueError(f"the recording has no {what} {name!r}; it has {', '.join(known)}")
+
+
+def _told(series: Sequence[Series]) -> str:
+    reasons = sum((it.reasons() for it in series), Counter[str]())
+    return ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
 
 
 def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
