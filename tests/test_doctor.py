@@ -21,7 +21,7 @@ from multidrop.cli.adapter import (
     low_latency,
     rs485_mode,
 )
-from multidrop.cli.doctor import (
+from multidrop.cli.findings import (
     ROUNDS,
     adapter_finding,
     echo_finding,
@@ -188,6 +188,7 @@ def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
     told = " ".join(out.split())
     assert f"{port} is a pseudo-terminal" in told
     assert "there is none, and so no driver" in told
+    assert "multidrop locks it against programs that heed such locks, makes it raw" in told
     assert "none at 9600 8N1: nothing came back" in told
     assert "not measured: a drive must answer -> name one with --model and --address" in told
     assert max(map(len, out.splitlines())) <= 80
@@ -211,7 +212,8 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
 
 
 def test_a_drive_that_is_not_there_is_told(run: Run, port: str) -> None:
-    _, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
+    status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
+    assert status == 1
     told = " ".join(out.split())
     assert "invt-che@9 did not answer once in 20 requests -> check its address" in told
 

@@ -7,11 +7,21 @@ import json
 import os
 import textwrap
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 from multidrop.bus import LEAST_TIMEOUT, Bus, exchange
-from multidrop.cli.adapter import Adapter, RS485Mode, find_adapter, low_latency, rs485_mode
+from multidrop.cli.adapter import find_adapter, low_latency, rs485_mode
+from multidrop.cli.findings import (
+    ROUNDS,
+    Finding,
+    adapter_finding,
+    echo_finding,
+    latency_finding,
+    low_latency_finding,
+    round_trip_finding,
+    rs485_finding,
+)
 from multidrop.cli.target import add_json_argument
 from multidrop.core import Exchange, Framing, Message, Respondent, build_request
 from multidrop.drive import Drive
@@ -22,19 +32,11 @@ from multidrop.plan import blocks
 from multidrop.timing import Settings
 
 WIDTH = 80
-LATENCY_MS = 1  # a larger latency timer is worth changing
 NOBODY = 247  # the address that the echo's request goes to
-ROUNDS = 20
-SLOW_S = 0.005  # more than this on top of a drive's usual response delay is worth a word
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What was found, and what the user should do about it, if anything."""
-
-    topic: str
-    what: str
-    advice: str = ""
+SETTING_UP = (
+    "while it has the port, multidrop locks it against programs that heed such locks, makes it raw, sets "
+    "each drive's baud rate and format, reads them back, and asks the driver for low latency"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({"port": arguments.port, "findings": [asdict(it) for it in findings]}, indent=2))
     else:
         print("\n".join(_text(findings)))
-    return 0
+    return 1 if any(it.is_failure for it in findings) else 0
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -106,11 +108,13 @@ def _opened(port: str, device: str) -> Iterator[Finding]:
     link = f", which is {device}" if device != port else ""
     if device.startswith("/dev/pts/"):
         yield Finding("port", f"{port} is a pseudo-terminal{link}: a program is at its other end")
+        yield Finding("set here", SETTING_UP)
         yield Finding(
             "adapter", "there is none, and so no driver, latency timer, RS-485 mode or low-latency flag"
         )
         return
     yield Finding("port", f"{port} is a serial port{link}")
+    yield Finding("set here", SETTING_UP)
     adapter = find_adapter(device)
     yield adapter_finding(adapter)
     fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -120,54 +124,6 @@ def _opened(port: str, device: str) -> Iterator[Finding]:
         yield rs485_finding(rs485_mode(fd))
     finally:
         os.close(fd)
-
-
-def adapter_finding(adapter: Adapter) -> Finding:
-    product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
-    driver = f"its driver is {adapter.driver}" if adapter.driver else "the system names no driver for it"
-    return Finding("adapter", f"{product}; {driver}")
-
-
-def latency_finding(adapter: Adapter) -> Finding:
-    milliseconds = adapter.latency_timer
-    if milliseconds is None:
-        return Finding("latency timer", "the driver has none that can be seen")
-    if milliseconds <= LATENCY_MS:
-        return Finding("latency timer", f"{milliseconds} ms: the shortest there is")
-    return Finding(
-        "latency timer",
-        f"{milliseconds} ms: every reply may wait for so long in the adapter",
-        f"echo {LATENCY_MS} | sudo tee {adapter.latency_path} (for good, a udev rule: "
-        f'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{{latency_timer}}="{LATENCY_MS}")',
-    )
-
-
-def low_latency_finding(low: bool | None) -> Finding:
-    if low is None:
-        return Finding("low latency", "the driver has no such flag")
-    if low:
-        return Finding("low latency", "the flag is set: multidrop sets it whenever it opens the port")
-    return Finding(
-        "low latency",
-        "the flag is not set: the driver did not take it from multidrop",
-        "it may be root's to set: setserial PORT low_latency",
-    )
-
-
-def rs485_finding(mode: RS485Mode | None) -> Finding:
-    if mode is None:
-        return Finding(
-            "RS-485 mode", "the driver has none: the adapter itself must switch between sending and receiving"
-        )
-    if not mode.enabled:
-        return Finding(
-            "RS-485 mode",
-            "the driver has it, and it is off",
-            "if the transceiver hangs on RTS, switch it on in the device tree or with an RS-485 tool; "
-            "an adapter that switches by itself needs nothing",
-        )
-    hears = ", and hears what it sends: multidrop takes the echo out" if mode.hears_itself else ""
-    return Finding("RS-485 mode", f"on: the driver switches the direction{hears}")
 
 
 # ---- the line ----
@@ -196,18 +152,6 @@ def _echo(port: str, settings: Settings) -> Finding:
     return echo_finding(heard, build_request(Framing.RTU, request), settings)
 
 
-def echo_finding(heard: bytes, sent: bytes, settings: Settings) -> Finding:
-    if not heard:
-        return Finding("echo", f"none at {settings}: nothing came back of what was sent")
-    if heard == sent:
-        return Finding("echo", f"the adapter hears what it sends at {settings}; multidrop takes it out")
-    return Finding(
-        "echo",
-        f"{len(heard)} bytes came unasked at {settings}: {heard[:16].hex(' ').upper()}",
-        "see whether another program or master talks on this line, and whether its ends are terminated",
-    )
-
-
 def _round_trip(port: str, drive: Drive | None) -> Finding:
     if drive is None:
         return Finding(
@@ -228,28 +172,6 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
         if it.result > 0
     )
     return round_trip_finding(drive, delays)
-
-
-def round_trip_finding(drive: Drive, delays: list[float]) -> Finding:
-    """`delays` are sorted, in s, from the request's last bit to the reply's first, as seen from here."""
-    if not delays:
-        return Finding(
-            "round trip",
-            f"{drive.name} did not answer once in {ROUNDS} requests",
-            "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
-        )
-    least, median, most = delays[0], delays[len(delays) // 2], delays[-1]
-    figures = f"{least * 1e3:.1f} ms at least, {median * 1e3:.1f} in the middle, {most * 1e3:.1f} at most"
-    lost = f"; {ROUNDS - len(delays)} of {ROUNDS} requests stayed without a good reply"
-    what = f"{drive.name} begins to answer after {figures}{lost if len(delays) < ROUNDS else ''}"
-    if median - drive.response_delay > SLOW_S:
-        return Finding(
-            "round trip",
-            what,
-            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest is the adapter's, "
-            "or the drive's own parameter for the response delay",
-        )
-    return Finding("round trip", what)
 
 
 def _text(findings: list[Finding]) -> Iterator[str]:
