@@ -111,6 +111,11 @@ def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
     assert [it.so_far.misses.total() for it in watched.drives] == [12, 0, 0]
 
 
+def test_a_rested_drive_tells_why_it_is_rested(watched: WatchedPlant) -> None:
+    watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
+    assert watched.drives[2].why_silent == "no reply"
+
+
 def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
     it = WatchedPlant(a_plant(tmp_path, 1))
     it.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
@@ -198,9 +203,7 @@ def test_a_wide_overview_has_the_delays(watched: WatchedPlant) -> None:
 def test_the_page_says_how_the_drive_answers(watched: WatchedPlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
     assert lines[1] == " forward      12 missed: bad checksum 9, no reply 3"
-    assert lines[2] == (
-        " 50.0 exchanges/s   answers after 8.9 ms, p99 8.9, at most 31.0   2 late   17 bytes skipped"
-    )
+    assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
     silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), NOW))
     assert silent[2] == " 0.0 exchanges/s"
 

@@ -109,14 +109,16 @@ def _misses(reasons: Mapping[str, int]) -> str:
 
 
 def _pace(it: Watched) -> str:
-    """How it answers: as of late, and its whole history's delays."""
+    """How often it is asked as of late, and how it has answered so far."""
     so_far, delays = it.so_far, it.so_far.delays
-    told = f"{it.lately.exchanges_per_second:.1f} exchanges/s"
+    told = [f"{it.lately.exchanges_per_second:.1f} exchanges/s"]
     if delays.replies:
-        told += f"   answers after {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, at most {_ms(delays.longest)}"
+        told.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
     if so_far.late_replies:
-        told += f"   {so_far.late_replies} late"
-    return f"{told}   {so_far.skipped_bytes} bytes skipped" if so_far.skipped_bytes else told
+        told.append(f"{so_far.late_replies} late")
+    if so_far.skipped_bytes:
+        told.append(f"{so_far.skipped_bytes} bytes skipped")
+    return "  ".join(told)
 
 
 def _ms(seconds: float) -> str:

@@ -17,6 +17,7 @@ from multidrop.register import Register
 from multidrop.statistics import LineStatistics, Statistics, look
 
 HISTORY = 240  # s, a point each
+UNASKED = "not "  # so begin the reasons of misses that no request left for
 LATELY = 5.0  # s: rates are those of so long
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
@@ -31,6 +32,7 @@ class Watched:
     polled: PolledDrive
     newest: dict[str, Row] = field(default_factory=dict)  # samples, by register
     missed: dict[str, Row] = field(default_factory=dict)  # the misses that are newer than these
+    why: str = ""  # it was missed when it was asked last
     so_far: Statistics = _NOTHING
     lately: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -42,6 +44,8 @@ class Watched:
     def add(self, row: Row) -> None:
         if row.value is None:
             self.missed[row.register] = row
+            if not row.status.startswith(UNASKED):
+                self.why = row.status
         else:
             self.newest[row.register] = row
             self.missed.pop(row.register, None)
@@ -63,7 +67,7 @@ class Watched:
         """Why nothing comes, where all that is polled is missed."""
         if not self.missed or len(self.missed) < len(self.polled.polls):
             return ""
-        return max(self.missed.values(), key=lambda row: row.time).status
+        return self.why or max(self.missed.values(), key=lambda row: row.time).status
 
     @property
     def fault(self) -> str:
