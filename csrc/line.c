@@ -38,11 +38,14 @@ static int64_t early_ns(const struct md_exchange *exchange)
     return later(0, drive->delay_ns - 2 * drive->deviation_ns - exchange->character_ns / 2);
 }
 
+enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
+
 /* Longer after each failure: the drive may have become slower, or is slower than most. */
 static int64_t timeout_ns(const struct md_drive *drive)
 {
-    int64_t usual = drive->delay_ns ? drive->delay_ns + 4 * drive->deviation_ns : 4 * drive->least_timeout_ns;
-    usual = later(usual, drive->least_timeout_ns);
+    int64_t usual = 4 * drive->least_timeout_ns, margin_ns = later(4 * drive->deviation_ns, drive->least_timeout_ns / 4);
+    if (drive->delay_ns)
+        usual = later(drive->delay_ns + margin_ns, drive->least_timeout_ns);
     return clamp(usual << (drive->failures < 8 ? drive->failures : 8), 0, drive->most_timeout_ns);
 }
 
@@ -254,10 +257,24 @@ static void learn_echo(struct md_line *line, size_t reply_at)
             line->echoes = 1;
 }
 
+/* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
+static void learn_burst(struct md_line *line, size_t at, int reply_len)
+{
+    if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST && line->sight > line->burst)
+        line->burst = line->sight;
+}
+
+/* Anything came, but at most the request's echo. */
+static int has_begun(const struct md_line *line)
+{
+    return line->rx_len > 0 && !(line->rx_len == line->tx_len && is_copy(line, 0));
+}
+
 /* What is no part of this exchange, as far as anyone can tell from the rest. */
 static void cut_out(struct md_line *line, size_t at, size_t len)
 {
     tell(line, MD_NOISE, line->completion->last_ns, line->rx + at, len);
+    line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - len);
     memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
 }
@@ -280,6 +297,7 @@ static void search(struct md_line *line, int64_t now_ns)
             md_copy_message(&line->completion->reply, &reply);
             line->completion->skipped -= (uint32_t)used;
             learn_echo(line, at);
+            learn_burst(line, at, used);
             measure(line, used);
             finish(line, used, line->rx + at, (size_t)used);
             return;
@@ -303,6 +321,10 @@ static void foresee(struct md_line *line, int64_t now_ns)
     const struct md_exchange *exchange = line->exchange;
     const uint8_t *begun = line->rx + line->rx_from;
     int have = line->rx_len - line->rx_from;
+    if (have > 0 && (line->sight == 0 || line->sight_at != line->rx_from)) {
+        line->sight_at = line->rx_from;
+        line->sight = (uint16_t)have;
+    }
     int function_at = exchange->framing == MD_RTU ? 1 : 3;
     int missing = md_reply_length(exchange->framing, &exchange->request) - have;
     int may_be_exception = have <= function_at || (begun[function_at] & 0x80) || begun[function_at] >= '8';
@@ -316,6 +338,7 @@ static void forget(struct md_line *line)
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
     tell(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
+    line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
     line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);
     memmove(line->rx, line->rx + GONE, line->rx_len);
@@ -374,7 +397,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             line->wake_ns = line->ready_ns;
             return MD_WAIT;
         }
-        line->wake_ns = line->give_up_ns;
+        line->wake_ns = has_begun(line) ? line->give_up_ns : line->begun_by_ns;
         line->looks++;
         if (now_ns >= line->wake_ns)
             line->state = ENDING;
@@ -422,7 +445,15 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
     int64_t reply_ns = reply_len * exchange->character_ns;
     line->give_up_ns = line->quiet_ns + timeout_ns(exchange->drive) + reply_ns;
     line->ready_ns = exchange->drive->delay_ns ? line->quiet_ns + early_ns(exchange) + reply_ns : 0;
-    line->looks = 0;
+    line->begun_by_ns = line->give_up_ns;
+    if (line->burst > 0 && exchange->drive->failures == 0) {
+        int64_t begun_ns = timeout_ns(exchange->drive) + (line->burst + 2) * exchange->character_ns;
+        if (line->quiet_ns + begun_ns < line->begun_by_ns)
+            line->begun_by_ns = line->quiet_ns + begun_ns;
+        if (line->begun_by_ns + begun_ns < line->ready_ns) /* a look is cheaper than so long a wait in vain */
+            line->ready_ns = line->begun_by_ns;
+    }
+    line->looks = line->sight = 0;
     line->state = LISTENING;
 }
 
@@ -470,6 +501,8 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         at += keep(line, bytes + at, len - at);
         search(line, now_ns);
     }
+    if (line->state == ENDING && now_ns < line->give_up_ns)
+        line->state = LISTENING;
     if (line->state == LISTENING)
         foresee(line, now_ns);
 }

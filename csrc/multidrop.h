@@ -189,7 +189,8 @@ struct md_line {
     int64_t silence_ns; /* demanded after what went last */
     int64_t wake_ns;
     int64_t give_up_ns; /* until then it waits for a babbling line to fall silent, or for the reply */
-    int64_t ready_ns;   /* before then the reply cannot be whole */
+    int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
+    int64_t ready_ns;   /* before then nothing is worth reading */
     struct md_drive *late; /* the first of those whose answers may still come */
     const struct md_exchange *exchange;
     struct md_completion *completion;
@@ -199,6 +200,8 @@ struct md_line {
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
     int looks;                /* how often the line was looked at since the request left */
     struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */
+    uint16_t sight_at, sight; /* where the reply may begin, and what there was of it at the first sight */
+    uint16_t burst;           /* at most so many characters wait in the adapter; 0: it may be a whole reply */
     uint8_t tx[513], rx[1026];
 };
 

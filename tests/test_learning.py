@@ -109,24 +109,29 @@ def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Respo
     assert drive.response_delay < 10e-3
 
 
-def time_out(line: LineDriver, drive: Respondent, request: Message = READ) -> int:
-    """How long after the request's last bit a silent drive is given up, its reply's own time left out."""
+def given_up(line: LineDriver, drive: Respondent, request: Message = READ) -> int:
+    """How long after the request's last bit a silent drive is given up."""
     left = ask(line, drive, request)
     line.wait_until_done()
     assert line.completion.result == Result.NO_REPLY
-    return line.now - left - 7 * CHARACTER
+    return line.now - left
+
+
+def time_out(line: LineDriver, drive: Respondent, request: Message = READ) -> int:
+    """The same without its reply's own time, for which a line waits that knows nothing of its adapter."""
+    return given_up(line, drive, request) - 7 * CHARACTER
 
 
 def test_a_time_out_follows_the_drive_s_own_delay(line: LineDriver, drive: Respondent) -> None:
     for number in range(200):
         answer(line, drive, (40 + number % 3) * MS)
-    assert 40 * MS < time_out(line, drive) < 60 * MS
+    assert 45 * MS < given_up(line, drive) - AWAITED < 60 * MS
 
 
 def test_a_time_out_is_never_under_its_floor(line: LineDriver, drive: Respondent) -> None:
     for _ in range(100):
         answer(line, drive, MS // 10)
-    assert time_out(line, drive) == LEAST
+    assert given_up(line, drive) == LEAST + AWAITED
 
 
 def test_each_failure_makes_the_next_time_out_longer_up_to_the_ceiling(
@@ -141,6 +146,88 @@ def test_each_failure_makes_the_next_time_out_longer_up_to_the_ceiling(
     line.now = drive.late_until_ns
     answer(line, drive, 5 * MS)
     assert drive.failures == 0
+
+
+# ---- nothing has begun ----
+
+AWAITED = 3 * CHARACTER  # where characters come one by one: that one, and two
+LONG = Message(1, 3, 0, 100)  # with a reply of 205 characters
+
+
+def gathered(line: LineDriver, drive: Respondent, request: Message = READ) -> None:
+    """A whole exchange, whose reply comes when it is whole."""
+    left = ask(line, drive, request)
+    text = build_reply(Framing.RTU, Message(1, 3, data=bytes(2 * request.count)))
+    while line.now < left + 15 * MS + len(text) * CHARACTER:
+        assert line.listens
+        line.now = min(left + 15 * MS + len(text) * CHARACTER, max(line.wake, line.now + CHARACTER))
+    line.receive(text)
+    assert line.want == "done"
+
+
+@pytest.mark.parametrize("request_", [READ, LONG], ids=["short", "long"])
+def test_a_reply_that_has_not_begun_is_not_waited_for_to_its_end(
+    line: LineDriver, drive: Respondent, request_: Message
+) -> None:
+    answer(line, drive, 2 * MS)
+    assert given_up(line, drive, request_) == LEAST + AWAITED
+
+
+def test_a_reply_that_has_begun_is_waited_for(line: LineDriver, drive: Respondent) -> None:
+    answer(line, drive, 2 * MS)
+    left = ask(line, drive, LONG)
+    text = build_reply(Framing.RTU, Message(1, 3, data=bytes(200)))
+    line.now = left + LEAST + CHARACTER
+    line.receive(text[:1])
+    while line.listens:
+        line.now += 10 * CHARACTER
+        arrived = min(len(text), (line.now - left - LEAST) // CHARACTER)
+        line.receive(text[line.completion.skipped : arrived])
+    assert line.completion.result == len(text)
+
+
+def test_a_drive_that_has_just_failed_is_given_all_its_time(line: LineDriver, drive: Respondent) -> None:
+    answer(line, drive, 2 * MS)
+    given_up(line, drive)
+    line.now = drive.late_until_ns
+    assert given_up(line, drive) == 2 * LEAST + 7 * CHARACTER
+
+
+def test_the_adapter_s_echo_is_no_beginning(line: LineDriver, drive: Respondent) -> None:
+    answer(line, drive, 2 * MS)
+    left = ask(line, drive)
+    line.receive(build_request(Framing.RTU, READ))
+    line.wait_until_done()
+    assert line.now == left + LEAST + AWAITED
+
+
+@pytest.mark.parametrize("request_", [READ, LONG], ids=["short", "long"])
+def test_an_adapter_that_gathers_replies_is_waited_for(
+    line: LineDriver, drive: Respondent, request_: Message
+) -> None:
+    """Nothing of a reply is seen before its end."""
+    for _ in range(20):
+        gathered(line, drive, request_)
+    assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
+
+
+def test_noise_does_not_tell_of_the_adapter(line: LineDriver, drive: Respondent) -> None:
+    ask(line, drive)
+    line.receive(b"\x01")
+    line.receive(b"\x03\x07")
+    line.now += 20 * MS
+    line.receive(reply())
+    assert line.want == "done"
+    assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
+
+
+def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Respondent) -> None:
+    answer(line, drive, 2 * MS)
+    given_up(line, drive)
+    line.begin(exchange(OTHER, drive))
+    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    line.receive(reply(1111))
+    assert (drive.tally().late, drive.late_until_ns) == (1, 0)
 
 
 # ---- answers that come late ----
