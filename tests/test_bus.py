@@ -11,8 +11,8 @@ import pytest
 from lines import Faulty, proof
 from toy import Fault, Toy
 
-from multidrop.bus import READ_ATTEMPTS, Bus
-from multidrop.core import Framing
+from multidrop.bus import READ_ATTEMPTS, Bus, exchange
+from multidrop.core import Framing, Message
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.innovert_ibd import Control
@@ -135,6 +135,21 @@ def test_the_bus_has_defaults_for_drives_without_their_own() -> None:
 
 
 # ---- writing ----
+
+
+def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
+    """One bit is added, as to the standard's own."""
+    drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
+    with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
+        for at in (1, 2):
+            drive = bus.attach(ErmanERG220, at)
+            assert drive.needed_silence() == 600e-6
+            assert exchange(drive, Message(at, 4, 1, 1), bus.respondent(drive)).c.silence_ns == 626042
+            bus.read(drive, drive.output_current)
+        assert bus.attach(ErmanERG220, 3, silence=1e-3).needed_silence() == 1e-3
+        assert bus.attach(ErmanERG220, 4, silence=None).needed_silence() == 1.75e-3
+        with pytest.raises(ValueError, match=r"^silence 300 us is shorter than 1\.5 characters at 38400 8N1"):
+            bus.attach(ErmanERG220, 5, silence=300e-6)
 
 
 def test_a_write_returns_what_the_drive_then_holds() -> None:

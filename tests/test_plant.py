@@ -132,6 +132,40 @@ def test_lines_drives_and_polls_are_read(load: Load) -> None:
     assert fan_1.drive.settings == Settings(38400, "8N1")
 
 
+SILENT = """\
+[[line]]
+name = "hall-1"
+port = "/dev/ttyUSB0"
+baudrate = 38400
+format = "8N1"
+silence = "500 us"
+
+[[line.drive]]
+name = "quick"
+model = "erman-er-g-220"
+address = 1
+
+[[line.drive]]
+name = "slow"
+model = "innovert-ibd"
+address = 2
+
+[[line.drive]]
+name = "text"
+model = "delixi-modbus"
+framing = "ascii"
+format = "7N2"
+address = 3
+"""
+
+
+def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(load: Load) -> None:
+    (line,) = load(SILENT).lines
+    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([500e-6, 10e-3, 0])
+    (line,) = load(SILENT.replace('silence = "500 us"\n', "")).lines
+    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
+
+
 def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [
@@ -173,13 +207,27 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ("[line]", "line = {} is not right; write [[line]], in two brackets, with its name, port and drives"),
         (
             "line = [3]",
-            "line number 1: 3 is not a table with name, port, baudrate, format, drive",
+            "line number 1: 3 is not a table with name, port, baudrate, format, silence, drive",
         ),
         (
             HEAD,
             "line \"L\": 'drive' is missing; add [[line.drive]], in two brackets, "
             "with its name, model and address",
         ),
+        (
+            HEAD + 'silence = "0 us"\n' + TOY,
+            'line "L": \'0 us\' is not a duration above 0, such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + "silence = 0.0005\n" + TOY,
+            'line "L": silence = 0.0005 is not right; write silence = "500 us"',
+        ),
+        (
+            HEAD + 'silence = "500 us"\n' + TOY,
+            'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, which may pass '
+            "within a frame: it is to be 1563 us or more",
+        ),
+        (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
         (HEAD + "baudrate = 7\n" + TOY, 'line "L": baud rate 7 is outside 50 to 4000000'),
         (
             HEAD + 'format = "8X1"\n' + TOY,

@@ -49,6 +49,12 @@ def test_a_cycle_is_characters_delays_and_silences() -> None:
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
 
 
+def test_a_shorter_silence_is_reckoned_with() -> None:
+    usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
+    cycles = [predict(asked(it, None, "output_current")).cycle for it in (usual, short)]
+    assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
+
+
 def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
     """Of three gaps two are the IBD's, whatever t3.5 is at the other drives' baud rate."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)

@@ -34,11 +34,11 @@ class Bus:
     """A line and the drives on it, which may differ in family, baud rate and format.
 
     `port` is a device such as /dev/ttyUSB0 or any pyserial URL; `baudrate` and `format` replace the
-    families' defaults for drives that are attached without their own. Raises LineError when the
-    port cannot be opened. Writes that may wear an EEPROM are counted in `ledger`, a file that all
-    processes share, and all writes are noted in the file `audit`. A write whose turn does not come
-    within `expiry` seconds is not sent. Leaving the `with` block closes the port and sends nothing,
-    unless `stop_on_exit` was called.
+    families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
+    t3.5 between frames, if all of them bear it. Raises LineError when the port cannot be opened. Writes
+    that may wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are
+    noted in the file `audit`. A write whose turn does not come within `expiry` seconds is not sent.
+    Leaving the `with` block closes the port and sends nothing, unless `stop_on_exit` was called.
     """
 
     def __init__(
@@ -47,12 +47,14 @@ class Bus:
         *,
         baudrate: int | None = None,
         format: str | None = None,
+        silence: float | None = None,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = 1.0,
     ) -> None:
         self.baudrate = baudrate
         self.format = format
+        self.silence = silence
         self.drives: list[Drive] = []
         self.line = Line(port)
         try:
@@ -100,7 +102,8 @@ class Bus:
         if isinstance(drive, type):
             if address is None:
                 raise TypeError(f"attach({drive.__name__}, address=...): which address does it have?")
-            details = {"baudrate": self.baudrate, "format": self.format, **details}
+            line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
+            details = {**line, **details}
             drive = drive(address, **details)
         for other in self.drives:
             if other.address == drive.address:

@@ -7,6 +7,7 @@ attached to a bus, a verb is carried out there.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
@@ -60,6 +61,7 @@ __all__ = [  # also the names of other modules that a family's file needs
     "write",
 ]
 
+LONGEST_SILENCE = 1.0  # s, that a line may be given
 START_TIME = 5.0  # s in which a motor that was started is to be seen to run
 
 T = TypeVar("T", bound=float)
@@ -136,9 +138,10 @@ class Drive:
     """One drive on a line; its class is the family: the table of the manual, in the manual's order.
 
     `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
-    family's. Options are facts that only the owner knows (see `options`); `ram` names the registers
-    that its owner knows to be kept in RAM although the document does not say so.
-    Raises ValueError for anything the family's document does not allow.
+    family's. `silence`, in s, takes the place of the standard's t3.5 where all drives on the line bear
+    it; what the family's document demands is kept all the same. Options are facts that only the owner
+    knows (see `options`); `ram` names the registers that its owner knows to be kept in RAM although the
+    document does not say so. Raises ValueError for anything the family's document does not allow.
     """
 
     model: ClassVar[str] = ""
@@ -193,6 +196,7 @@ class Drive:
         framing: Framing | str | None = None,
         baudrate: int | None = None,
         format: str | None = None,
+        silence: float | None = None,
         ram: Iterable[str] = (),
         **options: float,
     ) -> None:
@@ -203,6 +207,8 @@ class Drive:
             self._checked("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
             self._checked("format", formats[0] if format is None else format, formats),
         )
+        self.agreed_silence = silence
+        self._check_silence()
         self.response_delay = max(
             self.response_delay, self.response_delay_characters * self.settings.character
         )
@@ -280,8 +286,27 @@ class Drive:
 
     def needed_silence(self) -> float:
         """Silence in s that this drive demands before a request and after its reply."""
-        t3_5 = self.settings.t3_5 if self.framing is Framing.RTU else 0.0
-        return max(t3_5, self.silence, self.silence_characters * self.settings.character)
+        own = max(self.silence, self.silence_characters * self.settings.character)
+        if self.framing is not Framing.RTU:
+            return own
+        return max(self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence, own)
+
+    def _check_silence(self) -> None:
+        """A shorter one would end frames in their middle: pauses within them may be that long."""
+        agreed, least = self.agreed_silence, 1.5 * self.settings.character
+        if agreed is None:
+            return
+        if (
+            isinstance(agreed, bool)
+            or not isinstance(agreed, (int, float))
+            or not 0 <= agreed <= LONGEST_SILENCE
+        ):
+            raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")
+        if self.framing is Framing.RTU and self.needed_silence() < least:
+            raise ValueError(
+                f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {self.settings}, which may "
+                f"pass within a frame: it is to be {math.ceil(least * 1e6)} us or more"
+            )
 
     # ---- verbs; each family replaces those that its document has ----
 

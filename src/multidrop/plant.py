@@ -128,6 +128,7 @@ _LINE = {
     "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
     "baudrate": Key(int, "baudrate = 9600"),
     "format": Key(str, 'format = "8N1"'),
+    "silence": Key(str, 'silence = "500 us"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 _DRIVE = {
@@ -159,7 +160,9 @@ def _line(table: Any, place: Place) -> Line:
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
         "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
     }
-    drives = [_drive(drive, settings, at) for drive, at in place.inside("drive", given.get("drive", []))]
+    silence = place.attempt(parse_duration, given["silence"]) if "silence" in given else None
+    inherited = {**settings, "silence": silence}
+    drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
     return Line(name, port, **settings, drives=tuple(drive for drive in drives if drive is not None))
 
 
@@ -217,6 +220,8 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
+        if key not in right:  # what it may be depends on the others
+            continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)
 

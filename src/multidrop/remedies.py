@@ -105,6 +105,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
         framing=drive.framing,
         baudrate=baudrate,
         format=drive.settings.format,
+        silence=drive.agreed_silence,
     )
 
 
