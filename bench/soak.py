@@ -140,6 +140,7 @@ class Soak:
             f"{row.time / 1e9:.3f} {row.drive}.{row.register} = {row.value:g}, not "
             f"{self.truth[row.drive, row.register]:g}: {', '.join(map('.'.join, whose[:4])) or 'no register'}"
         )
+        print(self.faults[-1], flush=True)
 
     def run_period(self, seconds: float) -> Period:
         period = Period()

@@ -60,6 +60,9 @@ class LineDriver:
     def lose(self, error: int) -> None:
         lib.md_line_abandon(self._line, lib.MD_LINE_LOST, error)
 
+    def expire(self) -> None:
+        lib.md_line_abandon(self._line, lib.MD_EXPIRED, 0)
+
     def wait_until_write(self) -> bytes:
         """Let the silence pass, as the engine does, and send the request."""
         for _ in range(8):

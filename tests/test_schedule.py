@@ -342,3 +342,13 @@ def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> Non
     for it in made.jobs:
         if it.period_ns:
             assert sum(1 for other, _, _ in done if other is it) >= 2900 * MS // it.period_ns
+
+
+def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come() -> None:
+    """Two questions between two looks, the first unanswered: else it is asked in vain without end."""
+    made = schedule(quick := job(1), timed := job(2, period_ms=10))
+    fail(made, 1, 0, now_ms=0, late_until_ms=100)
+    fail(made, 2, 0, now_ms=0, late_until_ms=60)
+    assert take(made, 10, 40) == []
+    assert {it.drive for it, _ in take(made, 70, 20)} == {timed.drive}
+    assert {it.drive for it, _ in take(made, 101, 50)} == {quick.drive, timed.drive}

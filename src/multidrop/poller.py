@@ -234,7 +234,7 @@ class _PolledLine:
                 self.schedule.add(part, now)
 
     def _keep_busy(self, port: Port, now: int) -> None:
-        cycle = self.schedule.cycle()
+        cycle = self.schedule.cycle(now)
         if not cycle:
             self._top_up(port, now)
         if cycle != self._cycle or port.repeating != bool(cycle):

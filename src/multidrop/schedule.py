@@ -76,6 +76,7 @@ class Schedule(Generic[J]):
     _health: dict[int, _Health] = field(default_factory=dict)
     _number: int = 0
     _ill: bool = False
+    _late_until_ns: int = 0  # of all drives
 
     def add(self, job: J, now_ns: int) -> None:
         self.jobs.append(job)
@@ -103,9 +104,9 @@ class Schedule(Generic[J]):
 
     # ---- what comes next ----
 
-    def cycle(self) -> list[J]:
+    def cycle(self, now_ns: int) -> list[J]:
         """What is to be carried out again and again, where that is all: no slots, and all drives answer."""
-        return [] if self._ill or self._waiting or self._begun else list(self._turn)
+        return [] if self._must_look(now_ns) or self._waiting or self._begun else list(self._turn)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
         """What keeps the line busy from `start_ns`, when it has done all it was given, to the horizon.
@@ -144,7 +145,7 @@ class Schedule(Generic[J]):
 
     def _due(self, at_ns: int) -> J | None:
         """The job whose slot ends first; where all can wait for it, rather one of the kind that was last."""
-        if self._ill:
+        if self._must_look(at_ns):
             for job in [it for it in self._begun if self._is_asleep(it, at_ns)]:
                 self._begun.remove(job)
                 self._pass(job)
@@ -191,9 +192,13 @@ class Schedule(Generic[J]):
 
     # ---- drives that are silent ----
 
+    def _must_look(self, at_ns: int) -> bool:
+        """Whether one may be asleep."""
+        return self._ill or at_ns < self._late_until_ns
+
     def _is_asleep(self, job: J, at_ns: int) -> bool:
         health = self._health[job.drive]
-        return health.rest_ns > 0 or at_ns < health.asleep_until_ns
+        return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
 
     def _probe(self, at_ns: int) -> J | None:
         """The shortest question to a drive whose rest is over; then it rests until the outcome is known."""
@@ -211,8 +216,8 @@ class Schedule(Generic[J]):
     def observe(self, drive: int, failures: int, now_ns: int, *, late_until_ns: int, cost_ns: int) -> None:
         """How often in a row a drive has not answered by now, and what asking it in vain costs.
 
-        Until `late_until_ns` its answer to an earlier question may come, so it is asked nothing. When
-        that has come, late as it is, the drive can be asked at once.
+        Until `late_until_ns` its answer to an earlier question may come, so it is asked nothing, even
+        if it has answered since. When that has come, late as it is, the drive can be asked at once.
         """
         health = self._health[drive]
         has_answered_late = late_until_ns < health.late_until_ns
@@ -225,6 +230,7 @@ class Schedule(Generic[J]):
         elif has_answered_late:
             health.asleep_until_ns = now_ns
         self._ill = any(it.failures for it in self._health.values())
+        self._late_until_ns = max(it.late_until_ns for it in self._health.values())
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self._health[drive]

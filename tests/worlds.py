@@ -1,0 +1,295 @@
+"""A poller and a simulated line on a clock of their own: an hour of the line takes seconds.
+
+The poller is the real one with its thread, plan and schedule; the line is the core's state machine.
+In place of the port, the core's thread and the clock is a world, in which time passes only while
+the test lets it, and never because the machine is busy.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from line_driver import LineDriver
+from lines import PATIENCE, line, plant, rows_of
+
+from multidrop import bus, poller
+from multidrop.batch import Row
+from multidrop.core import Columns, Completion, Exchange, Message, new_completion
+from multidrop.drive import Drive
+from multidrop.errors import LineError
+from multidrop.exchanges import NO_ROWS, exchange
+from multidrop.plant import PolledDrive
+from multidrop.poller import Poller
+from multidrop.sim import HostileWire
+
+S = 1_000_000_000
+BEGIN_NS = 1000 * S
+UTC_NS = 1_700_000_000 * S
+NEVER = 1 << 62
+ENODEV = 19
+
+
+class WorldWire(HostileWire):
+    """A hostile wire whose port is nothing that the system knows."""
+
+    def open(self) -> None:
+        path = "world"
+        port: Any = SimpleNamespace(path=path, close=lambda: None)
+        self.port = port
+
+
+class WorldPort:
+    """What the poller sees of an open port (core.Port), and what the core's thread does for it."""
+
+    room = 256
+
+    def __init__(self, world: World) -> None:
+        self.lost = False
+        self.urgent: deque[Exchange] = deque()
+        self.answers: list[Completion] = []  # to those
+        self._world = world
+        self._driver = LineDriver()
+        self._driver.now = world.now
+        self._queue: deque[tuple[Exchange, int]] = deque()
+        self._done: deque[tuple[Exchange, Any]] = deque()
+        self._under_way: Exchange | None = None
+        self._is_urgent = False
+        self._heard = b""
+        self._has_ended = False
+
+    # ---- the poller's side ----
+
+    @property
+    def pending(self) -> int:
+        return len(self._queue) + (self._under_way is not None and not self._is_urgent)
+
+    def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
+        assert self.pending + len(self._done) + len(exchanges) <= self.room
+        self._queue += zip(exchanges, not_before_ns, strict=True)
+        return len(exchanges)
+
+    def reap(self, columns: Columns, utc_minus_monotonic_ns: int) -> int:
+        count = 0
+        while self._done:
+            exchange, found = self._done[0]
+            if exchange.block is None or not columns.add(exchange.block, found, utc_minus_monotonic_ns):
+                break
+            self._done.popleft()
+            count += 1
+        return count
+
+    def end(self) -> bool:
+        self._has_ended = True
+        return self._under_way is not None and not self._is_urgent
+
+    def stop(self) -> None:
+        pass
+
+    # ---- the core's side ----
+
+    def hang_up(self) -> None:
+        """What is under way fails, and so does all that is queued."""
+        self.lost = True
+        while self._under_way or self._queue or self.urgent:
+            if not self._under_way:
+                self._take_up()
+            self._driver.lose(ENODEV)
+            self._finish()
+
+    def advance(self, heard: bytes) -> int:
+        """Carry on until there is nothing to do but wait; until when."""
+        driver = self._driver
+        driver.now = self._world.now
+        self._heard += heard
+        for _ in range(10_000):
+            if not self._under_way and not self._take_up():
+                self._listen()
+                return self._queue[0][1] if self._queue and not self._has_ended else NEVER
+            want = driver.want
+            if want == "done":
+                self._finish()
+            elif want == "write":
+                self._listen()
+                assert self._under_way
+                self._world.send(driver.take(), self._under_way.settings[0])
+                if self.lost:
+                    return NEVER
+            elif want == "read" and self._heard:
+                self._listen()
+            elif want == "wait" or driver.wake > driver.now:
+                return driver.wake
+        raise AssertionError("the line never waits")
+
+    def _listen(self) -> None:
+        heard, self._heard = self._heard, b""
+        self._driver.receive(heard)
+
+    def _take_up(self) -> bool:
+        now = self._world.now
+        self._is_urgent = bool(self.urgent)
+        if self.urgent:
+            exchange, due_ns = self.urgent.popleft(), now
+        elif self._queue and not self._has_ended and (self._queue[0][1] <= now or self.lost):
+            exchange, due_ns = self._queue.popleft()
+        else:
+            return False
+        self._driver.found = new_completion()
+        self._driver.begin(exchange)
+        self._under_way = exchange
+        if exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
+            again = (at_ns for other, at_ns in self._queue if other is exchange)
+            if now >= next(again, NEVER):
+                self._driver.expire()
+        return True
+
+    def _finish(self) -> None:
+        assert self._under_way
+        if self._is_urgent:
+            self.answers.append(self._driver.completion)
+        else:
+            self._done.append((self._under_way, self._driver.found))
+        self._under_way = None
+        if self.pending in (0, self.room // 4):
+            self._world.has_notice = True
+
+
+class WorldLine:
+    """What the bus sees of a line (line.Line)."""
+
+    def __init__(self, world: World) -> None:
+        self.port = "world"
+        self._world = world
+        self.queue: WorldPort | None = None
+        self.reopen()
+
+    def require(self, settings: tuple[int, str]) -> None:
+        pass
+
+    def overruns(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.queue = self._world.port = None
+
+    def reopen(self) -> None:
+        self.close()
+        if self._world.wire.port is None:
+            raise LineError(self.port, "it is not there")
+        self.queue = self._world.port = WorldPort(self._world)
+
+
+class World:
+    """A wire, and a poller of drives on it: `run` lets time pass, and returns the rows that come of it."""
+
+    def __init__(self, wire: WorldWire, drives: Sequence[PolledDrive]) -> None:
+        self.now = self._limit = BEGIN_NS
+        self.wire = wire
+        self.port: WorldPort | None = None
+        self.has_notice = False
+        self._leaving = False
+        self._failure: BaseException | None = None
+        self._turn = threading.Condition()
+        self._threads = {*threading.enumerate()}
+        patch = self._patch = pytest.MonkeyPatch()
+        patch.setattr(bus, "Line", lambda port: WorldLine(self))
+        for module in (bus, poller):
+            patch.setattr(module, "now_ns", lambda: self.now)
+        patch.setattr(poller, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
+        patch.setattr(poller, "utc_minus_monotonic_ns", lambda: UTC_NS)
+        patch.setattr(poller, "await_notice", self._await_notice)
+        wire.open()
+        self.poller = Poller(plant(line("world", *drives)))
+
+    def __enter__(self) -> World:
+        self.poller.__enter__()
+        return self
+
+    def __exit__(self, *failure: Any) -> None:
+        with self._turn:
+            self._leaving = True
+            self._turn.notify_all()
+        self.poller.close()
+        self._patch.undo()
+
+    @property
+    def seconds(self) -> float:
+        return (self.now - BEGIN_NS) / S
+
+    def run(self, seconds: float) -> list[Row]:
+        """Let so many seconds pass."""
+        with self._turn:
+            self._limit += round(seconds * S)
+            self._turn.notify_all()
+            assert self._turn.wait_for(lambda: self._failure or self._rests, PATIENCE)
+        if self._failure:
+            raise self._failure
+        return rows_of(self.poller)
+
+    def command(self, drive: Drive, request: Message) -> None:
+        """Have a request carried out ahead of the polling, if the port is there."""
+        ours = self.poller.bus("line")
+        if self.port:
+            self.port.urgent.append(exchange(drive, request, ours.respondent(drive), NO_ROWS))
+
+    # ---- the poller's thread ----
+
+    @property
+    def _rests(self) -> bool:
+        return self.now >= self._limit and self._is_waiting
+
+    _is_waiting = False
+
+    def _await_notice(self, seconds: float) -> None:
+        for thread in {*threading.enumerate()} - self._threads - {threading.current_thread()}:
+            thread.join()  # opens the port again: in the world that takes no time
+        try:
+            with self._turn:
+                self._is_waiting = True
+                self._turn.notify_all()
+                while self.now >= self._limit and not self._leaving:
+                    self._turn.wait()
+                self._is_waiting = False
+            if not self._leaving:
+                self._look(min(self.now + round(seconds * S), self._limit))
+        except BaseException as failure:
+            self._failure = failure
+            with self._turn:
+                self._turn.notify_all()
+            raise
+
+    def _pass_until(self, end_ns: int) -> None:
+        while self.now < end_ns:
+            self._look(end_ns)
+
+    def _look(self, end_ns: int) -> None:
+        """Let time pass until then, or until the port wants more."""
+        self.has_notice = False
+        while True:
+            wake = self._settle()
+            if self.has_notice or self.now >= end_ns:
+                return
+            self.now = min(max(wake, self.now + 1), end_ns)
+
+    def _settle(self) -> int:
+        """All that happens now; when something happens next."""
+        heard = self.wire.advance(self.now / S)
+        if self.port and not self.port.lost and self.wire.port is None:
+            self.port.hang_up()
+            self.has_notice = True
+        wake = NEVER
+        if self.port and not self.port.lost:
+            wake = self.port.advance(heard)
+        at = self.wire.wake
+        return wake if at is None else min(wake, -int(-at * S // 1))
+
+    def send(self, request: bytes, baudrate: int) -> None:
+        """What the client sends, to the drives; the port may be gone with it."""
+        self.wire.receive(request, self.now / S, baudrate)
+        if self.wire.port is None and self.port:
+            self.port.hang_up()
+            self.has_notice = True
