@@ -103,10 +103,10 @@ class HostileWire(Wire):
         elif self._strikes("merge"):
             self._held = Transmission(data, begin + self._up_to(self.faults.late), character)
             return
+        elif self._strikes("delay"):
+            begin += self._up_to(self.faults.late)
         if self._strikes("twice"):
             data += data
-        if self._strikes("delay"):
-            begin += self._up_to(self.faults.late)
         if len(data) > 1 and self._strikes("split"):
             at = self._random.randrange(1, len(data))
             super()._send(data[:at], begin, character)
