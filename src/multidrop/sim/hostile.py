@@ -78,9 +78,11 @@ class HostileWire(Wire):
         super().receive(self._damaged(chunk), now, baudrate)
 
     def _deliver(self, ears: Ears, frames: Sequence[Frame]) -> None:
+        if not frames:
+            return
         before = self._running()
         super()._deliver(ears, frames)
-        if len(self._running() - before) and self._strikes("start_noise"):
+        if self._running() - before and self._strikes("start_noise"):
             self._make_noise(frames[-1].end, ears.receiver.character)
 
     def _running(self) -> set[SimulatedDrive]:
