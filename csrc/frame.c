@@ -22,16 +22,16 @@ enum { COIL = 0x05, LOOPBACK = 0x08 };
 
 static const struct function {
     uint8_t request, reply; /* enum shape */
-    uint8_t unit_bits;      /* BIT or WORD: what count counts */
+    uint8_t unit_bits;      /* BIT or WORD: what count counts, where there is one */
     uint16_t most;          /* the largest count */
 } functions[] = {
     [0x01] = {RANGE, DATA, BIT, 2000},
     [0x02] = {RANGE, DATA, BIT, 2000},
     [0x03] = {RANGE, DATA, WORD, 125},
     [0x04] = {RANGE, DATA, WORD, 125},
-    [0x05] = {ECHO, ECHO, BIT, 1},
-    [0x06] = {ECHO, ECHO, WORD, 1},
-    [0x08] = {ECHO, ECHO, WORD, 1},
+    [0x05] = {.request = ECHO, .reply = ECHO},
+    [0x06] = {.request = ECHO, .reply = ECHO},
+    [0x08] = {.request = ECHO, .reply = ECHO},
     [0x0F] = {RANGE_DATA, RANGE, BIT, 1968},
     [0x10] = {RANGE_DATA, RANGE, WORD, 123},
 };
@@ -50,7 +50,7 @@ enum { RUN_COMMAND = 2, STATE_QUERY = 3, PARAMETER_QUERY = 7, CANNOT_EXECUTE = 0
 
 static const struct function *find_function(uint8_t code)
 {
-    static const struct function none = {NONE, NONE, 0, 0};
+    static const struct function none = {.request = NONE, .reply = NONE};
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
 }
 
@@ -98,8 +98,6 @@ static size_t put_body(int shape, const struct md_message *message, uint8_t *bod
         put16(body + 4, message->count);
         data_at = 6;
     }
-    if (shape == RANGE)
-        return data_at;
     if (shape == DATA || shape == RANGE_DATA)
         body[data_at++] = (uint8_t)message->data_len;
     memcpy(body + data_at, message->data, message->data_len);
@@ -337,7 +335,7 @@ static int is_reply(int framing, const struct md_message *message)
         return framing != MD_DELIXI || is_delixi_refusal(message->exception);
     switch (reply_shape(framing, message->function)) {
     case RANGE:
-        return is_range(function, message);
+        return is_range(function, message) && message->data_len == 0;
     case DATA:
         return message->data_len >= 1 && message->data_len <= data_bytes(function, function->most) &&
                8 * message->data_len % function->unit_bits == 0;

@@ -185,8 +185,11 @@ static const struct {
 } requests[] = {
     {"125 registers", MD_RTU, 8, {.address = 1, .function = 3, .count = 125}},
     {"126 registers", MD_RTU, 0, {.address = 1, .function = 3, .count = 126}},
+    {"125 input registers", MD_RTU, 8, {.address = 1, .function = 4, .count = 125}},
+    {"126 input registers", MD_RTU, 0, {.address = 1, .function = 4, .count = 126}},
     {"no register", MD_RTU, 0, {.address = 1, .function = 4}},
     {"2000 bits", MD_ASCII, 17, {.address = 1, .function = 1, .count = 2000}},
+    {"2000 inputs", MD_RTU, 8, {.address = 1, .function = 2, .count = 2000}},
     {"2001 bits", MD_RTU, 0, {.address = 1, .function = 2, .count = 2001}},
     {"to the last register", MD_RTU, 8, {.address = 1, .function = 3, .start = 0xFFFF, .count = 1}},
     {"past the last register", MD_RTU, 0, {.address = 1, .function = 3, .start = 0xFFFF, .count = 2}},
@@ -222,6 +225,7 @@ static const struct {
     {"half a register", MD_RTU, 0, {.address = 1, .function = 4, .data_len = 3}},
     {"nothing", MD_RTU, 0, {.address = 1, .function = 3}},
     {"a byte of bits", MD_RTU, 6, {.address = 1, .function = 1, .data_len = 1}},
+    {"2000 inputs", MD_RTU, 255, {.address = 1, .function = 2, .data_len = 250}},
     {"an exception", MD_RTU, 5, {.address = 1, .function = 3, .exception = 2}},
     {"words written", MD_RTU, 8, {.address = 1, .function = 0x10, .count = 123}},
     {"too many words written", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 124}},
@@ -244,6 +248,49 @@ static void check_builders(void)
         for (size_t room = 0; room <= MD_MOST_FRAME; room++)
             CHECK(build(framing, message, page_end() - room, room) ==
                   (length && room >= (size_t)length ? length : MD_BAD_REQUEST));
+    }
+}
+
+/* ---- how soon bytes tell ---- */
+
+static const struct {
+    const char *name, *bytes; /* all but the last are no verdict yet */
+    int framing, result;
+    struct md_message request; /* none: the bytes are a request's */
+} verdicts[] = {
+    {"no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {0}},
+    {"no function, as text", ":012B", MD_ASCII, MD_BAD_FUNCTION, {0}},
+    {"an exception's function", "01 83", MD_RTU, MD_BAD_FUNCTION, {0}},
+    {"what only the drive may say", ":01F0", MD_DELIXI, MD_BAD_FUNCTION, {0}},
+    {"a word more than may be written", "01 10 00 00 00 7C F8", MD_RTU, MD_BAD_LENGTH, {0}},
+    {"a byte less than the words written", "01 10 00 00 00 02 03", MD_RTU, MD_BAD_LENGTH, {0}},
+    {"a byte less, as text", ":01100000000203", MD_ASCII, MD_BAD_LENGTH, {0}},
+    {"no colon", "01", MD_ASCII, MD_NO_START, {0}},
+    {"no digit", ":0G", MD_ASCII, MD_BAD_CHARACTER, {0}},
+    {"no digit in the checksum", ":0106001012349g", MD_ASCII, MD_BAD_CHARACTER, {0}},
+    {"no carriage return", ":010600101234A3\\n", MD_ASCII, MD_BAD_CHARACTER, {0}},
+    {"no line feed", ":010600101234A3\\r\\r", MD_ASCII, MD_BAD_CHARACTER, {0}},
+    {"another drive", "02", MD_RTU, MD_BAD_ADDRESS, {.address = 1, .function = 3, .count = 2}},
+    {"another drive, as text", ":02", MD_DELIXI, MD_BAD_ADDRESS, {.address = 1, .function = 7, .data_len = 4}},
+    {"an answer to a broadcast", "00", MD_RTU, MD_BAD_ADDRESS, {.function = 6, .data_len = 2}},
+    {"another function", "01 04", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
+    {"another function's exception", "01 84", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
+    {"an exception without a code", "01 83 00", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
+    {"another byte count", "01 03 02", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 3, .count = 2}},
+    {"an answer to no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
+    {"another command", ":0106", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
+    {"a refusal below the refusals", ":01FB", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
+};
+
+static void check_verdicts(void)
+{
+    for (size_t i = 0; i < COUNT(verdicts); i++) {
+        struct frame frame = {.framing = verdicts[i].framing, .is_reply = verdicts[i].request.function != 0};
+        row = verdicts[i].name;
+        frame.len = read_bytes(verdicts[i].bytes, frame.bytes);
+        for (size_t len = 0; len < frame.len; len++)
+            CHECK(parse(&frame, frame.bytes, len, &verdicts[i].request) == MD_INCOMPLETE);
+        CHECK(parse(&frame, frame.bytes, frame.len, &verdicts[i].request) == verdicts[i].result);
     }
 }
 
@@ -390,6 +437,7 @@ int main(int argc, char **argv)
     }
     check_documents(argv[1]);
     check_builders();
+    check_verdicts();
     check_impossible_counts();
     check_values();
     check_columns();
