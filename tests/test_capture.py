@@ -248,6 +248,28 @@ def test_what_is_no_capture_of_a_line_is_told_in_a_sentence(
     assert "\n" not in str(mistake.value)
 
 
+def described(*options: tuple[int, bytes]) -> bytes:
+    """A pcapng file with one interface, described so, and no packet."""
+    told = b"".join(
+        struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4) for code, value in options
+    )
+    interface = struct.pack("<HHI", 147, 0, 0) + told
+    size = len(interface) + 12
+    section = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+    return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
+
+
+def test_a_resolution_that_says_nothing_is_the_usual_one(tmp_path: Path) -> None:
+    (tmp_path / "a.pcapng").write_bytes(described((9, b"")))
+    assert spans(tmp_path / "a.pcapng") == {"a-0": []}
+
+
+def test_a_clock_that_is_off_by_ages_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
+    with pytest.raises(CaptureError, match=r"byte 28: its clock is 1099511627776 s off"):
+        spans(tmp_path / "a.pcapng")
+
+
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
 def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) -> None:
     path = write(tmp_path / "a.pcapng", RTU)

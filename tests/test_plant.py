@@ -191,7 +191,8 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
     )
     assert mistakes(text) == [
         "line \"hall-1\": unknown key 'prot'; did you mean 'port'?",
-        'line "hall-1", drive "pump-1": \'50\' is not a duration above 0, such as "50 ms", "2 s" or "1 min"',
+        'line "hall-1", drive "pump-1": \'50\' is not a duration from 100 us to 24 h, '
+        'such as "50 ms", "2 s" or "1 min"',
         'line "hall-1", drive "pump-1", poll number 1: '
         "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
         'line "hall-1", drive "fan-1": '
@@ -303,7 +304,8 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + TOY + 'every = "0 ms"',
-            'line "L", drive "D": \'0 ms\' is not a duration above 0, such as "50 ms", "2 s" or "1 min"',
+            'line "L", drive "D": \'0 ms\' is not a duration from 100 us to 24 h, '
+            'such as "50 ms", "2 s" or "1 min"',
         ),
         (
             HEAD + TOY + "rated_frequency = true",
@@ -372,6 +374,32 @@ def test_a_file_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("a = " + "[" * 5000 + "]" * 5000, "is not TOML of ours: it is nested too deeply"),
+        ("address = " + "9" * 5000, "is not TOML: Exceeds the limit"),
+        ("address = 0x" + "f" * 5000, "is not TOML: a number does not fit into 64 bits"),
+    ],
+    ids=["nested", "decimal", "hexadecimal"],
+)
+def test_a_file_that_tomllib_chokes_on_is_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(PlantError, match=sentence) as found:
+        load_plant(tmp_path / "a.toml")
+    assert len(found.value.mistakes) == 1
+
+
+def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> None:
+    (sentence,) = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
+    assert sentence.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
+
+
+def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:
+    (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
+    assert sentence.endswith(".py: File name too long")
+
+
+@pytest.mark.parametrize(
     ("text", "expected"),
     [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)],
 )
@@ -379,9 +407,12 @@ def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("text", ["", "50", "ms", "-5 ms", "0 s", "5 sec", "1e3 s", "nan s", "5 ms 3"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "50", "ms", "-5 ms", "0 s", "5 sec", "1e3 s", "nan s", "5 ms 3", "1 us", "25 h", "9" * 400 + " h"],
+)
 def test_what_is_no_duration_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"is not a duration above 0, such as"):
+    with pytest.raises(ValueError, match=r"is not a duration from 100 us to 24 h, such as"):
         parse_duration(text)
 
 

@@ -15,13 +15,27 @@ T = TypeVar("T")
 def read_document(path: Path, what: str) -> dict[str, Any]:
     """A TOML file's tables; ValueError, without the path, when there are none to be had."""
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        document = tomllib.loads(path.read_text("utf-8"))
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
     except UnicodeDecodeError as failure:
         raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
-    except tomllib.TOMLDecodeError as failure:
+    except RecursionError as failure:
+        raise ValueError("is not TOML of ours: it is nested too deeply") from failure
+    except ValueError as failure:
         raise ValueError(f"is not TOML: {failure}") from failure
+    if not _fits(document):
+        raise ValueError("is not TOML: a number does not fit into 64 bits")
+    return document
+
+
+def _fits(value: Any) -> bool:
+    """Whether every number is one of TOML's, which has integers of 64 bits."""
+    if isinstance(value, dict):
+        return all(map(_fits, value.values()))
+    if isinstance(value, list):
+        return all(map(_fits, value))
+    return not isinstance(value, int) or -(2**63) <= value < 2**63
 
 
 @dataclass(frozen=True)
@@ -50,8 +64,11 @@ class Place:
             yield table, Place(self.path, (*self.labels, label), self.mistakes, self.seen)
 
     def wrong(self, sentence: object) -> None:
-        """This is a mistake."""
-        self.mistakes.append(": ".join(filter(None, (str(self.path), ", ".join(self.labels), str(sentence)))))
+        """This is a mistake. What a terminal would not print as it stands is spelt out."""
+        text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
+        self.mistakes.append(
+            f"{self.path}: {''.join(it if it.isprintable() else repr(it)[1:-1] for it in text)}"
+        )
 
     def once(self, *what: object, sentence: str) -> None:
         """It is a mistake if this has been seen before; `{first}` in the sentence is where."""

@@ -50,7 +50,11 @@ def _drive(module: ModuleType, path: str, name: str) -> type[Drive]:
 
 
 def _load(path: Path) -> ModuleType:
-    if not path.is_file():
+    try:
+        is_there = path.is_file()
+    except OSError as failure:
+        raise ValueError(f"no model can be taken from {path}: {failure.strerror}") from failure
+    if not is_there:
         raise ValueError(f"there is no file {path} to take a model from")
     return _load_once(path.resolve())
 

@@ -116,12 +116,15 @@ def load_plant(path: Path | str) -> Plant:
 
 def parse_duration(text: str) -> float:
     """Seconds in a duration that a person wrote, such as "50 ms"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip())
-    if match is None or float(match[1]) == 0:
-        raise ValueError(f'{text!r} is not a duration above 0, such as "50 ms", "2 s" or "1 min"')
-    return float(match[1]) * {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}[match[2]]
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
+    units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+    seconds = float(match[1]) * units[match[2]] if match else 0
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise ValueError(f'{text!r} is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"')
+    return seconds
 
 
+_SHORTEST, _LONGEST = 100e-6, 86400.0  # s
 _PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
 _LINE = {
     "name": Key(str, 'name = "hall-1"', needed=True),

@@ -15,6 +15,7 @@ _SECTION, _INTERFACE, _SIMPLE_PACKET, _OLD_PACKET = 0x0A0D0D0A, 1, 3, 2
 _SHB_APPLICATION = 4
 _IF_NAME, _IF_RESOLUTION, _IF_OFFSET = 2, 9, 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
+_MOST_OFFSET = 1 << 33  # s; nanoseconds since 1970 are kept in 64 bits
 _PCAP = {  # the first four bytes: whether big-endian, and ticks in a second
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),
@@ -144,13 +145,15 @@ class Capture:
         if len(body) < 8:
             raise self._damaged(at)
         options = dict(self._options(body[8:]))
-        resolution = options.get(_IF_RESOLUTION, b"\x06")[0]
+        resolution = (options.get(_IF_RESOLUTION) or b"\x06")[0]
         power = resolution & ~_BINARY
         if power > (_MOST_BITS if resolution & _BINARY else _MOST_DIGITS):
             raise CaptureError(f"{self.path}: byte {at}: its clock is finer than a nanosecond")
         ticks_per_s = 2**power if resolution & _BINARY else 10**power
         offset = options.get(_IF_OFFSET, bytes(8))
         seconds: int = struct.unpack(f"{self._order}q", offset)[0] if len(offset) == 8 else 0
+        if abs(seconds) > _MOST_OFFSET:
+            raise CaptureError(f"{self.path}: byte {at}: its clock is {seconds} s off")
         name = options.get(_IF_NAME, b"").rstrip(b"\0").decode(errors="replace")
         link: int = struct.unpack_from(f"{self._order}H", body)[0]
         self._add(link, name or f"{self.path.stem}-{len(self.lines)}", ticks_per_s, seconds * 10**9)
