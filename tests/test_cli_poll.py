@@ -235,7 +235,7 @@ def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
     status, out, err = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (2, "")
     assert err.startswith(f"multidrop: {tmp_path}/a.arrows is not a recording: ")
-    assert run("convert", tmp_path / "none.csv", tmp_path / "b.csv")[0] == 1
+    assert run("convert", tmp_path / "none.csv", tmp_path / "b.csv")[0] == 2
 
 
 def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
