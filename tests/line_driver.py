@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Exchange, completion, new_completion
+from multidrop.core import Completion, Exchange, Result, completion, new_completion
 
 MS = 1_000_000
 
@@ -58,10 +58,10 @@ class LineDriver:
             lib.md_line_received(self._line, data[at : at + piece], len(data[at : at + piece]), self.now)
 
     def lose(self, error: int) -> None:
-        lib.md_line_abandon(self._line, lib.MD_LINE_LOST, error)
+        self.abandon(Result.LINE_LOST, error)
 
-    def expire(self) -> None:
-        lib.md_line_abandon(self._line, lib.MD_EXPIRED, 0)
+    def abandon(self, result: Result, error: int = 0) -> None:
+        lib.md_line_abandon(self._line, result, error)
 
     def wait_until_write(self) -> bytes:
         """Let the silence pass, as the engine does, and send the request."""

@@ -32,8 +32,8 @@ from multidrop.sim.faults import RATES
 S = 1_000_000_000
 REGISTERS = 5  # of each drive
 EVERY = 0.5  # s, of the first of them; the others as fast as the line allows
-HEALTHY, FAULTY = 5.0, 10.0  # s
-CYCLES = 10  # in which the rate must be back
+HEALTHY, FAULTY = 4.0, 8.0  # s
+CYCLES = 20  # in which the rate must be back
 KEPT = 0.97
 MOST_GROWTH_KB = 2048
 
@@ -87,24 +87,29 @@ LINES = {f"{family.model} {framing}": number for number, (family, framing, _) in
 class Story:
     """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
 
-    def __init__(self, drives: Sequence[Drive], seed: int) -> None:
-        self.asked = [_polls(drive) for drive in drives]
+    def __init__(self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY) -> None:
+        self.every = every
+        self.asked = [_polls(drive, every) for drive in drives]
         self.motor = YD1000(31, name="motor")
         sims = [*(EncodedDrive(drive) for drive in drives), simulated(self.motor)]
         self.wire = WorldWire(sims, Faults(seed=seed))
-        motor = polled(self.motor, self.motor.readings()[:1], 1.0)
+        motor = polled(self.motor, self.motor.readings()[:1], every)
         self.world = World(self.wire, [*self.asked, motor])
         self.truth = proofs(*self.asked)
         self.rows: list[Row] = []
         self.drives = [*drives, self.motor]
 
     def run(self, seconds: float) -> list[Row]:
-        """So many seconds, in which the motor starts and stops."""
         first = len(self.rows)
-        for command in (START, STOP):
-            self.world.command(self.motor, command)
-            self.rows += self.world.run(seconds / 2)
+        self.rows += self.world.run(seconds)
         return self.rows[first:]
+
+    def run_motor(self, seconds: float) -> None:
+        """So many seconds, in each of which the motor starts and stops."""
+        for _ in range(round(seconds)):
+            for command in (START, STOP):
+                self.world.command(self.motor, command)
+                self.run(0.5)
 
     def tell(self, faults: Faults) -> None:
         """Health, the fault, and its end, after which the rate must be back."""
@@ -113,7 +118,7 @@ class Story:
             healthy = [row for row in self.run(HEALTHY) if row.value is not None]
             rate, cycle = len(healthy) / HEALTHY, _longest_gap(healthy)
             self.wire.faults = faults
-            self.run(FAULTY)
+            self.run_motor(FAULTY)
             self.wire.faults = Faults()
             self.run(2 * faults.late)  # what is on its way comes
             begin = self.back_off_is_over() + round(cycle * S)
@@ -156,15 +161,15 @@ class Story:
         assert told["dropped"] == 0
         assert told["samples"] + misses.total() == len(self.rows)
         assert Counter(line["misses"]) == misses
-        slots = int(self.world.seconds / EVERY) - 1
+        slots = int(self.world.seconds / self.every) - 1 if self.every else 0
         rows = Counter((row.drive, row.register) for row in self.rows)
         missing = sum(max(0, slots - rows[it.drive.name, it.polls[0].register.name]) for it in self.asked)
         assert missing <= line["overrun_slots"]
 
 
-def _polls(drive: Drive) -> PolledDrive:
+def _polls(drive: Drive, every: float | None) -> PolledDrive:
     first, *others = drive.readings()[:REGISTERS]
-    timed, quick = polled(drive, [first], EVERY), polled(drive, others)
+    timed, quick = polled(drive, [first], every), polled(drive, others)
     return PolledDrive(drive, (*timed.polls, *quick.polls))
 
 
@@ -193,9 +198,17 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     if VARIANTS[number][1] in NOT_TOLD.get(kind, ()):
         return
     before = descriptors(), threading.active_count()
-    story = Story(of_one_variant(number), seed=1)
+    story = Story(of_one_variant(number))
     story.tell(KINDS[kind])
     assert (descriptors(), threading.active_count()) == before
+    assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
+    """Nothing is polled at a rate: that goes without the poller's thread until something fails."""
+    story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
+    story.tell(KINDS[kind])
     assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
 
 

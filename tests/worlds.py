@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from enum import Enum
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from line_driver import LineDriver
 from lines import PATIENCE, line, plant, rows_of
+from multidrop._core import lib
 
 from multidrop import bus, poller
 from multidrop.batch import Row
-from multidrop.core import Columns, Completion, Exchange, Message, new_completion
+from multidrop.core import Exchange, Inbox, Message, Result, new_completion
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.exchanges import NO_ROWS, exchange
@@ -29,7 +31,6 @@ from multidrop.sim import HostileWire
 
 S = 1_000_000_000
 BEGIN_NS = 1000 * S
-UTC_NS = 1_700_000_000 * S
 NEVER = 1 << 62
 ENODEV = 19
 
@@ -43,6 +44,25 @@ class WorldWire(HostileWire):
         self.port = port
 
 
+class WorldInbox(Inbox):
+    """Whoever waits for a call lets time pass meanwhile."""
+
+    pass_time: Callable[[float], None]
+
+    def await_calls(self, seconds: float) -> list[int]:
+        self.pass_time(seconds)
+        return super().await_calls(0)
+
+
+class Turn(Enum):
+    """Whose exchange is under way."""
+
+    NOBODYS = 0
+    WISHED = 1
+    QUEUED = 2
+    REPEATED = 3
+
+
 class WorldPort:
     """What the poller sees of an open port (core.Port), and what the core's thread does for it."""
 
@@ -50,56 +70,57 @@ class WorldPort:
 
     def __init__(self, world: World) -> None:
         self.lost = False
+        self.done = 0
         self.urgent: deque[Exchange] = deque()
-        self.answers: list[Completion] = []  # to those
         self._world = world
+        self._inbox: Inbox | None = None
+        self._number = 0
         self._driver = LineDriver()
         self._driver.now = world.now
         self._queue: deque[tuple[Exchange, int]] = deque()
-        self._done: deque[tuple[Exchange, Any]] = deque()
+        self._round: deque[Exchange] = deque()
+        self._turn = Turn.NOBODYS
         self._under_way: Exchange | None = None
-        self._is_urgent = False
+        self._failures = 0
         self._heard = b""
         self._has_ended = False
 
     # ---- the poller's side ----
 
-    @property
-    def pending(self) -> int:
-        return len(self._queue) + (self._under_way is not None and not self._is_urgent)
+    def report_to(self, inbox: Inbox, number: int) -> None:
+        self._inbox, self._number = inbox, number
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        assert self.pending + len(self._done) + len(exchanges) <= self.room
+        assert len(self._queue) + len(exchanges) <= self.room
         self._queue += zip(exchanges, not_before_ns, strict=True)
         return len(exchanges)
 
-    def reap(self, columns: Columns, utc_minus_monotonic_ns: int) -> int:
-        count = 0
-        while self._done:
-            exchange, found = self._done[0]
-            if exchange.block is None or not columns.add(exchange.block, found, utc_minus_monotonic_ns):
-                break
-            self._done.popleft()
-            count += 1
-        return count
+    def repeat(self, exchanges: Sequence[Exchange]) -> None:
+        self._round = deque(exchanges)
+
+    @property
+    def repeating(self) -> bool:
+        return bool(self._round)
 
     def end(self) -> bool:
         self._has_ended = True
-        return self._under_way is not None and not self._is_urgent
+        return self._turn in (Turn.QUEUED, Turn.REPEATED)
 
     def stop(self) -> None:
-        pass
+        if self.end():
+            self._driver.abandon(Result.POLL_ENDED)
+            self._finish()
 
     # ---- the core's side ----
 
     def hang_up(self) -> None:
         """What is under way fails, and so does all that is queued."""
         self.lost = True
-        while self._under_way or self._queue or self.urgent:
-            if not self._under_way:
-                self._take_up()
-            self._driver.lose(ENODEV)
+        self._round.clear()
+        while self._under_way or self._take_up():
+            self._driver.abandon(Result.LINE_LOST, ENODEV)
             self._finish()
+        self._call()
 
     def advance(self, heard: bytes) -> int:
         """Carry on until there is nothing to do but wait; until when."""
@@ -131,31 +152,59 @@ class WorldPort:
 
     def _take_up(self) -> bool:
         now = self._world.now
-        self._is_urgent = bool(self.urgent)
         if self.urgent:
-            exchange, due_ns = self.urgent.popleft(), now
-        elif self._queue and not self._has_ended and (self._queue[0][1] <= now or self.lost):
+            self._begin(Turn.WISHED, self.urgent.popleft())
+        elif self._has_ended:
+            return False
+        elif self._queue and (self._queue[0][1] <= now or self.lost):
             exchange, due_ns = self._queue.popleft()
+            self._begin(Turn.QUEUED, exchange)
+            if exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
+                again = (at_ns for other, at_ns in self._queue if other is exchange)
+                if now >= next(again, NEVER):
+                    self._driver.abandon(Result.EXPIRED)
+        elif self._round:
+            self._begin(Turn.REPEATED, self._round[0])
+            self._round.rotate(-1)
         else:
             return False
+        return True
+
+    def _begin(self, turn: Turn, exchange: Exchange) -> None:
+        self._turn, self._under_way = turn, exchange
+        self._failures = exchange.respondent.failures
         self._driver.found = new_completion()
         self._driver.begin(exchange)
-        self._under_way = exchange
-        if exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
-            again = (at_ns for other, at_ns in self._queue if other is exchange)
-            if now >= next(again, NEVER):
-                self._driver.expire()
-        return True
 
     def _finish(self) -> None:
         assert self._under_way
-        if self._is_urgent:
-            self.answers.append(self._driver.completion)
-        else:
-            self._done.append((self._under_way, self._driver.found))
-        self._under_way = None
-        if self.pending in (0, self.room // 4):
-            self._world.has_notice = True
+        turn, exchange, found = self._turn, self._under_way, self._driver.found
+        self._turn, self._under_way = Turn.NOBODYS, None
+        if turn is Turn.WISHED:
+            return
+        self._report(exchange, found)
+        if turn is Turn.QUEUED:
+            self.done += 1
+            if len(self._queue) in (0, self.room // 4):
+                self._call()
+        elif found.result < 0 and not found.sent_ns:
+            self._round.clear()
+            self._call()
+
+    def _report(self, exchange: Exchange, found: Any) -> None:
+        assert self._inbox
+        assert exchange.block
+        lib.md_inbox_add(self._inbox.c, exchange.block.c, found)
+        is_refusal = found.result > 0 and found.reply.exception
+        if found.result > 0:
+            exchange.block.c.refusals = exchange.block.c.refusals + 1 if is_refusal else 0
+        if is_refusal or exchange.respondent.failures != self._failures:
+            self._call()
+
+    def _call(self) -> None:
+        if self._inbox:
+            self._inbox.call(self._number)
+            self._world.is_called = True
 
 
 class WorldLine:
@@ -190,7 +239,7 @@ class World:
         self.now = self._limit = BEGIN_NS
         self.wire = wire
         self.port: WorldPort | None = None
-        self.has_notice = False
+        self.is_called = False
         self._leaving = False
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
@@ -200,8 +249,7 @@ class World:
         for module in (bus, poller):
             patch.setattr(module, "now_ns", lambda: self.now)
         patch.setattr(poller, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
-        patch.setattr(poller, "utc_minus_monotonic_ns", lambda: UTC_NS)
-        patch.setattr(poller, "await_notice", self._await_notice)
+        patch.setattr(poller, "Inbox", self._inbox)
         wire.open()
         self.poller = Poller(plant(line("world", *drives)))
 
@@ -244,7 +292,12 @@ class World:
 
     _is_waiting = False
 
-    def _await_notice(self, seconds: float) -> None:
+    def _inbox(self) -> WorldInbox:
+        made = WorldInbox()
+        made.pass_time = self._pass_time
+        return made
+
+    def _pass_time(self, seconds: float) -> None:
         for thread in {*threading.enumerate()} - self._threads - {threading.current_thread()}:
             thread.join()  # opens the port again: in the world that takes no time
         try:
@@ -268,10 +321,10 @@ class World:
 
     def _look(self, end_ns: int) -> None:
         """Let time pass until then, or until the port wants more."""
-        self.has_notice = False
+        self.is_called = False
         while True:
             wake = self._settle()
-            if self.has_notice or self.now >= end_ns:
+            if self.is_called or self.now >= end_ns:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
 
@@ -280,7 +333,6 @@ class World:
         heard = self.wire.advance(self.now / S)
         if self.port and not self.port.lost and self.wire.port is None:
             self.port.hang_up()
-            self.has_notice = True
         wake = NEVER
         if self.port and not self.port.lost:
             wake = self.port.advance(heard)
@@ -292,4 +344,3 @@ class World:
         self.wire.receive(request, self.now / S, baudrate)
         if self.wire.port is None and self.port:
             self.port.hang_up()
-            self.has_notice = True
