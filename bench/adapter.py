@@ -115,12 +115,12 @@ def decoder(drives: int) -> Callable[[], Batch]:
     registers = list(Played.registers.values())
     replies = []
     for address in range(1, drives + 1):
-        fields = [Field(it.address, it.wire, address - 1, it.address, 1, 10) for it in registers]
+        fields = [Field(it.address, it.wire, it.address, 1, 10) for it in registers]
         data = b"".join(value.to_bytes(2, "big") for value in expected(address))
         found = new_completion()
         found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
         found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
-        replies.append((Block(fields), found))
+        replies.append((Block(address - 1, fields), found))
     names = [f"drive-{address}" for address in range(1, drives + 1)], [it.name for it in registers]
 
     def decode() -> Batch:

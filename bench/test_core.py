@@ -32,7 +32,7 @@ READ_TEN = Message(1, 3, 0, 10)
 REPLY = bytes.fromhex("010308010001F401F4003225C4")  # ERMAN ER-G-220, section 6, FC03
 
 
-TEN_VALUES = Block([Field(at, Wire.U16, 0, at, 1, 10) for at in range(10)])
+TEN_VALUES = Block(0, [Field(at, Wire.U16, at, 1, 10) for at in range(10)])
 
 
 def unhurried(request: Message) -> Exchange:

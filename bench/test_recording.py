@@ -21,7 +21,7 @@ def batch() -> Batch:
     found = new_completion()
     found.result, found.sent_ns, found.first_ns = 37, 1, 2
     found.reply.data_len, found.reply.data[0:32] = 32, list(range(32))
-    block = Block([Field(at, Wire.U16, 0, at, 1, 10) for at in range(16)])
+    block = Block(0, [Field(at, Wire.U16, at, 1, 10) for at in range(16)])
     columns = Columns(ROWS)
     while columns.add(block, found, 0):
         pass

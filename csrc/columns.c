@@ -109,7 +109,7 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
         columns->time[row] = sent_ns + utc_minus_monotonic_ns;
         columns->sent[row] = sent_ns;
         columns->uncertainty[row] = status ? 0 : completion->first_ns - sent_ns;
-        columns->drive[row] = field->drive;
+        columns->drive[row] = block->drive;
         columns->reg[row] = field->reg;
         columns->status[row] = status;
         columns->value[row] = status ? 0 : value * field->multiplier / field->divisor;

@@ -223,6 +223,22 @@ static int take_from_queue(struct md_port *port, int64_t *wake_ns, int64_t now_n
     return 0;
 }
 
+/* The next one of those that are repeated. With many lines what those behind it need is out of the
+ * caches by now, and is fetched while there is time. */
+static const struct md_exchange *take_next(struct md_port *port)
+{
+    unsigned at = port->round_at, second = at + 1 < port->round_len ? at + 1 : 0;
+    unsigned third = second + 1 < port->round_len ? second + 1 : 0;
+    port->round_at = second;
+    const struct md_exchange *soon = port->round[second];
+    __builtin_prefetch(port->round[third]);
+    __builtin_prefetch(&port->round[third]->request);
+    __builtin_prefetch(soon->block);
+    __builtin_prefetch(soon->drive);
+    __builtin_prefetch(&soon->drive->tally);
+    return port->round[at];
+}
+
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
 static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
@@ -239,9 +255,7 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
     if (pending(port) && take_from_queue(port, wake_ns, now_ns))
         return 1;
     if (port->round_len) {
-        const struct md_exchange *next = port->round[port->round_at];
-        port->round_at = (port->round_at + 1) % port->round_len;
-        begin(port, REPEATED, next, &port->completion, now_ns);
+        begin(port, REPEATED, take_next(port), &port->completion, now_ns);
         return 1;
     }
     if (!pending(port)) {
@@ -259,9 +273,12 @@ static void report(struct md_port *port)
     const struct md_completion *completion = &port->completion;
     if (port->inbox)
         md_inbox_add(port->inbox, exchange->block, completion);
+    struct md_block *block = exchange->block;
     int is_refusal = completion->result > 0 && completion->reply.exception;
-    if (exchange->block && completion->result > 0)
-        exchange->block->refusals = is_refusal ? exchange->block->refusals + 1 : 0;
+    if (block && is_refusal)
+        block->refusals++;
+    else if (block && completion->result > 0 && block->refusals)
+        block->refusals = 0;
     if (is_refusal || exchange->drive->failures != port->failures)
         call(port);
 }

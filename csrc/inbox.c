@@ -13,12 +13,16 @@
 
 static const int64_t CLOCK_HOLDS_NS = 50000000; /* until it is asked again how far UTC is ahead */
 
+enum { MOST_SPARE = 64 }; /* chunks that were given back */
+
 struct md_inbox {
     pthread_mutex_t mutex; /* guards all below */
     pthread_cond_t called_up;
     size_t chunk_rows, most_chunks;
     struct md_columns **chunks; /* a ring */
     size_t first, count;        /* of the chunks that hold rows */
+    struct md_columns *spare[MOST_SPARE];
+    size_t spares;
     uint64_t dropped;
     int64_t utc_minus_monotonic_ns, asked_ns;
     uint64_t called[MD_MOST_NUMBERS / 64]; /* a bit for each number */
@@ -73,6 +77,8 @@ void md_inbox_free(struct md_inbox *inbox)
 {
     for (size_t i = 0; i < inbox->count; i++)
         md_columns_free(inbox->chunks[(inbox->first + i) % inbox->most_chunks]);
+    while (inbox->spares)
+        md_columns_free(inbox->spare[--inbox->spares]);
     pthread_cond_destroy(&inbox->called_up);
     pthread_mutex_destroy(&inbox->mutex);
     free(inbox->chunks);
@@ -97,7 +103,9 @@ static struct md_columns *newest(struct md_inbox *inbox)
 /* A chunk with no rows yet: a new one, or else the newest, whose rows are dropped. */
 static struct md_columns *begin_chunk(struct md_inbox *inbox)
 {
-    struct md_columns *chunk = inbox->count < inbox->most_chunks ? md_columns_new(inbox->chunk_rows) : NULL;
+    struct md_columns *chunk = NULL;
+    if (inbox->count < inbox->most_chunks)
+        chunk = inbox->spares ? inbox->spare[--inbox->spares] : md_columns_new(inbox->chunk_rows);
     if (chunk) {
         inbox->chunks[(inbox->first + inbox->count++) % inbox->most_chunks] = chunk;
     } else if ((chunk = newest(inbox)) != NULL) {
@@ -133,6 +141,18 @@ struct md_columns *md_inbox_take(struct md_inbox *inbox)
     }
     pthread_mutex_unlock(&inbox->mutex);
     return chunk;
+}
+
+void md_inbox_give_back(struct md_inbox *inbox, struct md_columns *columns)
+{
+    columns->rows = 0;
+    pthread_mutex_lock(&inbox->mutex);
+    int is_kept = inbox->spares < MOST_SPARE;
+    if (is_kept)
+        inbox->spare[inbox->spares++] = columns;
+    pthread_mutex_unlock(&inbox->mutex);
+    if (!is_kept)
+        md_columns_free(columns);
 }
 
 size_t md_inbox_chunks(struct md_inbox *inbox)

@@ -21,6 +21,8 @@ enum state {
     ENDING     /* the time-out is over: looks once more, because it may be late to look at all */
 };
 
+static const int64_t WORTH_WAITING = 100000; /* ns; before a shorter time a sleep costs more than a look */
+
 static int64_t later(int64_t a, int64_t b)
 {
     return a > b ? a : b;
@@ -352,7 +354,9 @@ void md_line_init(struct md_line *line, int64_t now_ns)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
                    struct md_completion *completion, int64_t now_ns)
 {
-    *completion = (struct md_completion){.begun_ns = now_ns, .stale = line->rx_len};
+    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* what follows counts by its length */
+    completion->begun_ns = now_ns;
+    completion->stale = line->rx_len;
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = 0;
@@ -393,7 +397,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
         return MD_DONE;
     case LISTENING:
-        if (now_ns < line->ready_ns && line->ready_ns < line->give_up_ns) {
+        if (line->ready_ns - now_ns > WORTH_WAITING && line->ready_ns < line->give_up_ns) {
             line->wake_ns = line->ready_ns;
             return MD_WAIT;
         }

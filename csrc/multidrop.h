@@ -120,17 +120,17 @@ enum { MD_DELAY_BUCKETS = 128 };
 
 /* What became of a drive's exchanges (tally.c). Values are those of the exchange's block, or one. */
 struct md_tally {
-    uint64_t exchanges, answered, values;
+    uint64_t exchanges, answered, values; /* the first eight: counted at every exchange, and side by side */
     uint64_t sent;        /* requests that began to leave */
-    uint64_t ended[17];   /* exchanges that were not answered, by -result; 0: broadcasts */
-    uint64_t missed[17];  /* values, by -result */
-    uint32_t refused[256]; /* values, by exception code */
-    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7, 6 */
-    uint64_t late;        /* answers that came after their time-out */
     uint64_t stray_bytes; /* bytes that were no part of a reply */
     uint64_t ideal_ns;    /* what the answered exchanges had to take of the line */
-    uint64_t delays[128]; /* replies, by their response delay: bucket n is from md_delay_edge(n) to that of n + 1 */
     int64_t longest_ns;   /* response delay */
+    uint64_t late;        /* answers that came after their time-out */
+    uint64_t delays[128]; /* replies, by their response delay: bucket n is from md_delay_edge(n) to that of n + 1 */
+    uint64_t ended[17];   /* exchanges that were not answered, by -result; 0: broadcasts */
+    uint64_t missed[17];  /* values, by -result */
+    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7, 6 */
+    uint32_t refused[256]; /* values, by exception code */
 };
 
 /* What is known of a drive: the bounds of its time-out are given, the rest is learnt from its
@@ -139,25 +139,26 @@ struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
     int64_t delay_ns, deviation_ns; /* the response delay, smoothed, and its mean deviation */
     int64_t late_until_ns;          /* so long the answer to `late` may still come */
-    struct md_message late;
+    uint32_t failures;              /* in a row */
     int late_framing;
     int late_others;                /* and answers to requests before that one, too */
     struct md_drive *next_late;     /* on the same line, whose answer may still come */
-    uint32_t failures;              /* in a row */
     struct md_tally tally;
+    struct md_message late;
 };
 
-/* One request and all that is needed to carry it out; constant while it is in use. */
+/* One request and all that is needed to carry it out; constant while it is in use. What every
+ * exchange needs comes first: with many lines each of them comes from far away. */
 struct md_exchange {
-    int framing;
-    struct md_message request;
-    struct md_settings settings;
-    int64_t character_ns;  /* one character on the wire */
-    int64_t silence_ns;    /* before the request and after its reply */
-    int64_t turnaround_ns; /* after a broadcast */
-    int64_t period_ns;     /* between its slots in a queue; 0: it has none */
     struct md_drive *drive;
     struct md_block *block; /* what its reply holds; NULL: nobody makes rows of it */
+    int64_t character_ns;   /* one character on the wire */
+    int64_t silence_ns;     /* before the request and after its reply */
+    int64_t turnaround_ns;  /* after a broadcast */
+    int64_t period_ns;      /* between its slots in a queue; 0: it has none */
+    struct md_settings settings;
+    int framing;
+    struct md_message request;
 };
 
 /* What became of it. Times are of CLOCK_MONOTONIC; first and last are 0 where nothing came. */
@@ -169,8 +170,8 @@ struct md_completion {
     int64_t first_ns, last_ns; /* the first and the last byte after the request were seen */
     uint32_t stale;            /* bytes thrown away before the request left: late replies, noise */
     uint32_t skipped;          /* bytes after the request that were not part of the reply */
-    struct md_message reply;   /* of a good reply or an exception */
     uint16_t raw_len;
+    struct md_message reply;   /* of a good reply or an exception */
     uint8_t raw[513];          /* the reply; a failure's: what came, its end where it is too long */
 };
 
@@ -272,8 +273,9 @@ struct md_inbox *md_inbox_new(size_t chunk_rows, size_t most_chunks); /* NULL: s
 void md_inbox_free(struct md_inbox *inbox); /* when no port reports to it */
 /* Make rows of what became of an exchange, where it has a block. */
 void md_inbox_add(struct md_inbox *inbox, const struct md_block *block, const struct md_completion *completion);
-/* The oldest rows, the caller's to free; NULL when there are none. */
+/* The oldest rows, the caller's until they are given back; NULL when there are none. */
 struct md_columns *md_inbox_take(struct md_inbox *inbox);
+void md_inbox_give_back(struct md_inbox *inbox, struct md_columns *columns);
 size_t md_inbox_chunks(struct md_inbox *inbox); /* that hold rows; the newest is still being filled */
 uint64_t md_inbox_dropped(struct md_inbox *inbox); /* rows */
 enum { MD_MOST_NUMBERS = 65536 };
@@ -293,14 +295,16 @@ double md_value(const uint8_t *data, size_t len, size_t at, int wire);
 struct md_field {
     uint16_t at;
     uint8_t wire;
-    uint16_t drive, reg; /* codes of their names */
+    uint16_t reg; /* code of its name */
     double multiplier, divisor;
 };
 
+/* What replies of a drive hold. Drives of a kind share the fields. */
 struct md_block {
     const struct md_field *fields;
     int count;
     uint32_t refusals; /* exceptions in a row */
+    uint16_t drive;    /* code of its name */
 };
 
 /* Rows; all arrays have room for the same number. `valid` is a bitmap, least significant bit first. */

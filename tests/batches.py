@@ -22,7 +22,7 @@ METADATA = {
 
 def block(drive: int, *registers: int, divisor: float = 100.0) -> Block:
     return Block(
-        [Field(at, Wire.U16, drive, register, 1.0, divisor) for at, register in enumerate(registers)]
+        drive, [Field(at, Wire.U16, register, 1.0, divisor) for at, register in enumerate(registers)]
     )
 
 

@@ -96,11 +96,12 @@ def reply(*values: int) -> Any:
 
 def test_rows_of_a_block() -> None:
     block = Block(
+        5,
         [
-            Field(0, Wire.U16, drive=5, register=50, multiplier=1, divisor=10),
-            Field(2, Wire.I16, drive=5, register=51, multiplier=1, divisor=100),
-            Field(1, Wire.U32, drive=5, register=52, multiplier=60, divisor=1),
-        ]
+            Field(0, Wire.U16, register=50, multiplier=1, divisor=10),
+            Field(2, Wire.I16, register=51, multiplier=1, divisor=100),
+            Field(1, Wire.U32, register=52, multiplier=60, divisor=1),
+        ],
     )
     columns = Columns(8)
     assert columns.add(block, reply(3, 0xFFFF, 0xFF9C), UTC)
@@ -120,11 +121,11 @@ def test_rows_of_a_block() -> None:
 def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
     """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
     columns = Columns(1)
-    assert columns.add(Block([Field(0, Wire.U16, 0, 0, 1, divisor)]), reply(raw), 0)
+    assert columns.add(Block(0, [Field(0, Wire.U16, 0, 1, divisor)]), reply(raw), 0)
     assert columns.array("value")[0] == raw / divisor
 
 
-ONE = Block([Field(0, Wire.U16, 1, 2, 1, 1)])
+ONE = Block(1, [Field(0, Wire.U16, 2, 1, 1)])
 
 
 @pytest.mark.parametrize(
@@ -178,7 +179,7 @@ def test_request_that_never_left_has_the_time_at_which_it_was_taken_up() -> None
 
 def test_field_beyond_the_reply_is_a_miss() -> None:
     columns = Columns(2)
-    block = Block([Field(0, Wire.U16, 1, 2, 1, 1), Field(1, Wire.U16, 1, 3, 1, 1)])
+    block = Block(1, [Field(0, Wire.U16, 2, 1, 1), Field(1, Wire.U16, 3, 1, 1)])
     assert columns.add(block, reply(9), 0)
     assert list(columns.array("status")) == [0, -Result.BAD_LENGTH]
     assert list(columns.array("value")) == [9, 0]
@@ -196,7 +197,7 @@ def test_bitmap_of_values_and_misses() -> None:
 
 def test_block_without_room_is_left_out_whole() -> None:
     columns = Columns(3)
-    two = Block([Field(0, Wire.U16, 1, 2, 1, 1), Field(1, Wire.U16, 1, 3, 1, 1)])
+    two = Block(1, [Field(0, Wire.U16, 2, 1, 1), Field(1, Wire.U16, 3, 1, 1)])
     answer = reply(1, 2)
     assert columns.add(two, answer, 0)
     assert not columns.add(two, answer, 0)

@@ -39,7 +39,7 @@ PARITY = next(bit for bit, name in REFUSALS.items() if name == "parity")
 ANY_SETTINGS, NO_SETTINGS = 0, -1
 
 
-ONE_VALUE = Block([Field(0, Wire.U16, 0, 0, 1, 1)])
+ONE_VALUE = Block(0, [Field(0, Wire.U16, 0, 1, 1)])
 
 
 def read(

@@ -14,7 +14,7 @@ from multidrop.register import Register
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
-NO_ROWS = core.Block([])  # of a command: a poll's summary counts the values of its rows alone
+NO_ROWS = core.Block(0, [])  # of a command: a poll's summary counts the values of its rows alone
 
 
 def exchange(

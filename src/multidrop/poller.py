@@ -46,29 +46,23 @@ class _Codes:
     """The names that rows are made of, each with its number."""
 
     def __init__(self) -> None:
-        self.drives: list[str] = []
-        self.registers: list[str] = []
+        self.drives: dict[str, int] = {}
+        self.registers: dict[str, int] = {}
 
     def fields(self, drive: Drive, block: Block) -> core.Block:
         return core.Block(
+            self.drives.setdefault(drive.name, len(self.drives)),
             [
                 Field(
                     block.offset(register),
                     register.wire,
-                    _code(self.drives, drive.name),
-                    _code(self.registers, register.name),
+                    self.registers.setdefault(register.name, len(self.registers)),
                     register.scale.numerator,
                     register.scale.denominator,
                 )
                 for register in block.registers
-            ]
+            ],
         )
-
-
-def _code(names: list[str], name: str) -> int:
-    if name not in names:
-        names.append(name)
-    return names.index(name)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -432,7 +426,7 @@ class Poller:
                 return None
             self._taken_ns = now
         columns = self._inbox.take()
-        return Batch(columns, self._codes.drives, self._codes.registers) if columns else None
+        return Batch(columns, list(self._codes.drives), list(self._codes.registers)) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Batches as they come, about one `every` s, for `seconds` s or until the caller leaves off."""

@@ -86,10 +86,9 @@ class _Line:
                 Field(
                     place.at,
                     place.wire,
-                    drive,
                     self._registers.setdefault(place.name, len(self._registers)),
                     scale.numerator if scale else 1,
                     scale.denominator if scale else 1,
                 )
             )
-        return Block(fields)
+        return Block(drive, fields)

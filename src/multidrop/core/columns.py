@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import lru_cache
 from itertools import accumulate
@@ -34,22 +34,27 @@ def raw_value(data: bytes, at: int, wire: Wire) -> float:
 
 
 class Field(NamedTuple):
-    """Where a register lies in a block's reply, its scale, and the codes of its names."""
+    """Where a register lies in a block's reply, its scale, and the code of its name."""
 
     at: int
     wire: Wire
-    drive: int
     register: int
     multiplier: float
     divisor: float
 
 
-class Block:
-    """The fields that one exchange's reply holds (struct md_block)."""
+@lru_cache(maxsize=1024)
+def _shared(fields: tuple[Field, ...]) -> Any:
+    """One array for all drives of a kind: the core goes through it faster than through many."""
+    return ffi.new("struct md_field[]", fields)
 
-    def __init__(self, fields: Sequence[Field]) -> None:
-        self._fields = ffi.new("struct md_field[]", [tuple(field) for field in fields])
-        self.c = ffi.new("struct md_block *", {"fields": self._fields, "count": len(fields)})
+
+class Block:
+    """What one exchange's reply holds: fields of a drive, given by the code of its name (struct md_block)."""
+
+    def __init__(self, drive: int, fields: Sequence[Field]) -> None:
+        self._fields = _shared(tuple(fields))
+        self.c = ffi.new("struct md_block *", {"fields": self._fields, "count": len(fields), "drive": drive})
         self.count = len(fields)
 
     @property
@@ -73,19 +78,19 @@ class Columns:
     """Rows in the core's own memory: one array a column (struct md_columns)."""
 
     def __init__(self, room: int) -> None:
-        self._own(lib.md_columns_new(room))
+        self._own(lib.md_columns_new(room), lib.md_columns_free)
 
     @classmethod
-    def of(cls, made: Any) -> Columns:
-        """What the core made, and gives away."""
+    def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
+        """What the core made, until nobody looks at it any more."""
         columns = cls.__new__(cls)
-        columns._own(made)
+        columns._own(made, give_back)
         return columns
 
-    def _own(self, made: Any) -> None:
+    def _own(self, made: Any, give_back: Callable[[Any], object]) -> None:
         if made == ffi.NULL:
             raise MemoryError("no memory for rows")
-        self.c = ffi.gc(made, lib.md_columns_free)
+        self.c = ffi.gc(made, give_back)
         first = ffi.cast("uint8_t *", made)
         self._at = {name: ffi.cast("uint8_t *", getattr(made, name)) - first for name in (*COLUMNS, "valid")}
         # One piece, which is there for as long as any view of it.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Block, Columns, miss
 from multidrop.core.results import Result
@@ -26,7 +28,7 @@ class Inbox:
     def take(self) -> Columns | None:
         """The oldest rows that wait; None when there are none."""
         made = lib.md_inbox_take(self.c)
-        return None if made == ffi.NULL else Columns.of(made)
+        return None if made == ffi.NULL else Columns.lent(made, partial(lib.md_inbox_give_back, self.c))
 
     def add_miss(self, block: Block, result: Result, due_ns: int) -> None:
         """Rows for values that were due at `due_ns` but never asked for."""
