@@ -169,7 +169,10 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
 {
     if (port->must_take < 0 || same_settings(&port->settings, settings))
         return;
+    int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
+    port->progress.switching_ns += md_now_ns() - begun_ns;
+    put(&port->progress.switches, port->progress.switches + 1);
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)

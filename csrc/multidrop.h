@@ -260,6 +260,8 @@ struct md_progress {
     uint32_t submitted, done;
     uint32_t lost;      /* the descriptor failed: all that comes is MD_LINE_LOST */
     uint32_t repeating; /* exchanges are carried out again and again */
+    uint32_t switches;  /* of baud rate and format */
+    int64_t switching_ns; /* that they took */
 };
 const struct md_progress *md_port_progress(struct md_port *port);
 /* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */

@@ -121,6 +121,22 @@ def test_polling_all_readings_in_single_requests_is_warned_of(run: Run, tmp_path
     assert "?" not in run("plan", path)[1]
 
 
+def test_a_plan_reckons_with_the_time_of_switching(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        LINE.format("hall-1", 1) + DRIVE.format("p", "yd1000", 1) + 'poll = ["output_current"]\n'
+        "" + DRIVE.format("q", "erman-er-g-220", 2) + 'poll = ["output_current"]\n'
+    )
+    free = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
+    assert (free["switches"], free["switching_ms"]) == (2, 0)
+    told = " ".join(run("plan", path)[1].split())
+    assert "2 times in a bus cycle the line changes its settings; what that takes a poll tells" in told
+    path.write_text(path.read_text().replace("port =", 'switching = "3 ms"\nport ='))
+    dear = json.loads(run("plan", path, "--json")[1])["lines"]["hall-1"]
+    assert dear["cycle_ms"] - free["cycle_ms"] == pytest.approx(6)
+    assert "the line changes its settings, 3 ms each" in " ".join(run("plan", path)[1].split())
+
+
 def test_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     name = "the pump behind the second door on the left of the hall with the blue floor"
@@ -164,6 +180,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
     assert found["measured"]["utilisation"] == summary["utilisation"]
     assert found["measured"]["exchanges_per_second"]["pump-9"] == 0
     assert found["measured"]["cycle_ms"] > 0
+    assert found["measured"]["switching_ms"] == summary["switching_ms"] > 0
 
 
 def test_poll_shows_them_to_a_person(plant: Path) -> None:

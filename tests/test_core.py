@@ -418,6 +418,19 @@ def test_refused_settings_that_must_be_taken() -> None:
     os.close(master)
 
 
+def test_what_a_change_of_settings_takes_is_measured() -> None:
+    master, slave = os.openpty()
+    os.set_blocking(slave, False)
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        assert port.switching == 0
+        begun = now_ns()
+        for format in ("8N1", "8E1", "8N1"):
+            port.carry_out(read(0, format=format, timeout=0.001))
+        assert 0 < port.switching * 3e9 < now_ns() - begun
+    os.close(slave)
+    os.close(master)
+
+
 def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
     with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
         found = port.carry_out(read(0))

@@ -162,7 +162,9 @@ address = 3
 def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([500e-6, 10e-3, 0])
-    (line,) = load(SILENT.replace('silence = "500 us"\n', "")).lines
+    assert line.switching == 0
+    (line,) = load(SILENT.replace('silence = "500 us"\n', 'switching = "2 ms"\n')).lines
+    assert line.switching == 2e-3
     assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
@@ -208,7 +210,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ("[line]", "line = {} is not right; write [[line]], in two brackets, with its name, port and drives"),
         (
             "line = [3]",
-            "line number 1: 3 is not a table with name, port, baudrate, format, silence, drive",
+            "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, drive",
         ),
         (
             HEAD,

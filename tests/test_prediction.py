@@ -69,6 +69,20 @@ def test_each_switch_of_settings_adds_its_time() -> None:
     exchanges = [it for drive in drives for it in asked(drive, None, "output_frequency")]
     free, dear = predict(exchanges), predict(exchanges, switching=0.01)
     assert dear.cycle - free.cycle == pytest.approx(2 * 0.01)
+    assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
+
+
+def test_a_remedy_reckons_with_the_switching() -> None:
+    drives = [ErmanERG220(1), YD1000(2)]
+    exchanges = [it for drive in drives for it in asked(drive, 0.06, "output_frequency")]
+    periods = []
+    for switching in (0.0, 0.05):
+        found = remedies(exchanges, predict(exchanges, switching=switching), switching)
+        assert found.every is not None
+        periods.append(found.every[0][1])
+        changed = [it for drive in drives for it in asked(drive, periods[-1], "output_frequency")]
+        assert predict(changed, switching=switching).fits
+    assert periods[1] > periods[0]
 
 
 def test_measured_delays_take_the_place_of_the_document_s() -> None:

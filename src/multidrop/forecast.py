@@ -10,12 +10,12 @@ from multidrop.plan import Planned, silence
 from multidrop.prediction import predict
 
 
-def forecast(exchanges: Sequence[Planned]) -> dict[str, Any]:
+def forecast(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
     """The prediction for a line, and of each drive's blocks what they take of it: by plain numbers.
 
     Characters are those on the wire; of a reply, of a good one.
     """
-    prediction = predict(exchanges)
+    prediction = predict(exchanges, switching=switching)
     drives = dict.fromkeys(it.drive for it in exchanges)
     return {
         "utilisation": round(prediction.utilisation, 4),

@@ -48,6 +48,7 @@ class Line:
     baudrate: int | None
     format: str | None
     drives: tuple[PolledDrive, ...]
+    switching: float = 0.0  # s that the port needs to change them
 
     def planned(self) -> list[Planned]:
         """All that is polled on it, in blocks."""
@@ -70,7 +71,7 @@ class Plant:
         return {
             "multidrop": version("multidrop"),
             "plant": str(self.path),
-            "planned": {line.name: forecast(line.planned()) for line in self.lines},
+            "planned": {line.name: forecast(line.planned(), line.switching) for line in self.lines},
             "drives": {
                 polled.drive.name: _described(line, polled) for line in self.lines for polled in line.drives
             },
@@ -132,6 +133,7 @@ _LINE = {
     "baudrate": Key(int, "baudrate = 9600"),
     "format": Key(str, 'format = "8N1"'),
     "silence": Key(str, 'silence = "500 us"'),
+    "switching": Key(str, 'switching = "2 ms"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 _DRIVE = {
@@ -163,10 +165,13 @@ def _line(table: Any, place: Place) -> Line:
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
         "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
     }
-    silence = place.attempt(parse_duration, given["silence"]) if "silence" in given else None
+    silence, switching = (
+        place.attempt(parse_duration, given[key]) if key in given else None
+        for key in ("silence", "switching")
+    )
     inherited = {**settings, "silence": silence}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
-    return Line(name, port, **settings, drives=tuple(drive for drive in drives if drive is not None))
+    return Line(name, port, **settings, drives=tuple(filter(None, drives)), switching=switching or 0.0)
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: Place) -> PolledDrive | None:

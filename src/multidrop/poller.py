@@ -97,6 +97,7 @@ class _PolledLine:
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
         self._ahead_ns = 0  # what is queued will take
         self._learnt_ns = 0
+        self.switching = declared.switching  # s; in the end as measured
         self._asked_of: list[tuple[Drive, Respondent]] = []
         self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
         self._reopening: threading.Thread | None = None
@@ -142,7 +143,7 @@ class _PolledLine:
     def start(self) -> None:
         self.started_ns = now_ns()
         self.bus.reset_statistics()
-        place = {drive: at for at, drive in enumerate(in_order(self.bus.drives))}
+        place = {drive: at for at, drive in enumerate(in_order(self.bus.drives, self.switching))}
         for job in sorted(self._jobs, key=lambda job: place[job.owner]):
             self.schedule.add(job, self.started_ns)
 
@@ -269,6 +270,8 @@ class _PolledLine:
         if self._reopening:
             self._reopening.join()
         self.ended_ns = now_ns()
+        if port := self.bus.line.queue:
+            self.switching = port.switching
 
     @property
     def is_under_way(self) -> bool:
@@ -303,6 +306,7 @@ class _PolledLine:
             "stray_bytes": sum(tally.stray_bytes for tally in tallies),
             "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
             "overrun_slots": sum(job.skipped for job in self._jobs),
+            "switching_ms": round(self.switching * 1e3, 3),
             "set_aside": [f"{job.owner.name}.{job.block.registers[0].name}" for job in self.set_aside],
             "drives": drives,
         }

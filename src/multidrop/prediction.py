@@ -42,6 +42,7 @@ class Prediction:
     """Of one line: `cycle` is that of everything polled as fast as the line allows, in s."""
 
     cycle: float
+    switches: int  # of line settings in it
     utilisation: float  # over 1: so many times as fast the line would have to be
     rates: tuple[Rate, ...]
 
@@ -87,7 +88,7 @@ def predict(
     """What a line reaches on which these are polled.
 
     `delays` are the response delays in s that were measured, of drives that have any; `switching` is
-    what the port needs to change baud rate or format, 0 until somebody has measured it.
+    what the port needs to change baud rate or format, as a poll has measured it.
     """
     jobs = _jobs(exchanges, delays or {}, switching)
     _run(jobs, switching)
@@ -102,6 +103,7 @@ def predict(
             job.own + gap(jobs[at - 1].planned.drive, job.planned.drive, switching)
             for at, job in enumerate(jobs)
         ),
+        sum(job.planned.drive.settings != jobs[at - 1].planned.drive.settings for at, job in enumerate(jobs)),
         max(load, 1.0) if turn else load,
         tuple(
             Rate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,20 +46,18 @@ def duration_text(seconds: float) -> str:
     return f"{seconds:g} s" if seconds >= 1 else f"{seconds * 1e3:g} ms"
 
 
-def remedies(
-    exchanges: Sequence[Planned], prediction: Prediction, delays: Mapping[Drive, float] | None = None
-) -> Remedies:
-    """What would make these fit, of which this is predicted."""
+def remedies(exchanges: Sequence[Planned], prediction: Prediction, switching: float = 0.0) -> Remedies:
+    """What would make these fit, of which this is predicted; `switching` is as for `predict`."""
     tight = [rate for rate in prediction.rates if not rate.fits]
     return Remedies(
-        _every(exchanges, tight, max(1.0, prediction.utilisation), delays or {}),
-        _baudrate(exchanges, delays or {}),
-        _registers(exchanges, tight, delays or {}),
+        _every(exchanges, tight, max(1.0, prediction.utilisation), switching),
+        _baudrate(exchanges, switching),
+        _registers(exchanges, tight, switching),
     )
 
 
 def _every(
-    exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, delays: Mapping[Drive, float]
+    exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...] | None:
     """Longer by one factor, of which this is the least that can do."""
     hasty = {(rate.drive, rate.every) for rate in tight}
@@ -70,7 +68,7 @@ def _every(
             replace(it, every=longer[it.every]) if it.every and (it.drive, it.every) in hasty else it
             for it in exchanges
         ]
-        if predict(changed, delays).fits:
+        if predict(changed, switching=switching).fits:
             return tuple(longer.items())
     return None
 
@@ -81,9 +79,7 @@ def _rounded_up(seconds: float) -> float:
     return round(math.ceil(seconds / digit - 1e-9) * digit, 9)
 
 
-def _baudrate(
-    exchanges: Sequence[Planned], delays: Mapping[Drive, float]
-) -> tuple[int, tuple[Drive, ...]] | None:
+def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
     drives = dict.fromkeys(it.drive for it in exchanges)
     for baudrate in sorted({baudrate for drive in drives for baudrate in drive.baudrates}):
         slow = [it for it in drives if it.settings.baudrate < baudrate and baudrate in it.baudrates]
@@ -91,8 +87,7 @@ def _baudrate(
         changed = [
             one for drive in drives for one in planned(fast.get(drive, drive), _wanted(exchanges, drive))
         ]
-        known = {fast.get(drive, drive): delay for drive, delay in delays.items()}
-        if slow and predict(changed, known).fits:
+        if slow and predict(changed, switching=switching).fits:
             return baudrate, tuple(slow)
     return None
 
@@ -113,9 +108,7 @@ def _wanted(exchanges: Sequence[Planned], drive: Drive) -> list[tuple[Register[A
     return [(register, it.every) for it in exchanges if it.drive is drive for register in it.block.registers]
 
 
-def _registers(
-    exchanges: Sequence[Planned], tight: Sequence[Rate], delays: Mapping[Drive, float]
-) -> int | None:
+def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [it for it in exchanges if (it.drive, it.every) not in crowded]
 
@@ -125,7 +118,7 @@ def _registers(
             for rate in tight
             for one in planned(rate.drive, [(register, rate.every) for register in rate.registers[:count]])
         ]
-        return not predict([*others, *fewer], delays).fits
+        return not predict([*others, *fewer], switching=switching).fits
 
     most = max(len(rate.registers) for rate in tight)
     return bisect_left(range(1, most), True, key=is_too_many) or None

@@ -14,7 +14,7 @@ Figures = dict[str, Any]
 
 
 def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Predictions with the documents' response delays and with those measured, and the poller's summary."""
+    """Predictions, with the documents' response delays and with what was measured, and the summary."""
     wanted = line.planned()
     told = summary["drives"]
     known = {
@@ -25,11 +25,12 @@ def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
     asked_for = any(it.every is not None for it in wanted)  # then no cycle follows the other
     cycles = summary["exchanges"] / len(wanted)
     return {
-        "predicted": _figures(predict(wanted)),
-        "predicted_with_measured_delays": _figures(predict(wanted, known)),
+        "predicted": _figures(predict(wanted, switching=line.switching)),
+        "predicted_with_measured_delays": _figures(predict(wanted, known, summary["switching_ms"] / 1e3)),
         "measured": {
             "cycle_ms": None if asked_for or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
             "utilisation": summary["utilisation"],
+            "switching_ms": summary["switching_ms"],
             "exchanges_per_second": {
                 name: told["exchanges_per_second"] for name, told in summary["drives"].items()
             },
@@ -41,6 +42,7 @@ def _figures(prediction: Prediction) -> Figures:
     drives = dict.fromkeys(rate.drive for rate in prediction.rates)
     return {
         "cycle_ms": round(prediction.cycle * 1e3, 3),
+        "switches": prediction.switches,
         "utilisation": round(prediction.utilisation, 4),
         "exchanges_per_second": {
             drive.name: round(prediction.exchanges_per_second(drive), 2) for drive in drives
@@ -62,3 +64,6 @@ def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
         rows.append((f"{shortened(name)}, exchanges/s", *rates))
     yield from (f"  {row}" for row in aligned(rows, "<>>>"))
     yield "  by delays: predicted with the response delays that were measured"
+    if found["predicted"]["switches"]:
+        took = found["measured"]["switching_ms"]
+        yield f"  and with the {took:.2f} ms that the port needed to change its settings"

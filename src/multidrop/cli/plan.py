@@ -47,8 +47,8 @@ class _Plan:
 
 def _plan(line: Line) -> _Plan:
     wanted = line.planned()
-    prediction = predict(wanted)
-    return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction))
+    prediction = predict(wanted, switching=line.switching)
+    return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction, line.switching))
 
 
 def _misfits(plan: _Plan) -> list[str]:
@@ -93,6 +93,8 @@ def _text(plan: _Plan) -> Iterator[str]:
         f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest",
         WIDTH,
     )
+    if prediction.switches:
+        yield from _wrapped(_switching(plan))
     rows: list[Row] = [("DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED")]
     rows += [_row(rate) for rate in prediction.rates]
     yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
@@ -102,6 +104,13 @@ def _text(plan: _Plan) -> Iterator[str]:
         yield from _wrapped(f"! {plan.remedies}")
     for sentence in _warnings(plan):
         yield from _wrapped(f"? {sentence}")
+
+
+def _switching(plan: _Plan) -> str:
+    times = f"{plan.prediction.switches} times in a bus cycle the line changes its settings"
+    if plan.line.switching:
+        return f"{times}, {duration_text(plan.line.switching)} each"
+    return f'{times}; what that takes a poll tells: add it to the line, such as switching = "2 ms"'
 
 
 def _row(rate: Rate) -> Row:
@@ -134,6 +143,8 @@ def _as_json(plan: _Plan) -> dict[str, Any]:
         "fits": prediction.fits,
         "cycle_ms": round(prediction.cycle * 1e3, 3),
         "utilisation": round(prediction.utilisation, 4),
+        "switches": prediction.switches,
+        "switching_ms": plan.line.switching * 1e3,
         "drives": {polled.drive.name: _drive_as_json(plan, polled.drive.name) for polled in plan.line.drives},
         "misfits": _misfits(plan),
         "remedies": _remedies_as_json(plan.remedies) if plan.remedies else None,

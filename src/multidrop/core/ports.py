@@ -110,6 +110,11 @@ class Port:
         """The descriptor failed, and nothing more is carried out on it."""
         return bool(self._progress.lost)
 
+    @property
+    def switching(self) -> float:
+        """Seconds that a change of baud rate or format takes, on average; 0 before the first one."""
+        return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
+
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
         self._kept.add(exchange.respondent)  # the core still looks at it when a late answer comes
