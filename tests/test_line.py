@@ -477,6 +477,42 @@ def test_echo_behind_a_stray_byte(line: LineDriver) -> None:
     assert (line.completion.result, line.completion.skipped) == (8, 10)
 
 
+DAMAGED_ECHOES = {
+    "its end is missing": confirmation()[:5],
+    "its begin is missing": confirmation()[3:],
+    "a bit is wrong": bytes([confirmation()[0] ^ 4]) + confirmation()[1:],
+    "its middle is missing": confirmation()[:2] + confirmation()[4:],
+}
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("echo", DAMAGED_ECHOES)
+def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
+    """Nor does what comes then: it may be the echo, and what came before it noise. It can be read back."""
+    teach_echo(line)
+    ask(line, WRITE)
+    line.receive(DAMAGED_ECHOES[echo] + confirmation(), piece)
+    line.wait_until_done()
+    assert line.completion.result < 0
+    line.now += 10 * TIMEOUT
+    ask(line)
+    answer(line, rtu("01 03 00 00 00 01") + reply_of(2))
+    assert line.completion.reply.data == words(2)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("cut", [(0, 5), (3, 8), (0, 1), (7, 8)])
+def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int, int], piece: int) -> None:
+    teach_echo(line)
+    ask(line)
+    echo = rtu("01 03 00 00 00 01")[slice(*cut)]
+    answer(line, echo + reply_of(2), piece)
+    assert (line.completion.reply.data, line.completion.skipped) == (words(2), len(echo))
+    ask(line, WRITE)
+    answer(line, confirmation())  # the line is still known to echo
+    assert line.completion.result == Result.NO_REPLY
+
+
 def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
     teach_echo(line)
     ask(line)

@@ -54,6 +54,12 @@ class Slow(Toy):
     baudrates = (9600,)
 
 
+class Brisk(Toy):
+    """On a line on which the standard's silence is longer than 3.5 characters."""
+
+    baudrates = (38_400,)
+
+
 READINGS = Quick.readings()
 NAMES = {it.name for it in READINGS}
 ONE = [Quick.output_current]
@@ -295,6 +301,20 @@ def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
         for _ in range(3):
             polling.until("ok")
             polling.until("no reply")
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+def test_a_silence_that_is_too_short_for_the_drive() -> None:
+    """It takes a request that comes before its own silence is over for the rest of the frame before."""
+    strict = simulated(Brisk(1, name="pump-1"))
+    strict.needs_silence = True
+    hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)
+    with Simulator([Wire([strict])]) as sim, Polling(line(sim.wires[0].path, hasty)) as polling:
+        polling.until("ok")
+        polling.until("no reply", 2)
+        polling.until("ok")
+    assert strict.counters.early > 0
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     polling.check_summary()
 

@@ -192,6 +192,28 @@ def test_all_silent_drives_together_cost_their_share() -> None:
     assert 0 < asked * cost_ms / 3_600_000 <= SILENT_SHARE
 
 
+@pytest.mark.parametrize("dead", [1, 5, 10])
+@pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
+def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int | None) -> None:
+    """Of 31, once it is known: the others keep 97 % of the rate that they have without them."""
+    answered: list[int] = []
+    for count in (31, 31 - dead):
+        made = schedule(*(job(drive, period_ms, duration_ms=12) for drive in range(count)))
+        failures = dict.fromkeys(range(31 - dead, 31), 0)
+        at, good = 0, 0
+        while at < 200_000 * MS:
+            ((it, due),) = made.take(at, at, at + 10_000 * MS, 1)
+            at = max(at, due) + it.duration_ns
+            if it.drive in failures:
+                at += 300 * MS
+                failures[it.drive] += 1
+                made.observe(it.drive, failures[it.drive], at, late_until_ns=at, cost_ns=300 * MS)
+            elif at > 20_000 * MS:
+                good += 1
+        answered.append(good)
+    assert answered[0] >= 0.97 * answered[1]
+
+
 def test_a_drive_that_wakes_is_asked_one_thing_and_is_back_with_its_first_answer() -> None:
     made = schedule(job(1), job(1), other := job(2))
     fail(made, 1, 2, now_ms=0)
