@@ -219,7 +219,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + 'silence = "0 us"\n' + TOY,
-            'line "L": \'0 us\' is not a duration above 0, such as "50 ms", "2 s" or "1 min"',
+            'line "L": \'0 us\' is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"',
         ),
         (
             HEAD + "silence = 0.0005\n" + TOY,
