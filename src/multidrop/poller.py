@@ -29,7 +29,7 @@ from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silenc
 from multidrop.plant import Plant
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
-from multidrop.statistics import LineStatistics
+from multidrop.statistics import LineStatistics, Statistics
 
 LOOK_S = 0.05  # the longest that a line waits to be tended, or whoever wants rows to be told of them
 REST_S = 0.5  # the same, where nobody waits for either
@@ -322,6 +322,7 @@ class _PolledLine:
             "exchanges_per_second": round(tally.answered / seconds, 2),
             "samples_per_second": round(tally.values / seconds, 2),
             "response_delay_ms": round(respondent.response_delay * 1e3, 3),
+            "p99_delay_ms": round(Statistics(seconds, tally).delays.p99 * 1e3, 3),
             "misses": dict(misses),
         }
 
