@@ -8,19 +8,22 @@ import os
 import pty
 import random
 import signal
+import socket
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from frames import PRINTED
+from lines import PATIENCE
 from peers import require_module
 from taps import tapped
 from test_cli import Run, run
 from test_cli_poll import MULTIDROP, multidrop, recorded
+from test_line_ports import SerialServer, pyserials_own
 from test_sim_lines import opened, receive
 
 from multidrop.capture import CaptureWriter, Side
@@ -220,6 +223,76 @@ def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
         os.write(listener.fileno(), b"\x01")
 
 
+# ---- behind a network ----
+
+
+class FarLine:
+    """A line at the far end of a connection: says the same again and again, and keeps what it is told."""
+
+    def __init__(self, said: bytes) -> None:
+        self._said = said
+        self.told = b""
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._server.accept()
+        with connection, suppress(OSError):
+            connection.settimeout(0.005)
+            while True:
+                connection.sendall(self._said)
+                with suppress(TimeoutError):
+                    more = connection.recv(1024)
+                    if not more:
+                        return
+                    self.told += more
+
+    def close(self) -> bytes:
+        """What it was told in the end."""
+        self._thread.join(timeout=PATIENCE)
+        self._server.close()
+        return self.told
+
+
+@pytest.mark.parametrize("kind", ["socket", "rfc2217"])
+@pyserials_own
+def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:
+    far = FarLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
+    server = SerialServer(far.url) if kind == "rfc2217" else None
+    url = server.url if server else far.url
+    status, out, err = run("sniff", url, "--baudrate", 19200, "--format", "8E1", "--seconds", 2, "--json")
+    assert (status, err) == (0, f"listening on {url}, Ctrl-C ends\n")
+    told = [json.loads(line) for line in out.splitlines()]
+    assert {it["line"] for it in told[:-1]} == {url}
+    assert told[-1]["summary"]["exchanges"] > 10
+    heard = [it.get("frames", [])[1:] for it in told[2:-2]]  # it may begin, and end, amid a frame
+    pair = [[it.frame.hex(" ").upper()] for it in (READ, WRITE)]
+    assert heard in ((len(heard) * pair)[: len(heard)], (len(heard) * pair)[1 : len(heard) + 1])
+    if server:
+        assert (server.port.baudrate, server.port.parity) == (19200, "E")
+        server.close()
+    assert far.close() == b""
+
+
+def test_a_url_s_port_has_no_write() -> None:
+    far = FarLine(b"")
+    with Listener(far.url, Settings(9600, "8N1")) as listener:
+        (port,) = (it for it in vars(listener._source).values() if hasattr(it, "write"))
+        with pytest.raises(OSError, match="only listened to: 01 is not sent"):
+            port.write(b"\x01")
+    assert far.close() == b""
+
+
+def test_a_network_that_goes_away_ends_it_with_a_sentence(run: Run) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        threading.Thread(target=lambda: server.accept()[0].close(), daemon=True).start()
+        status, _, err = run("sniff", url)
+    assert (status, err.splitlines()[-1]) == (1, f"multidrop: {url}: the port was lost (hung up)")
+
+
 # ---- replay ----
 
 PAIRS = {it.frame: it for it in PRINTED if it.request is not None}
@@ -307,7 +380,8 @@ def test_what_cannot_be_listened_to_is_told_in_a_sentence(run: Run, tmp_path: Pa
         (tmp_path / "none", "there is no such port"),
         (ordinary, "it is not a serial port"),
         (tmp_path, "it is not a serial port"),
-        ("socket://127.0.0.1:9", "only a device such as /dev/ttyUSB0 can be opened so that nothing is sent"),
+        ("socket://127.0.0.1:9", "nothing listens there"),
+        ("socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"),
     ):
         assert run("sniff", port) == (1, "", f"multidrop: {port}: {sentence}\n")
 

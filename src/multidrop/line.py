@@ -20,7 +20,16 @@ import serial
 from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError
 
-__all__ = ["Line", "Wake", "now_ns", "sleep", "utc_minus_monotonic_ns"]
+__all__ = [
+    "PORT_FAILURES",
+    "Line",
+    "Wake",
+    "check_address",
+    "now_ns",
+    "reason_of",
+    "sleep",
+    "utc_minus_monotonic_ns",
+]
 
 sleep = time.sleep
 
@@ -39,7 +48,7 @@ _TIOCGICOUNT = 0x545D
 _ICOUNTER = struct.Struct("20i")
 _OVERRUN, _BUF_OVERRUN = 7, 10
 
-_PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
+PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
 
 _OPEN_REASONS = {
     errno.ENOENT: "there is no such port",
@@ -52,7 +61,7 @@ _OPEN_REASONS = {
 }
 
 
-def _reason(failure: BaseException) -> str:
+def reason_of(failure: BaseException) -> str:
     """Why, in words: pyserial hides the system's error in its own, or behind it."""
     for error in (failure, failure.__context__):
         if isinstance(error, socket.gaierror):
@@ -63,7 +72,7 @@ def _reason(failure: BaseException) -> str:
     return str(failure)
 
 
-def _check_address(port: str) -> None:
+def check_address(port: str) -> None:
     """ValueError for a URL of a network port that does not say where it is."""
     url = urlsplit(port)
     if url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port):
@@ -123,13 +132,13 @@ class _Bridge:
             thread.start()
 
     def _out(self) -> None:
-        with suppress(*_PORT_FAILURES):
+        with suppress(*PORT_FAILURES):
             while request := self._ours.recv(1024):
                 self._port.write(request)
         self._hang_up()
 
     def _in(self) -> None:
-        with suppress(*_PORT_FAILURES):
+        with suppress(*PORT_FAILURES):
             while not self._closing.is_set():
                 received = self._port.read(1)  # waits for 10 ms at most
                 if received:
@@ -169,7 +178,7 @@ class Line:
 
     def _open(self) -> None:
         try:
-            _check_address(self.port)
+            check_address(self.port)
             port = self._serial = serial.serial_for_url(self.port, do_not_open=True)
             port.timeout = 0
             if isinstance(port, serial.Serial):
@@ -178,11 +187,11 @@ class Line:
             self._core = self._drive(port)
             if self._tap:
                 self._core.tap(self._tap)
-            with suppress(*_PORT_FAILURES, AttributeError, NotImplementedError):
+            with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
-        except _PORT_FAILURES as failure:
+        except PORT_FAILURES as failure:
             self.close()
-            raise LineError(self.port, _reason(failure)) from failure
+            raise LineError(self.port, reason_of(failure)) from failure
 
     def _drive(self, port: serial.SerialBase) -> Port:
         if type(port).read is serial.Serial.read:
@@ -212,7 +221,7 @@ class Line:
                 self._bridge.close()
                 self._bridge = None
             if self._serial:
-                with suppress(*_PORT_FAILURES):
+                with suppress(*PORT_FAILURES):
                     self._serial.close()
 
     def tap(self, tap: Tap) -> None:
@@ -240,8 +249,8 @@ class Line:
                 raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
             try:
                 _make(self._serial, settings)
-            except _PORT_FAILURES as failure:
-                raise LineError(self.port, _reason(failure)) from failure
+            except PORT_FAILURES as failure:
+                raise LineError(self.port, reason_of(failure)) from failure
             self._settings = settings
 
     def _opened(self, settings: tuple[int, str]) -> Port:
@@ -288,7 +297,7 @@ class Line:
             if self._bridge or not self._serial:
                 return None
             fcntl.ioctl(self._serial.fileno(), _TIOCGICOUNT, counts)
-        except (*_PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
+        except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
             return None
         found = _ICOUNTER.unpack(counts)
         return int(found[_OVERRUN] + found[_BUF_OVERRUN])

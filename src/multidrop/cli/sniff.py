@@ -19,13 +19,14 @@ from multidrop.cli.target import add_json_argument
 from multidrop.plant import Line, Plant, load_plant
 from multidrop.timing import Settings
 
-_LOOK_S = 0.05
 _SILENT_S = 0.5  # so long no frame pauses midway
 _GIVEN_UP_S = 1.5  # so long no master waits for a reply
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("port", metavar="PORT", nargs="?", help="device such as /dev/ttyUSB0")
+    parser.add_argument(
+        "port", metavar="PORT", nargs="?", help="device such as /dev/ttyUSB0, or pyserial URL"
+    )
     parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             line = _line_at(plant, arguments.port)
             listener = stack.enter_context(Listener(arguments.port, _settings(arguments, line)))
             out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
-            ear = Ear(line.name if line else Path(arguments.port).name, line, as_json=arguments.json, out=out)
+            ear = Ear(line.name if line else _name(arguments.port), line, as_json=arguments.json, out=out)
             _listen(listener, ear, arguments.seconds)
             counts = ear.pairing.counts()
     print(json.dumps({"summary": counts}) if arguments.json else summary(counts))
@@ -61,6 +62,10 @@ def _line_at(plant: Plant | None, port: str) -> Line | None:
     """The plant's line at this port; its only line may be listened to at any."""
     lines = plant.lines if plant else ()
     return next((line for line in lines if line.port == port), line_of(plant, port))
+
+
+def _name(port: str) -> str:
+    return port if "://" in port else Path(port).name
 
 
 def _settings(arguments: argparse.Namespace, line: Line | None) -> Settings:
@@ -78,7 +83,7 @@ def _listen(listener: Listener, ear: Ear, seconds: float | None) -> None:
             now = time.monotonic()
             if seconds is not None and now - begun >= seconds:
                 break
-            if listener.hear(_LOOK_S):
+            if listener.hear():
                 heard_at = now
             listener.heard.end(now - heard_at > _SILENT_S)
             ear.hear(listener.heard)

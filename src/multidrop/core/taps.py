@@ -8,7 +8,7 @@ from typing import Any
 from multidrop._core import ffi, lib
 from multidrop.core.overheard import Side
 
-_RING = 1 << 17  # bytes: what a fast line says in some seconds
+_RING = 1 << 18  # bytes: what a fast line says in some seconds
 _TAKEN = 1 << 16  # bytes of packets at a time
 
 
