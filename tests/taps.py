@@ -6,22 +6,25 @@ import os
 import selectors
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from multidrop.core import set_settings
 
 
 @contextmanager
-def tapped(drives: str, baudrate: int) -> Iterator[tuple[str, str]]:
-    """Paths of the master's port and of the listener's; behind `drives` is the port that is mastered."""
+def tapped(drives: str, baudrate: int, hear: Callable[[bytes], bytes] = bytes) -> Iterator[tuple[str, str]]:
+    """Paths of the master's port and of the listener's; behind `drives` is the port that is mastered.
+
+    `hear` tells what the listener hears of what was said.
+    """
     behind = os.open(drives, os.O_RDWR | os.O_NOCTTY)
     set_settings(behind, baudrate, "8N1")
     (master, master_port), (tap, tap_port) = os.openpty(), os.openpty()
     for port in (master_port, tap_port):
         tty.setraw(port)
     reader, writer = os.pipe()
-    thread = threading.Thread(target=_copy, args=(behind, master, tap, reader), daemon=True)
+    thread = threading.Thread(target=_copy, args=(behind, master, tap, reader, hear), daemon=True)
     thread.start()
     try:
         yield os.ttyname(master_port), os.ttyname(tap_port)
@@ -32,7 +35,7 @@ def tapped(drives: str, baudrate: int) -> Iterator[tuple[str, str]]:
             os.close(fd)
 
 
-def _copy(behind: int, master: int, tap: int, stop: int) -> None:
+def _copy(behind: int, master: int, tap: int, stop: int, hear: Callable[[bytes], bytes]) -> None:
     with selectors.DefaultSelector() as ready:
         for fd in (behind, master, stop):
             ready.register(fd, selectors.EVENT_READ)
@@ -42,5 +45,5 @@ def _copy(behind: int, master: int, tap: int, stop: int) -> None:
                     return
                 with suppress(OSError):
                     said = os.read(key.fd, 1024)
-                    os.write(tap, said)  # first, so that it hears a request before its reply
+                    os.write(tap, hear(said))  # first, so that it hears a request before its reply
                     os.write(master if key.fd == behind else behind, said)

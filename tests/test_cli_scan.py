@@ -67,6 +67,11 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
         (2, "innovert-ibd"),
         (3, "toy"),
     ]
+    status, told, _ = run("poll", out, "--seconds", 1, "--json")
+    assert status == 0
+    polled = json.loads(told)["lines"]["line-1"]["drives"]
+    assert set(polled) == {"invt-che-1", "innovert-ibd-2", "toy-3"}
+    assert all(it["samples"] for it in polled.values())
     status, _, err = run("scan", port, *words)
     assert status == 2
     assert "is there already" in err

@@ -1,4 +1,4 @@
-"""`sniff` and `decode`: a mixed line that others master, while we only listen."""
+"""`sniff` and `decode`: live, behind a network, from captures, and what goes wrong."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import fcntl
 import json
 import os
 import pty
-import random
 import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,13 @@ from typing import Any
 import pytest
 from frames import PRINTED
 from lines import PATIENCE
-from peers import require_module
 from taps import tapped
 from test_cli import Run, run
 from test_cli_poll import MULTIDROP, multidrop, recorded
 from test_line_ports import SerialServer, pyserials_own
-from test_sim_lines import opened, receive
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.cli.listening import Listener
-from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -37,7 +33,6 @@ from multidrop.timing import Settings
 
 __all__ = ["run"]  # a fixture
 
-EXCHANGES = int(os.environ.get("SNIFFED_EXCHANGES", "300"))
 DRIVES = (InnovertIBD(1), InvtCHE(2), InnovertIBD(3, framing="ascii"), DelixiNative(4))
 PLANT = """
 [[line]]
@@ -115,81 +110,6 @@ def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
             process.send_signal(signal.SIGINT)
             reader.join(timeout=20)
             process.kill()
-
-
-# ---- masters that know nothing of us ----
-
-Said = tuple[int, int, list[int] | int]  # address, function, values or minus the exception code
-
-
-def pymodbus(
-    framer: str, address: int, starts: list[int], written: int
-) -> Callable[[str, random.Random, int], list[Said]]:
-    """A master that reads and writes with pymodbus."""
-
-    def master(port: str, chance: random.Random, count: int) -> list[Said]:
-        client = require_module("pymodbus.client")
-        kind = require_module("pymodbus").FramerType(framer)
-        said: list[Said] = []
-        with client.ModbusSerialClient(port, framer=kind, baudrate=9600, timeout=5) as it:
-            for _ in range(count):
-                if chance.random() < 0.8:
-                    start = chance.choice(starts)
-                    reply = it.read_holding_registers(start, count=chance.randint(1, 3), device_id=address)
-                    values = -reply.exception_code if reply.isError() else reply.registers
-                    said.append((address, 3, values))
-                else:
-                    assert not it.write_register(*written, device_id=address).isError()
-                    said.append((address, 6, [written[1]]))
-        return said
-
-    return master
-
-
-def delixi(port: str, chance: random.Random, count: int) -> list[Said]:
-    """pymodbus does not speak it."""
-    said: list[Said] = []
-    for _ in range(count):
-        register = chance.choice([DelixiNative.output_frequency, DelixiNative.output_current])
-        request = Message(4, 7, register.address, data=bytes(4))
-        with opened(port) as fd:
-            os.write(fd, build_request(Framing.DELIXI, request))
-            _, reply = parse_reply(Framing.DELIXI, receive(fd, 21), request)
-        assert reply is not None
-        said.append((4, 7, [int.from_bytes(reply.data)]))
-    return said
-
-
-FREQUENCY, STOP = (InnovertIBD.frequency.address, 1000), (InvtCHE.control.address, 5)
-MASTERS = (
-    pymodbus("rtu", 1, [0, 1], FREQUENCY),
-    pymodbus("rtu", 2, [0x3000, 0x3001], STOP),
-    pymodbus("ascii", 3, [0, 1], FREQUENCY),
-    delixi,
-)
-
-
-def _said(told: dict[str, Any]) -> list[int] | int:
-    return -told["exception"] if told["result"] == "refused" else list(told["values"].values())
-
-
-def test_every_exchange_of_a_mixed_line_is_heard(line: tuple[str, str]) -> None:
-    port, tap = line
-    chance = random.Random(1)
-    said: list[Said] = []
-    with sniffing(tap) as sniffer:
-        while len(said) < EXCHANGES:
-            said += chance.choice(MASTERS)(port, chance, 10)
-    heard = [(it["address"], it["function"], _said(it)) for it in sniffer.told[:-1]]
-    assert heard == said
-    assert sniffer.summary == {
-        "exchanges": len(said),
-        "broadcasts": 0,
-        "unanswered": 0,
-        "strays": 0,
-        "unknown_bytes": 0,
-    }
-    assert {it["framing"] for it in sniffer.exchanges} == {"rtu", "ascii", "delixi"}
 
 
 def test_a_poll_s_values_are_heard_captured_and_decoded(

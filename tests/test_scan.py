@@ -18,9 +18,10 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
 from multidrop.errors import LineError
-from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, scan, sweeps
+from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
 from multidrop.sim.dialect import Reason, Refusal
+from multidrop.sim.ibd import SimulatedIBD
 from multidrop.timing import Settings
 
 FAMILIES = list(MODELS.values())
@@ -255,6 +256,20 @@ def test_two_drives_at_one_address_are_recognised() -> None:
     ]
 
 
+class Everything(Echo, Junk):
+    """Echo, stray bytes and noise together."""
+
+
+def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address() -> None:
+    one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
+    one["output_current"], twin["output_current"] = 41.1, 77.7
+    line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
+    findings = found(line, sweeps(FAMILIES))
+    assert drives(findings) == declared(*ALL_EIGHT)
+    assert {it.address for it in findings if not isinstance(it, Found)} == {9}
+    assert {type(it) for it in findings} == {Found, Crowd}
+
+
 class OneAfterTheOther(Shared):
     """The second drive at the address is slower: it answers when the first one has done."""
 
@@ -365,7 +380,7 @@ def test_every_question_is_a_read_of_the_documents() -> None:
     assert len(set(questions(sweeps(FAMILIES)))) < 10
 
 
-class Bare(SimulatedDrive):
+class Bare(SimulatedIBD):
     """An IBD of which only what examples of its manual show is there: the addresses above are inferred."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
@@ -373,13 +388,27 @@ class Bare(SimulatedDrive):
             raise Refusal(Reason.READ_ADDRESS)
         return super().read(function, start, count)
 
-    codes = {}
 
-
-def test_an_ibd_that_does_not_show_its_line_is_found_but_not_named() -> None:
-    line = Line(Pair([Bare(InnovertIBD(3)), Bare(InnovertIBD(4, framing="ascii"))]))
+def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
+    bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
+    line = Line(Pair([Bare(it) for it in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
-    assert drives(found(line, plan)) == {(3, "", "9600 8N1", "rtu"), (4, "", "9600 8N1", "ascii")}
+    findings = found(line, plan)
+    assert drives(findings) == declared(*bare)
+    assert {it.doubt for it in findings} == {"it only reads like one: look at its name plate"}
+    text = plant_text("/dev/ttyUSB0", findings, MODELS)
+    assert text.count("# it only reads like one: look at its name plate") == 2
+    assert text.count("# confirmed = 1  # once its name plate says so") == 2
+
+
+def test_what_has_other_bits_than_an_ibd_s_terminals_is_none() -> None:
+    for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
+        drive = Bare(InnovertIBD(3))
+        drive.shows = {(0x03, 22): lambda self, bits=bits: bits}
+        line = Line(Pair([drive]))
+        assert drives(found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))) == {
+            (3, "", "9600 8N1", "rtu")
+        }
 
 
 class Anything(SimulatedDrive):

@@ -361,6 +361,11 @@ class Drive:
         """
         yield from ()
 
+    def resembles(self) -> Script[bool]:
+        """Whether it reads like one of the family where `identify` refuses it: good for a guess alone."""
+        yield from ()
+        return False
+
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start the motor at the setpoint in force; without a direction, in the one in force."""

@@ -24,6 +24,8 @@ from multidrop.register import HOLDING, command, reading, setting
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 
+SEEN_AS_1, NEVER_ELSE = 0x1800, 0xD800  # of PrA.22: bits 11 and 12, and with them 14 and 15
+
 INFERRED = "the address is inferred: the table of letters is lost"
 OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 = 9600 bit/s"
 
@@ -229,6 +231,17 @@ class InnovertIBD(Drive):
         except DriveRefused:
             return False
         return baudrate == Baudrate[f"B{self.settings.baudrate}"] and address == self.address
+
+    def resembles(self) -> Script[bool]:
+        """Bits 11 and 12 of PrA.22 are 1, as in the example, 14 and 15 are 0, and what is named is there."""
+        try:
+            yield from read(self.output_current)
+            yield from read(self.motor_speed)
+            yield from read(self.acceleration_time)
+            yield from read(self.run_source)
+            return (yield from read(self.terminals)) & NEVER_ELSE == SEEN_AS_1
+        except BusError:
+            return False
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from multidrop.core import Framing
 from multidrop.timing import Settings
 
+GUESS = "it only reads like one: look at its name plate"
+
 
 @dataclass(frozen=True)
 class Found:

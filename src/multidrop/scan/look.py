@@ -54,7 +54,7 @@ class Look:
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         self._respondent = self._scan.respondent(min(LEAST_TIMEOUT, known), known)
         self._answered = False
-        drives = recognise(self._sweep, self._address, families, self._reply)
+        drives, guess = recognise(self._sweep, self._address, families, self._reply)
         self.excess = self.response_delay - max((it.response_delay for it in drives), default=LEAST_TIMEOUT)
         return Found(
             self._address,
@@ -62,7 +62,7 @@ class Look:
             self._sweep.framing,
             tuple(drive.model or type(drive).__name__ for drive in drives),
             self.response_delay,
-            self._doubt(),
+            "; ".join(filter(None, (guess, self._doubt()))),
         )
 
     def _reply(self, drive: Drive, request: Message) -> Message:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 
 from multidrop.drive import Drive
-from multidrop.scan.findings import Found
+from multidrop.scan.findings import GUESS, Found
 from multidrop.scan.recognise import candidate
 
 
@@ -45,6 +45,8 @@ def _drive(it: Found, model: str, family: type[Drive]) -> Iterator[str]:
     yield f'framing = "{it.framing}"'
     yield f"baudrate = {drive.settings.baudrate}"
     yield f'format = "{drive.settings.format}"'
+    if GUESS in it.doubt and "confirmed" in family.options:
+        yield "# confirmed = 1  # once its name plate says so: before, nothing is written to it"
 
 
 def _text(value: str) -> str:

@@ -7,6 +7,7 @@ readings are there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from multidrop.core import Framing, Message, raw_value
@@ -14,6 +15,7 @@ from multidrop.drive import Drive, Read, Script
 from multidrop.errors import BusError, Refused
 from multidrop.plan import blocks
 from multidrop.register import Register
+from multidrop.scan.findings import GUESS
 from multidrop.scan.sweep import Sweep
 from multidrop.timing import Settings
 
@@ -22,19 +24,24 @@ Ask = Callable[[Drive, Message], Message]  # raises BusError where nothing good 
 MOST_READINGS = 3  # that are looked at where a family has no look of its own
 
 
-def recognise(sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask) -> list[Drive]:
-    """Drives of the families that fit best; several where they fit alike, none where none fits."""
+def recognise(
+    sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask
+) -> tuple[list[Drive], str]:
+    """Drives of the families that fit best, and what is to be doubted.
+
+    There are several where they fit alike, and none where none fits.
+    """
+    found = [candidate(family, sweep.settings, sweep.framing, address) for family in families]
+    drives = [drive for drive in found if drive is not None]
     scores: list[tuple[int, Drive]] = []
-    for family in families:
-        drive = candidate(family, sweep.settings, sweep.framing, address)
-        if drive is None:
-            continue
-        try:
+    for drive in drives:
+        with suppress(BusError, ValueError):  # what it must have is not there
             scores.append((_score(drive, ask), drive))
-        except (BusError, ValueError):
-            continue  # what it must have is not there
-    best = max((score for score, _ in scores), default=0)
-    return [drive for score, drive in scores if score == best]
+    if scores:
+        best = max(score for score, _ in scores)
+        return [drive for score, drive in scores if score == best], ""
+    alike = [drive for drive in drives if _resembles(drive, ask)]
+    return alike, GUESS if alike else ""
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
@@ -72,8 +79,14 @@ def _score(drive: Drive, ask: Ask) -> int:
     return score
 
 
-def _perform(drive: Drive, script: Script[None], ask: Ask) -> None:
-    """Carry a look out: reads only."""
+def _resembles(drive: Drive, ask: Ask) -> bool:
+    with suppress(BusError, ValueError):
+        return bool(_perform(drive, drive.resembles(), ask))
+    return False
+
+
+def _perform(drive: Drive, script: Script[Any], ask: Ask) -> Any:
+    """Carry a look out, which only reads; what it says."""
     try:
         step = next(script)
         while True:
@@ -85,8 +98,8 @@ def _perform(drive: Drive, script: Script[None], ask: Ask) -> None:
                 step = script.throw(failure)
             else:
                 step = script.send(value)
-    except StopIteration:
-        return
+    except StopIteration as end:
+        return end.value
 
 
 def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
