@@ -386,6 +386,10 @@ def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None
         "",
         f"multidrop: {capture} is there already: name another file, or remove it first\n",
     )
+    assert run("poll", mixed_plant, "--flight-recorder", capture)[::2] == (
+        2,
+        f"multidrop: {capture} is a file: name a directory for the flight recorder\n",
+    )
     assert run("poll", mixed_plant, "--capture", "a.csv")[::2] == (
         2,
         "multidrop: a.csv: a capture's name ends in .pcapng\n",

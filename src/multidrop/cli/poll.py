@@ -17,7 +17,7 @@ from multidrop.cli.interruption import Interruption
 from multidrop.cli.live import LiveTable
 from multidrop.cli.overwriting import check_capture, refuse_overwriting
 from multidrop.cli.tapping import Tapping, tapping_text
-from multidrop.cli.target import add_json_argument
+from multidrop.cli.target import add_json_argument, duration
 from multidrop.cli.values import aligned
 from multidrop.plant import Plant, load_plant
 from multidrop.poller import Poller
@@ -36,7 +36,7 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
     parser.add_argument(
         "--seconds",
         metavar="S",
-        type=_seconds,
+        type=duration,
         default=seconds,
         help=f"how long; {seconds or 'until Ctrl-C'}",
     )
@@ -65,6 +65,8 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
     """Poll the plant as `add_polling_arguments` says, and tell what became of it."""
     if arguments.capture:
         check_capture(arguments.capture)
+    if arguments.flight_recorder and arguments.flight_recorder.is_file():
+        raise ValueError(f"{arguments.flight_recorder} is a file: name a directory for the flight recorder")
     show = not arguments.json and sys.stdout.isatty()
     table = LiveTable(plant, sys.stdout) if show else None
     with ExitStack() as stack:
@@ -128,13 +130,3 @@ def _text(summary: dict[str, Any]) -> str:
     lines.append(f"{summary['samples']} samples and {summary['misses']} misses{into}{dropped}")
     lines += tapping_text(summary)
     return "\n".join(lines)
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
-    return seconds

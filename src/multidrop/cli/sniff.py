@@ -15,7 +15,7 @@ from multidrop.cli.interruption import Interruption
 from multidrop.cli.listening import Listener
 from multidrop.cli.overheard import Ear, replay, summary
 from multidrop.cli.overwriting import check_capture
-from multidrop.cli.target import add_json_argument
+from multidrop.cli.target import add_json_argument, duration
 from multidrop.plant import Line, Plant, load_plant
 from multidrop.timing import Settings
 
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
     parser.add_argument("--baudrate", type=int, metavar="N", help="the plant's, or 9600")
     parser.add_argument("--format", metavar="8N1", help="the plant's, or 8N1")
-    parser.add_argument("--seconds", type=float, metavar="S", help="how long; until Ctrl-C")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; until Ctrl-C")
     add_json_argument(parser)
 
 
@@ -72,7 +72,8 @@ def _settings(arguments: argparse.Namespace, line: Line | None) -> Settings:
     """The arguments', else the line's, else those that most of its drives have."""
     found = [polled.drive.settings for polled in line.drives] if line else []
     usual = max(found, key=found.count) if found else Settings(9600, "8N1")
-    return Settings(arguments.baudrate or usual.baudrate, arguments.format or usual.format)
+    baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
+    return Settings(baudrate, arguments.format or usual.format)
 
 
 def _listen(listener: Listener, ear: Ear, seconds: float | None) -> None:

@@ -43,6 +43,17 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON for programs")
 
 
+def duration(text: str) -> float:
+    """How long, in s."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+    return seconds
+
+
 def drive_of(arguments: argparse.Namespace) -> Drive:
     """The drive that the arguments name, not yet on a bus; ValueError for what its family does not allow."""
     family = find_model(arguments.model)
