@@ -67,6 +67,7 @@ class WorldPort:
     """What the poller sees of an open port (core.Port), and what the core's thread does for it."""
 
     room = 256
+    switching = 0.0
 
     def __init__(self, world: World) -> None:
         self.lost = False
