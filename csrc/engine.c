@@ -65,6 +65,8 @@ struct md_port {
     int watched;       /* the waiter tells when it can be read */
     int emptied;       /* it was read empty a moment ago: nothing is there yet */
     int lost_error;
+    struct md_port *next; /* of those that wait to be opened */
+    int opened, open_error;
     int ending, closing, closed;
     struct md_line line;
     struct md_completion completion;
@@ -74,9 +76,10 @@ struct md_engine {
     pthread_t thread;
     pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the wishes */
     atomic_int callers;     /* clients that want the mutex, whom the thread lets in */
-    pthread_cond_t changed; /* a wish was granted, a port closed */
+    pthread_cond_t changed; /* a wish was granted, a port opened or closed */
     struct md_waiter *waiter;
     struct md_bell bell;
+    struct md_port *arriving; /* clients wait for these to be opened */
     struct md_port **ports;
     int64_t *wakes; /* when each port wants to be looked at, whatever happens */
     unsigned count, room;
@@ -364,10 +367,10 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 {
     if (until_ns == NEVER)
         return md_waiter_wait(engine->waiter, ready, READY, -1);
-    int64_t left = until_ns - engine->lateness_ns - md_now_ns();
+    int64_t wake_ns = until_ns - engine->lateness_ns, left = wake_ns - md_now_ns();
     int n = md_waiter_wait(engine->waiter, ready, READY, left > 0 ? left : 0);
-    if (n == 0 && left > 0) {
-        int64_t late = md_now_ns() - (until_ns - engine->lateness_ns);
+    int64_t late = md_now_ns() - wake_ns;
+    if (n == 0 && left > 0 && late >= 0) { /* else it could not sleep for so short a time */
         engine->lateness_ns += (late - engine->lateness_ns) / 8;
         if (engine->lateness_ns > MOST_LATENESS)
             engine->lateness_ns = MOST_LATENESS;
@@ -375,6 +378,42 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
             ;
     }
     return n;
+}
+
+/* Make room for one more port; 0 when there is no memory. */
+static int grow(struct md_engine *engine)
+{
+    if (engine->count < engine->room)
+        return 1;
+    unsigned room = engine->room ? 2 * engine->room : 16;
+    struct md_port **ports = realloc(engine->ports, room * sizeof *ports);
+    if (ports)
+        engine->ports = ports;
+    int64_t *wakes = realloc(engine->wakes, room * sizeof *wakes);
+    if (wakes)
+        engine->wakes = wakes;
+    if (!ports || !wakes)
+        return 0;
+    engine->room = room;
+    return 1;
+}
+
+/* Open those ports whose clients wait for it: nobody else may touch the waiter while it waits. */
+static void open_ports(struct md_engine *engine)
+{
+    for (struct md_port *port = engine->arriving; port; port = port->next) {
+        port->opened = 1;
+        if (!grow(engine) || md_waiter_add(engine->waiter, port->fd, port)) {
+            port->open_error = errno;
+            continue;
+        }
+        port->index = engine->count;
+        engine->wakes[engine->count] = NEVER;
+        engine->ports[engine->count++] = port;
+    }
+    if (engine->arriving)
+        pthread_cond_broadcast(&engine->changed);
+    engine->arriving = NULL;
 }
 
 /* Close those ports whose clients wait for it; nobody is on them now. */
@@ -428,6 +467,7 @@ static void *run(void *argument)
         }
         if (told) {
             md_bell_silence(&engine->bell);
+            open_ports(engine);
             close_ports(engine);
         }
         int64_t now_ns = md_now_ns();
@@ -491,24 +531,6 @@ void md_engine_stop(struct md_engine *engine)
     free(engine);
 }
 
-/* Make room for one more port; 0 when there is no memory. */
-static int grow(struct md_engine *engine)
-{
-    if (engine->count < engine->room)
-        return 1;
-    unsigned room = engine->room ? 2 * engine->room : 16;
-    struct md_port **ports = realloc(engine->ports, room * sizeof *ports);
-    if (ports)
-        engine->ports = ports;
-    int64_t *wakes = realloc(engine->wakes, room * sizeof *wakes);
-    if (wakes)
-        engine->wakes = wakes;
-    if (!ports || !wakes)
-        return 0;
-    engine->room = room;
-    return 1;
-}
-
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room)
 {
     struct md_port *port = calloc(1, sizeof *port);
@@ -531,15 +553,15 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
     enter(engine);
-    int added = grow(engine) && md_waiter_add(engine->waiter, fd, port) == 0;
-    if (added) {
-        port->index = engine->count;
-        engine->wakes[engine->count] = NEVER;
-        engine->ports[engine->count++] = port;
-    }
+    port->next = engine->arriving;
+    engine->arriving = port;
+    md_bell_ring(&engine->bell);
+    while (!port->opened)
+        pthread_cond_wait(&engine->changed, &engine->mutex);
     leave(engine);
-    if (added)
+    if (!port->open_error)
         return port;
+    errno = port->open_error;
     free(slots);
     free(port);
     return NULL;
@@ -556,9 +578,9 @@ int md_port_end(struct md_port *port)
 
 void md_port_tap(struct md_port *port, struct md_tap *tap)
 {
-    pthread_mutex_lock(&port->engine->mutex);
+    enter(port->engine);
     port->line.tap = tap;
-    pthread_mutex_unlock(&port->engine->mutex);
+    leave(port->engine);
 }
 
 void md_port_stop(struct md_port *port)

@@ -1,7 +1,8 @@
-/* Serial settings of a descriptor, made by ioctl and read back.
+/* Serial settings of a descriptor, made and read back: what was taken is what is found then.
  *
  * tcsetattr() reports EINVAL when nothing of what it was asked for took effect, so that a pty
- * cannot be reopened at even parity; the ioctl does not, and takes any baud rate. */
+ * cannot be reopened at even parity. Linux has an ioctl that does not, and takes any baud rate; other
+ * systems take what their termios knows. */
 #include "multidrop.h"
 
 #include <errno.h>
@@ -40,7 +41,7 @@ static int get(int fd, attributes *now)
 
 static int set(int fd, attributes *wanted, uint32_t baudrate)
 {
-    if (cfsetspeed(wanted, baudrate))
+    if (cfsetispeed(wanted, baudrate) || cfsetospeed(wanted, baudrate))
         return -errno;
     return tcsetattr(fd, TCSANOW, wanted) && errno != EINVAL ? -errno : 0;
 }
@@ -49,6 +50,10 @@ static uint32_t speed(const attributes *now)
 {
     return (uint32_t)cfgetospeed(now);
 }
+#endif
+
+#ifndef CRTSCTS /* POSIX knows no flow control by wires */
+#define CRTSCTS 0
 #endif
 
 static struct md_settings describe(const attributes *now)
