@@ -132,7 +132,7 @@ def mixed() -> Mixed:
         )
         for drive in drives
     ]
-    return Mixed(drives, words, len(exchanges), predict(exchanges).cycle)
+    return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
 
 def poll_mixed(port: str, seconds: float) -> dict[str, Any]:

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from line_driver import LineDriver
 
+from multidrop.bus import exchange
+from multidrop.core import Respondent, build_reply
 from multidrop.drive import Drive, Framing
 from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.plan import Planned, planned
-from multidrop.prediction import predict
+from multidrop.plan import Planned, in_order, planned
+from multidrop.prediction import LATENESS
+from multidrop.prediction import predict as predict_with_host
 from multidrop.register import HOLDING, reading
 from multidrop.remedies import Remedies, duration_text, remedies
 from multidrop.schedule import TURN_SHARE
+from multidrop.sim import EncodedDrive
 
 BIT = 1 / 9600
+predict = partial(predict_with_host, lateness=0.0)
 
 
 class Simple(Drive):
@@ -114,6 +123,57 @@ def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> N
     assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", True)]
     assert found.rates[1].reached == pytest.approx(TURN_SHARE / (2 * (OWN + SILENCE)))
     assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
+
+
+def test_a_host_is_late_in_each_exchange() -> None:
+    exchanges = [*asked(Simple(1)), *asked(Simple(2))]
+    assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
+
+
+# ---- against the core's own line, on a clock that only the test moves ----
+
+
+def carried_out(exchanges: Sequence[Planned]) -> float:
+    """Seconds of a bus cycle in which every drive answers after its document's delay."""
+    drives = in_order(dict.fromkeys(it.drive for it in exchanges))
+    order = [it for drive in drives for it in exchanges if it.drive is drive]
+    respondents = {it: Respondent(least_timeout=0.02, most_timeout=it.response_timeout) for it in drives}
+    made = [exchange(it.drive, it.block.request(it.drive.address), respondents[it.drive]) for it in order]
+    answers = [EncodedDrive(it.drive).answer(it.block.request(it.drive.address), 0) for it in order]
+    line = LineDriver()
+    begun = []
+    for _ in range(3):
+        begun.append(line.now)
+        for planned_, asked_, answer in zip(order, made, answers, strict=True):
+            assert answer is not None
+            reply = build_reply(planned_.drive.framing, answer)
+            line.begin(asked_)
+            request = line.wait_until_write()
+            characters = len(request) + len(reply)
+            own = characters * planned_.drive.settings.character + planned_.drive.response_delay
+            line.now += round(own * 1e9)
+            assert line.listens
+            line.receive(reply)
+            assert line.want == "done"
+            assert line.completion.result == len(reply)
+    return (begun[2] - begun[1]) / 1e9
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(sorted(MODELS)), st.integers(0, 2), st.integers(1, 6)),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, int]]) -> None:
+    exchanges: list[Planned] = []
+    for address, (model, framing, count) in enumerate(wanted, 1):
+        family = MODELS[model]
+        drive = family(address, framing=family.framings[framing % len(family.framings)])
+        exchanges += planned(drive, [(it, None) for it in drive.readings()[:count]])
+    assert carried_out(exchanges) == pytest.approx(predict(exchanges).cycle, rel=1e-5)
 
 
 PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])

@@ -1,7 +1,7 @@
 """What a line will reach: bus cycle, utilisation, the rate of each drive; before its port is opened. Pure.
 
-Every exchange is taken to succeed at once, and the host to cost nothing. Which exchange follows
-which is asked of the schedule itself, on a line of which only the clock exists.
+Every exchange is taken to succeed at once, and the host to be late by what is usual. Which exchange
+follows which is asked of the schedule itself, on a line of which only the clock exists.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from multidrop.plan import Planned, gap, in_order, kind, sending, silence
 from multidrop.register import Register
 from multidrop.schedule import TURN_SHARE, Job, Schedule
 
+LATENESS = 100e-6  # s of each exchange in which a common machine wakes up and writes the request
 ENOUGH = 0.97  # of a wanted rate: it counts as kept
 LEAST_EXCHANGES = 1000  # for so many the schedule is asked
 LEAST_ROUNDS = 3
@@ -63,7 +64,7 @@ class _Asked(Job):
     """A job with what became of it on the line of which only the clock exists."""
 
     planned: Planned
-    own: float  # s from the request's begin to the reply's end
+    own: float  # s from the end of the silence to that of the reply
     count: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -83,14 +84,18 @@ class _Asked(Job):
 
 
 def predict(
-    exchanges: Sequence[Planned], delays: Mapping[Drive, float] | None = None, switching: float = 0.0
+    exchanges: Sequence[Planned],
+    delays: Mapping[Drive, float] | None = None,
+    switching: float = 0.0,
+    lateness: float = LATENESS,
 ) -> Prediction:
     """What a line reaches on which these are polled.
 
     `delays` are the response delays in s that were measured, of drives that have any; `switching` is
-    what the port needs to change baud rate or format, as a poll has measured it.
+    what the port needs to change baud rate or format, as a poll has measured it, and `lateness` what
+    the host adds to each exchange: 0 for what the line alone would reach.
     """
-    jobs = _jobs(exchanges, delays or {}, switching)
+    jobs = _jobs(exchanges, delays or {}, switching, lateness)
     _run(jobs, switching)
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
@@ -118,7 +123,9 @@ def predict(
     )
 
 
-def _jobs(exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching: float) -> list[_Asked]:
+def _jobs(
+    exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching: float, lateness: float
+) -> list[_Asked]:
     """In the order of the bus cycle."""
     of_drive: dict[Drive, list[Planned]] = {}
     for exchange in exchanges:
@@ -134,7 +141,7 @@ def _jobs(exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching
         )
         for drive in in_order(of_drive, switching)
         for it in of_drive[drive]
-        for own in [sending(drive, it.block) + delays.get(drive, drive.response_delay)]
+        for own in [lateness + sending(drive, it.block) + delays.get(drive, drive.response_delay)]
     ]
 
 
