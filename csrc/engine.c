@@ -624,15 +624,17 @@ int md_port_submit(struct md_port *port, const struct md_exchange *const *exchan
     return taken;
 }
 
-void md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n)
+unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n)
 {
     enter(port->engine);
+    unsigned next = port->round_at;
     port->round = exchanges;
     port->round_len = port->progress.lost ? 0 : n;
     port->round_at = 0;
     put(&port->progress.repeating, port->round_len > 0);
     leave(port->engine);
     md_bell_ring(&port->engine->bell);
+    return next;
 }
 
 const struct md_progress *md_port_progress(struct md_port *port)

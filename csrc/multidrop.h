@@ -253,8 +253,8 @@ void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t numbe
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
 /* Carry these out one after the other, and again, while nothing that is queued is due; until they are
- * replaced, the port is lost, or one of them could not be sent. */
-void md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
+ * replaced, the port is lost, or one of them could not be sent. Which of those before was the next. */
+unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 /* How far the queue is: each number only grows, and wraps around. */
 struct md_progress {
     uint32_t submitted, done;

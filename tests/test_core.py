@@ -214,6 +214,16 @@ def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
         assert port.carry_out(read(9)).status == 0
 
 
+def test_how_far_the_repetition_was_is_told(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(0), read(1), read(2)])
+        rows.of("value", 20)
+        following = port.repeat([])
+        port.carry_out(read(9))  # after what was under way
+        assert following == (rows.of("value", 20)[-1] + 1) % 3
+
+
 def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)

@@ -142,6 +142,22 @@ def test_a_job_in_turn_is_not_begun_twice_while_others_wait() -> None:
     assert [it for it, _ in take(made, 0, 10)] == jobs[2:4]
 
 
+def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
+    """Else those at its end would never be asked."""
+    jobs = [job(drive) for drive in range(5)]
+    made = schedule(*jobs)
+    assert made.cycle(0) == jobs
+    made.go_on(jobs[3])
+    fail(made, 0, 1, now_ms=0)
+    assert made.cycle(0) == []
+    assert [it for it, _ in take(made, 0, 15)] == [jobs[3], jobs[4], jobs[0]]
+    fail(made, 0, 0, now_ms=15)
+    assert made.cycle(15 * MS) == [*jobs[1:], jobs[0]]
+    made.remove(jobs[2])
+    made.go_on(jobs[2])  # it was its turn when it was removed
+    assert made.cycle(15 * MS)[0] in jobs
+
+
 def test_no_more_is_planned_than_there_is_room_for() -> None:
     made = schedule(job(1), job(2, 10))
     assert len(take(made, 0, 1000, most=7)) == 7

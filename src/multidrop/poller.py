@@ -230,11 +230,15 @@ class _PolledLine:
 
     def _keep_busy(self, port: Port, now: int) -> None:
         cycle = self.schedule.cycle(now)
-        if not cycle:
-            self._top_up(port, now)
         if cycle != self._cycle or port.repeating != bool(cycle):
-            port.repeat([job.exchange for job in cycle])
-            self._cycle = cycle
+            following = port.repeat([])
+            if self._cycle:
+                self.schedule.go_on(self._cycle[following])
+            self._cycle = self.schedule.cycle(now)
+            if self._cycle:
+                port.repeat([job.exchange for job in self._cycle])
+        if not self._cycle:
+            self._top_up(port, now)
         if self.schedule.unasked:
             self._miss(self.schedule.unasked, Result.NOT_ASKED)
             self.schedule.unasked = []

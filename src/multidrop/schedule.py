@@ -106,7 +106,14 @@ class Schedule(Generic[J]):
 
     def cycle(self, now_ns: int) -> list[J]:
         """What is to be carried out again and again, where that is all: no slots, and all drives answer."""
-        return [] if self._must_look(now_ns) or self._waiting or self._begun else list(self._turn)
+        if self._must_look(now_ns) or self._waiting or self._begun:
+            return []
+        return self._turn[self._next :] + self._turn[: self._next]
+
+    def go_on(self, job: J) -> None:
+        """That cycle has come so far that it is this job's turn."""
+        if job in self._turn:
+            self._next = self._turn.index(job)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
         """What keeps the line busy from `start_ns`, when it has done all it was given, to the horizon.

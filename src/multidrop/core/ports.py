@@ -77,12 +77,16 @@ class Port:
         self._inbox = inbox
         lib.md_port_report(self.c, inbox.c, number)
 
-    def repeat(self, exchanges: Sequence[Exchange]) -> None:
-        """Carry these out again and again while nothing that is queued is due, until they are replaced."""
+    def repeat(self, exchanges: Sequence[Exchange]) -> int:
+        """Carry these out again and again while nothing that is queued is due, until they are replaced.
+
+        Returns which of those that are replaced would have been next.
+        """
         self._kept.update(exchanges)  # one of them may be under way when they are replaced
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
-        lib.md_port_repeat(self.c, rounds, len(exchanges))
+        following = lib.md_port_repeat(self.c, rounds, len(exchanges))
         self._round = rounds
+        return int(following)
 
     @property
     def repeating(self) -> bool:
