@@ -9,7 +9,6 @@ import fcntl
 import os
 import socket
 import struct
-import termios
 import threading
 import time
 from contextlib import suppress
@@ -17,6 +16,7 @@ from urllib.parse import urlsplit
 
 import serial
 
+from multidrop.bridge import PORT_FAILURES, Bridge, set_up
 from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError
 
@@ -47,8 +47,6 @@ _NO_SETTINGS = -1
 _TIOCGICOUNT = 0x545D
 _ICOUNTER = struct.Struct("20i")
 _OVERRUN, _BUF_OVERRUN = 7, 10
-
-PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
 
 _OPEN_REASONS = {
     errno.ENOENT: "there is no such port",
@@ -109,55 +107,6 @@ class Wake:
             os.close(self._writer)
 
 
-def _make(port: serial.SerialBase, settings: tuple[int, str]) -> None:
-    """Have pyserial set the port up, which may take it a while."""
-    baudrate, format = settings
-    port.baudrate = baudrate
-    port.bytesize = int(format[0])
-    port.parity = format[1]
-    port.stopbits = int(format[2])
-
-
-class _Bridge:
-    """A descriptor for a port that has none: a socket pair, and a thread for each direction."""
-
-    def __init__(self, port: serial.SerialBase) -> None:
-        self._port = port
-        self._port.timeout = 0.01
-        self._ours, self.theirs = socket.socketpair()
-        self.theirs.setblocking(False)
-        self._closing = threading.Event()
-        self._threads = [threading.Thread(target=copy, daemon=True) for copy in (self._out, self._in)]
-        for thread in self._threads:
-            thread.start()
-
-    def _out(self) -> None:
-        with suppress(*PORT_FAILURES):
-            while request := self._ours.recv(1024):
-                self._port.write(request)
-        self._hang_up()
-
-    def _in(self) -> None:
-        with suppress(*PORT_FAILURES):
-            while not self._closing.is_set():
-                received = self._port.read(1)  # waits for 10 ms at most
-                if received:
-                    self._ours.sendall(received + self._port.read_all())
-        self._hang_up()
-
-    def _hang_up(self) -> None:
-        with suppress(OSError):
-            self._ours.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self._closing.set()
-        self._hang_up()
-        for thread in self._threads:
-            thread.join()
-        self._ours.close()
-        self.theirs.close()
-
-
 class Line:
     """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
 
@@ -166,7 +115,7 @@ class Line:
 
     def __init__(self, port: str) -> None:
         self.port = port
-        self._bridge: _Bridge | None = None
+        self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
         self._serial: serial.SerialBase | None = None
         self._core: Port | None = None
@@ -205,8 +154,8 @@ class Line:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return Port(fd, _NO_SETTINGS)
         if self._settings:
-            _make(port, self._settings)
-        self._bridge = _Bridge(port)
+            set_up(port, self._settings)
+        self._bridge = Bridge(port)
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
 
     def close(self) -> None:
@@ -248,7 +197,7 @@ class Line:
             if self._settings:
                 raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
             try:
-                _make(self._serial, settings)
+                set_up(self._serial, settings)
             except PORT_FAILURES as failure:
                 raise LineError(self.port, reason_of(failure)) from failure
             self._settings = settings
