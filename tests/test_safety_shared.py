@@ -23,6 +23,7 @@ from shared import SharedPair, shared
 from multidrop import exchanges
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request
+from multidrop.drive import Condition
 from multidrop.drives import InvtCHE
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
@@ -210,6 +211,23 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
         pair.says = rtu(STOP)
         pair.holds = lambda said: said == rtu(STOP)
         drive.stop()
+        assert not heard[0].sim.motor.energised
+
+
+@patient
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
+    """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
+    look = rtu("01 03 10 01 00 01")
+    with hall("invt-che", seed=3) as (drive, pair, heard):
+        drive.set_frequency(20)
+        drive.start()
+        pair.says = look
+        pair.holds = lambda said: said == look
+        assert drive.state().condition is Condition.RUNNING
+        pair.holds = lambda said: False
+        getattr(drive, verb)()
+        assert len([it for it in heard[0].writes if it.start == 0x1000]) == 3  # the start, and two of these
         assert not heard[0].sim.motor.energised
 
 

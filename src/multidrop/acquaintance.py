@@ -56,6 +56,15 @@ class Acquaintance:
             with suppress(DriveRefused):  # an answer too
                 self._exchanges.values(drive, [register], attempts)
 
+    def tell_echo(self, drive: Drive) -> None:
+        """Read once, so that the line learns whether what it heard was its adapter's echo.
+
+        Another client that asks the same seems to be one: then the drive's confirmations of writes, which
+        are copies too, would not count, until something is read.
+        """
+        with suppress(NoReply, BadReply):
+            self._read_something(drive, 1)
+
     def glance(self, drive: Drive) -> None:
         """Before a stop, which is sent to a drive that cannot be heard too: it is asked once, at first."""
         if self._unheard.get(drive, self) is self._exchanges.line.queue:

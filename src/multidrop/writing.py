@@ -68,6 +68,11 @@ class Writer:
             if completion.result == Result.EXPIRED:
                 raise Expired(drive.name, what, seconds)
             outcome = self._outcome(drive, register, asked, completion)
+            if (
+                outcome.effect is Effect.UNCONFIRMED
+                and build_request(drive.framing, request) in completion.raw
+            ):
+                self.acquaintance.tell_echo(drive)
         why = "" if outcome.failure is None else str(outcome.failure)
         self.log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
