@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from multidrop.schedule import FIRST_REST_NS, LONGEST_REST_NS, SILENT_SHARE, TURN_SHARE, Job, Schedule
 
@@ -390,3 +392,102 @@ def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come
     assert take(made, 10, 40) == []
     assert {it.drive for it, _ in take(made, 70, 20)} == {timed.drive}
     assert {it.drive for it, _ in take(made, 101, 50)} == {quick.drive, timed.drive}
+
+
+class Operation(RuleBasedStateMachine):
+    """A line's days: jobs come and go, the host stalls, drives fall silent and wake, the port vanishes."""
+
+    AHEAD = 100 * MS
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.made: Schedule[Job] = Schedule()
+        self.now = self.busy_until = 1000 * MS
+        self.added: dict[Job, int] = {}
+        self.slots: dict[Job, list[int]] = {}  # those that were asked
+        self.passed: Counter[Job] = Counter()  # those that were told as not asked
+        self.failures = dict.fromkeys(range(4), 0)
+        self.silent_until = dict.fromkeys(range(4), 0)  # a late answer may come so long
+
+    @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
+    def add(self, drive: int, period: int | None, duration: int) -> None:
+        if len(self.made.jobs) < 8:
+            it = job(drive, period, duration)
+            self.made.add(it, self.now)
+            self.made.observe(
+                drive, self.failures[drive], self.now, late_until_ns=self.silent_until[drive], cost_ns=0
+            )
+            self.added[it], self.slots[it] = self.now, []
+
+    @precondition(lambda self: self.made.jobs)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        it = data.draw(st.sampled_from(self.made.jobs))
+        self.made.remove(it)
+
+    @rule(drive=st.integers(0, 3), late=st.integers(0, 400))
+    def fall_silent(self, drive: int, late: int) -> None:
+        self._observe(drive, self.failures[drive] + 1, self.now + late * MS)
+
+    @rule(drive=st.integers(0, 3))
+    def wake(self, drive: int) -> None:
+        self._observe(drive, 0, 0)
+
+    def _observe(self, drive: int, failures: int, until: int) -> None:
+        if any(it.drive == drive for it in self.made.jobs):
+            self.failures[drive], self.silent_until[drive] = failures, until
+            self.made.observe(drive, failures, self.now, late_until_ns=until, cost_ns=30 * MS)
+
+    @rule()
+    def lose_the_port(self) -> None:
+        told = self.made.pass_all(self.now)
+        self.passed.update(it for it, _ in told if it.period_ns)
+        assert all(due <= self.now for _, due in told)
+
+    @rule(stall=st.integers(0, 300))
+    def go_on(self, stall: int) -> None:
+        self.now += stall * MS
+        taken = self.made.take(self.now, self.busy_until, self.now + self.AHEAD, 64)
+        at = max(self.now, self.busy_until)
+        for it, due in taken:
+            at = max(at, due)
+            assert it in self.made.jobs
+            assert at >= self.silent_until[it.drive]  # nothing is asked while an answer may still come
+            if it.period_ns and due == 0:  # asked to see whether its drive answers, in no slot
+                assert self.failures[it.drive] >= 2
+            elif it.period_ns:
+                assert (due - self.added[it]) % it.period_ns == 0  # on its grid
+                assert due > max(self.slots[it], default=-1)  # each slot once, in their order
+                assert due > at - it.period_ns  # what was missed is not made up for
+                self.slots[it].append(due)
+            else:
+                self.slots[it].append(at)
+            at += it.duration_ns
+        self.busy_until = at if taken else self.busy_until
+
+    @invariant()
+    def every_slot_is_accounted_for(self) -> None:
+        self.passed.update(it for it, _ in self.made.unasked if it.period_ns)
+        self.made.unasked.clear()
+        for it in self.made.jobs:
+            if it.period_ns:
+                slots = (it.due_ns - self.added[it]) // it.period_ns
+                assert slots == len(self.slots[it]) + it.skipped + self.passed[it]
+
+    def teardown(self) -> None:
+        """When all is well again, everything is asked, in its turn or at its rate."""
+        for drive in range(4):
+            self.wake(drive)
+        load = sum(it.duration_ns / it.period_ns for it in self.made.jobs if it.period_ns)
+        before = {it: len(self.slots[it]) for it in self.made.jobs}
+        for _ in range(100):
+            self.go_on(20)
+        counts = {it: len(self.slots[it]) - before[it] for it in self.made.jobs}
+        in_turn = [count for it, count in counts.items() if it.period_ns is None]
+        if load < 0.5:
+            assert all(counts.values())
+            assert max(in_turn, default=0) - min(in_turn, default=0) <= 1
+
+
+TestOperation = Operation.TestCase
+TestOperation.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
