@@ -15,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import multidrop.drives
+from multidrop.core import Message, build_reply, build_request, parse_reply, parse_request, raw_value
 from multidrop.drive import VERBS, Drive
 from multidrop.drives import MODELS
+from multidrop.plan import blocks, write_request
 from multidrop.register import Carrier, Register, Wire
 
 FAMILIES = list(MODELS.values())
@@ -169,6 +171,62 @@ def test_a_raw_count_survives_its_value(
     value = register.decode(raw)
     assert register.encode(value) == raw
     assert register.format(value).startswith(f"{value:.{register.decimals}f}")
+
+
+@registers(lambda it: it.writable)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
+    """Written in any framing, taken by the drive as it stands in the frame, and read back."""
+    drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
+    value = data.draw(_values(register))
+    asked = write_request(drive, register, register.encode(value))
+    frame = build_request(drive.framing, asked)
+    used, taken = parse_request(drive.framing, frame)
+    assert taken is not None
+    assert (used, taken) == (len(frame), asked)
+    if register.table.carrier is Carrier.NUMBER:
+        kept = bytes(2) + taken.start.to_bytes(2, "big")
+    elif register.table.carrier is Carrier.BIT:
+        kept = bytes([taken.data[0] & 1])
+    else:
+        kept = taken.data
+    if register.readable:
+        (block,) = blocks(drive, [register])
+        answer = Message(drive.address, block.request(drive.address).function, block.start, data=kept)
+        frame = build_reply(drive.framing, answer)
+        used, told = parse_reply(drive.framing, frame, block.request(drive.address))
+        assert told is not None
+        assert (used, told.data) == (len(frame), kept)
+    assert register.decode(raw_value(kept, 0, register.wire)) == value
+
+
+def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
+    """What may be written."""
+    if register.values is not None:
+        members = [
+            it for it in register.values if not any(it & mask == mask for mask in register.never_together)
+        ]
+        return st.sampled_from(members)
+    low, high = 0, (1 << 16 * register.words) - 1
+    if register.wire is Wire.BIT:
+        high = 1
+    if register.wire in (Wire.I16, Wire.I32, Wire.I32_SWAPPED):
+        low, high = -(high + 1) // 2, high // 2
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    return st.integers(low, high).map(register.decode)
+
+
+@registers(lambda it: it.values is None and it.writable)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_what_is_shown_can_be_typed(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
+    value = data.draw(_values(register))
+    shown = register.format(value).removesuffix(register.unit).strip()
+    assert register.encode(register.parse(shown)) == register.encode(value)
 
 
 def test_drives_import_what_they_may() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -185,6 +186,7 @@ def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
 INT64 = st.integers(-(2**63), 2**63 - 1)
 NAME = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 SAMPLE = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.floats(allow_nan=False), st.just("ok"))
+NO_NUMBER = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.just(math.nan), st.just("ok"))
 MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
 
 
@@ -197,6 +199,23 @@ def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: l
     with open_writer(path, {}) as writer:
         writer.write(from_rows(some))
     assert rows(open_reader(path)) == some
+
+
+@every_format
+@pytest.mark.parametrize("target", FORMATS)
+@settings(max_examples=20, deadline=None)
+@given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
+def test_any_batches_converted(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
+) -> None:
+    """A drive may send floating-point numbers that are none; nothing equals them but their name."""
+    folder = tmp_path_factory.mktemp("any")
+    with open_writer(folder / f"a{suffix}", {}) as writer:
+        for some in filter(None, batches):
+            writer.write(from_rows(some))
+    written = [row for some in batches for row in some]
+    assert convert(folder / f"a{suffix}", folder / f"b{target}") == len(written)
+    assert repr(rows(open_reader(folder / f"b{target}"))) == repr(written)
 
 
 @settings(max_examples=60, deadline=None)
