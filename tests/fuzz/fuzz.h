@@ -1,0 +1,66 @@
+/* What the C fuzz harnesses share: how a harness says where on a line bytes lie, and what must hold.
+ *
+ * A harness has LLVMFuzzerTestOneInput and find_wire; mutator.c mutates, and makes frames of what
+ * lies there: without it nothing would ever get past a byte count or a checksum. */
+#ifndef FUZZ_H
+#define FUZZ_H
+
+#include "multidrop.h"
+
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define must(truth) \
+    ((truth) ? (void)0 : (fprintf(stderr, "%s:%d: not so: %s\n", __FILE__, __LINE__, #truth), abort()))
+
+/* Bytes on a line, within an input. */
+struct wire {
+    size_t at, len;
+    size_t length_at;           /* of the byte that has their length; SIZE_MAX: none has */
+    int is_fixed;               /* their number stays what it is */
+    int framing;                /* -1: any */
+    int is_reply;               /* to `request` */
+    struct md_message request;
+};
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+/* Some place in the input where bytes of a line lie; 0 where there is none. The harness may mend what
+ * stands around it, lengths above all. */
+int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire);
+
+/* A copy that ends where its memory ends, so that over-reads are seen; free() it. */
+static inline uint8_t *exact_copy(const uint8_t *bytes, size_t len)
+{
+    uint8_t *copy = malloc(len ? len : 1);
+    if (!copy)
+        abort();
+    return len ? memcpy(copy, bytes, len) : copy;
+}
+
+/* framing, address, function, start, count, first two of the request's data: nine bytes */
+enum { REQUEST_BYTES = 9 };
+
+static inline struct md_message request_of(const uint8_t bytes[REQUEST_BYTES])
+{
+    struct md_message request = {
+        .address = bytes[1],
+        .function = bytes[2],
+        .start = (uint16_t)(bytes[3] << 8 | bytes[4]),
+        .count = (uint16_t)(bytes[5] << 8 | bytes[6]),
+        .data = {bytes[7], bytes[8]},
+    };
+    switch (request.function) {
+    case 0x05: case 0x06: case 0x08: request.data_len = 2; break;
+    case 0x0F: request.data_len = (uint16_t)((request.count + 7) / 8 % 251); break;
+    case 0x10: request.data_len = (uint16_t)(2 * request.count % 251); break;
+    default: break;
+    }
+    if (bytes[0] % 3 == MD_DELIXI)
+        request.data_len = 4;
+    return request;
+}
+
+#endif

@@ -1,0 +1,435 @@
+/* A line as a state machine, fed with any bytes at any time in any order.
+ *
+ * An input is a header (adapter, delays) and steps: exchanges begin, time passes, the port takes bytes or
+ * fails, noise comes, and the drives' own answers come at once, late, in pieces, damaged, doubled, or
+ * not at all. Every drive answers with a number that is the question's alone, so that an answer taken
+ * for another's is seen. A clock of 1 ns a character makes all times small. */
+#include "fuzz.h"
+
+#include <errno.h>
+
+enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_WANTS = 6, NOISE = -1, ECHO = -2 };
+
+enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, PORT_FAILS, STEPS };
+
+/* What a drive has to say, and has not said yet. */
+struct answer {
+    int exchange;     /* its number */
+    int64_t until_ns; /* so long it may come late */
+    size_t len, at;
+    uint8_t bytes[MD_MOST_FRAME];
+};
+
+struct scene {
+    struct md_line line;
+    struct md_completion done;
+    struct md_drive drives[DRIVES];
+    struct md_exchange exchange;
+    int is_under_way, has_asked, adapter_echoes, knew_echo, is_spoiled;
+    int number; /* of the exchange */
+    int64_t now, begun, ends; /* by then it must be over */
+    int64_t last_heard, silence; /* the line's last activity, and the silence demanded after it */
+    size_t left_over, before, after; /* bytes heard: before the exchange, before its request was sent, and after */
+    struct answer answers[ANSWERS];
+    uint64_t exchanges[DRIVES];
+    int16_t origin[HEARD]; /* of each byte after the request: the number of the exchange that it answers */
+    uint8_t heard[HEARD];
+    struct md_tap tap;
+    uint32_t told[256], passed[256]; /* how often each byte went over the line, as the tap has it, and indeed */
+};
+
+static struct scene scene;
+
+static int drive_of(const struct md_message *request)
+{
+    return request->address % DRIVES;
+}
+
+static struct answer *answer_to(int number)
+{
+    for (int i = 0; i < ANSWERS; i++)
+        if (scene.answers[i].exchange == number)
+            return &scene.answers[i];
+    return NULL;
+}
+
+/* ---- what must hold ---- */
+
+static void check_line(void)
+{
+    const struct md_line *line = &scene.line;
+    must(line->rx_from <= line->rx_len && line->rx_len <= sizeof line->rx && line->tx_at <= line->tx_len);
+    must(line->tx_len <= sizeof line->tx);
+}
+
+static int is_read(const struct md_message *request)
+{
+    return request->function <= 0x04;
+}
+
+/* These bytes came from the drive as its answer to this very question, at least in part. */
+static void check_origin(const uint8_t *raw, size_t len)
+{
+    int is_own = 0;
+    for (size_t at = 0; at + len <= scene.after; at++)
+        for (size_t i = 0; i < len && memcmp(scene.heard + at, raw, len) == 0; i++)
+            is_own |= scene.origin[at + i] == scene.number;
+    must(is_own);
+}
+
+static int is_same(const struct md_message *one, const struct md_message *other)
+{
+    return one->address == other->address && one->function == other->function && one->exception == other->exception &&
+           one->start == other->start && one->count == other->count && one->data_len == other->data_len &&
+           memcmp(one->data, other->data, one->data_len) == 0;
+}
+
+static void check_completion(void)
+{
+    const struct md_completion *done = &scene.done;
+    const struct md_exchange *exchange = &scene.exchange;
+    size_t used = done->result > 0 ? (size_t)done->result : 0;
+    must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
+    /* Every byte is the reply's, or counted; what came while the request was leaving may be its echo. */
+    must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
+    must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
+    must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
+    must((scene.after > 0) == (done->last_ns > 0) && done->first_ns <= done->last_ns && done->last_ns <= scene.now);
+    must(done->first_ns == 0 || done->sent_ns <= done->first_ns);
+    must(done->sent_ns == 0 || done->begun_ns <= done->sent_ns);
+    if (done->result > 0) {
+        struct md_message again;
+        must(scene.has_asked && done->raw_len == used);
+        must(md_parse_reply(exchange->framing, done->raw, done->raw_len, &exchange->request, &again) == done->result);
+        must(is_same(&again, &done->reply));
+        if (!scene.is_spoiled && (scene.knew_echo || !scene.adapter_echoes))
+            check_origin(done->raw, done->raw_len);
+    } else if (done->result == 0)
+        must(exchange->request.address == 0 && scene.after == 0);
+    else
+        must(done->result >= MD_EXPIRED && done->reply.address == 0);
+    if (done->result == MD_NO_REPLY) /* nothing, or the request's own echo; others' answers do not count */
+        must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
+}
+
+static void check_tallies(void)
+{
+    for (int i = 0; i < DRIVES; i++) {
+        const struct md_tally *tally = &scene.drives[i].tally;
+        uint64_t values = tally->values, ended = tally->answered, delays = 0;
+        for (size_t reason = 0; reason < 16; reason++) {
+            values += tally->missed[reason];
+            ended += tally->ended[reason];
+        }
+        for (size_t code = 0; code < 256; code++)
+            values += tally->refused[code];
+        for (size_t bucket = 0; bucket < MD_DELAY_BUCKETS; bucket++)
+            delays += tally->delays[bucket];
+        must(tally->exchanges == scene.exchanges[i] && values == tally->exchanges && ended == tally->exchanges);
+        must(delays == tally->answered && tally->sent <= tally->exchanges);
+        must(scene.drives[i].delay_ns >= 0 && scene.drives[i].deviation_ns >= 0);
+    }
+}
+
+static uint32_t number(const uint8_t *at)
+{
+    return at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
+}
+
+/* The tap was told of every byte that was sent or heard, whatever it was, in whole packets. */
+static void check_tap(void)
+{
+    enum { LEN_AT = 20, BYTES_AT = 28 };
+    static struct md_wrapping bare[2 * MD_SIDES];
+    static uint8_t packets[1 << 17];
+    for (size_t i = 0; i < sizeof bare / sizeof *bare; i++)
+        bare[i].head = bare[i].tail = (const uint8_t *)"";
+    size_t used = md_tap_take(&scene.tap, bare, 0, 0, packets, sizeof packets);
+    for (size_t at = 0; at < used; at += number(packets + at + 4)) {
+        must(number(packets + at + number(packets + at + 4) - 4) == number(packets + at + 4));
+        for (size_t i = 0; i < number(packets + at + LEN_AT); i++)
+            scene.told[packets[at + BYTES_AT + i]]++;
+    }
+    must(scene.tap.lost == 0 && scene.tap.taken == scene.tap.put);
+    must(memcmp(scene.told, scene.passed, sizeof scene.told) == 0);
+}
+
+/* ---- what happens ---- */
+
+static void end(void)
+{
+    check_completion();
+    scene.is_under_way = 0;
+    int64_t turnaround = scene.done.result == 0 ? scene.exchange.turnaround_ns : 0;
+    if (scene.done.sent_ns)
+        scene.silence = turnaround > scene.exchange.silence_ns ? turnaround : scene.exchange.silence_ns;
+    scene.exchanges[drive_of(&scene.exchange.request)]++;
+    struct answer *late = answer_to(scene.number);
+    if (late)
+        late->until_ns = scene.exchange.drive->late_until_ns;
+    scene.before = scene.after = 0;
+    check_tallies();
+    check_tap();
+}
+
+static void hear(const uint8_t *bytes, size_t len, int origin)
+{
+    int is_after = scene.is_under_way && scene.has_asked;
+    for (size_t i = 0; is_after && i < len && scene.after + i < HEARD; i++) {
+        scene.heard[scene.after + i] = bytes[i];
+        scene.origin[scene.after + i] = (int16_t)origin;
+    }
+    must(scene.after + len < HEARD);
+    scene.before += is_after ? 0 : len;
+    scene.after += is_after ? len : 0;
+    if (len && scene.last_heard < scene.now)
+        scene.last_heard = scene.now;
+    for (size_t i = 0; i < len; i++)
+        scene.passed[bytes[i]]++;
+    uint8_t *exact = exact_copy(bytes, len);
+    md_line_received(&scene.line, exact, len, scene.now);
+    free(exact);
+    check_line();
+}
+
+/* What it wants, asked again for as long as it wants to look at an empty port; ends exchanges. */
+static int want(void)
+{
+    int wish = MD_DONE;
+    if (!scene.is_under_way)
+        return wish;
+    for (int wants = 0; wants < MOST_WANTS; wants++) {
+        wish = md_line_want(&scene.line, scene.now);
+        check_line();
+        if (wish == MD_READ && scene.line.wake_ns <= scene.now)
+            continue;
+        must(wish == MD_DONE || scene.now < scene.ends || wish == MD_WRITE);
+        must((wish != MD_WAIT && wish != MD_READ) || scene.line.wake_ns > scene.now);
+        if (wish == MD_DONE)
+            end();
+        return wish;
+    }
+    must(wish == MD_DONE); /* it looks at the empty port for ever */
+    return wish;
+}
+
+/* The longest that an exchange may last, once its request can leave. */
+static int64_t longest(void)
+{
+    const struct md_exchange *exchange = &scene.exchange;
+    int64_t most = exchange->drive->most_timeout_ns;
+    return 3 * most + (2 * MD_MOST_FRAME + md_reply_length(exchange->framing, &exchange->request)) * exchange->character_ns;
+}
+
+static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
+{
+    struct md_message request = request_of(bytes);
+    if (want() != MD_DONE)
+        return;
+    request.address %= 8;
+    scene.number++;
+    scene.exchange = (struct md_exchange){.framing = bytes[0] % 3, .request = request, .character_ns = 1, .silence_ns = silence,
+                                          .turnaround_ns = turnaround, .drive = &scene.drives[drive_of(&request)]};
+    scene.begun = scene.now;
+    scene.has_asked = 0;
+    scene.before = scene.after = 0;
+    scene.left_over = scene.line.rx_len;
+    scene.knew_echo = scene.line.echoes;
+    scene.is_under_way = 1;
+    if (scene.silence < silence)
+        scene.silence = silence;
+    int64_t free_from = scene.last_heard + scene.silence > scene.now ? scene.last_heard + scene.silence : scene.now;
+    scene.ends = free_from + longest();
+    md_line_begin(&scene.line, &scene.exchange, &scene.done, scene.now);
+    want();
+}
+
+/* The request is out: its drive makes up an answer that no other question has. */
+static void ask(void)
+{
+    const struct md_message *request = &scene.exchange.request;
+    struct answer *answer = answer_to(0);
+    scene.has_asked = 1;
+    if (!request->address || !answer)
+        return;
+    struct md_message reply = *request;
+    if (scene.exchange.framing != MD_DELIXI && is_read(request)) {
+        unsigned bits = request->function > 2 ? 16 : 1;
+        reply.data_len = (uint16_t)((request->count * bits + 7) / 8);
+        for (int i = 0; i < reply.data_len; i++)
+            reply.data[i] = (uint8_t)(i % 2 ? scene.number : scene.number >> 8);
+    } else if (scene.exchange.framing != MD_DELIXI && request->function >= 0x0F)
+        reply.data_len = 0;
+    else if (scene.exchange.framing == MD_DELIXI && request->function == 7)
+        reply.data[3] = (uint8_t)scene.number;
+    else if (scene.exchange.framing == MD_DELIXI && request->function == 3)
+        reply.start = (uint16_t)(1 + scene.number % 8);
+    int len = md_build_reply(scene.exchange.framing, &reply, answer->bytes, sizeof answer->bytes);
+    must(len > 0);
+    *answer = (struct answer){.exchange = scene.number, .len = (size_t)len};
+    md_build_reply(scene.exchange.framing, &reply, answer->bytes, sizeof answer->bytes);
+}
+
+static void take(size_t most)
+{
+    if (want() != MD_WRITE)
+        return;
+    struct md_line *line = &scene.line;
+    size_t left = (size_t)(line->tx_len - line->tx_at), len = most < left ? most : left;
+    int is_babble = scene.now >= line->give_up_ns;
+    must(is_babble || line->tx_at > 0 || scene.now - scene.last_heard >= scene.silence);
+    uint8_t echo[MD_MOST_FRAME];
+    memcpy(echo, line->tx + line->tx_at, len);
+    int is_last = len == left && len > 0;
+    if (is_last)
+        ask();
+    for (size_t i = 0; i < len; i++)
+        scene.passed[echo[i]]++;
+    md_line_sent(line, len, scene.now);
+    check_line();
+    if (len && scene.last_heard < scene.now)
+        scene.last_heard = scene.now;
+    if (len)
+        scene.last_heard += (int64_t)len * scene.exchange.character_ns;
+    if (is_last)
+        want();
+    if (scene.adapter_echoes)
+        hear(echo, len, ECHO);
+    if (is_last)
+        want();
+}
+
+/* Up to `most` bytes of an answer, `flip` of them damaged. Nothing comes after its drive's last chance. */
+static void let_answer(unsigned which, size_t most, uint8_t flip)
+{
+    struct answer *answer = NULL;
+    for (unsigned i = 0; i < ANSWERS && !answer; i++)
+        if (scene.answers[(which + i) % ANSWERS].exchange)
+            answer = &scene.answers[(which + i) % ANSWERS];
+    if (!answer)
+        return;
+    int is_due = scene.is_under_way && scene.number == answer->exchange;
+    if (!is_due && scene.now >= answer->until_ns) {
+        answer->exchange = 0;
+        return;
+    }
+    size_t left = answer->len - answer->at, len = most < left ? most : left;
+    uint8_t bytes[MD_MOST_FRAME];
+    memcpy(bytes, answer->bytes + answer->at, len);
+    if (flip && len)
+        bytes[flip % len] ^= (uint8_t)(1u << flip % 8);
+    int number = answer->exchange;
+    answer->at += len;
+    if (answer->at == answer->len)
+        answer->exchange = 0;
+    hear(bytes, len, number);
+}
+
+static void fail(int error)
+{
+    if (scene.is_under_way) {
+        md_line_abandon(&scene.line, MD_LINE_LOST, error);
+        must(md_line_want(&scene.line, scene.now) == MD_DONE);
+        end();
+    }
+    memset(scene.answers, 0, sizeof scene.answers); /* what was under way is lost with the port */
+}
+
+/* One step; how many bytes of the input it took, 0 at the end. */
+static size_t act(const uint8_t *step, size_t left)
+{
+    size_t len;
+    switch (step[0] % STEPS) {
+    case BEGIN:
+        if (left < 3 + REQUEST_BYTES)
+            return 0;
+        begin(step + 3, step[1], step[2]);
+        return 3 + REQUEST_BYTES;
+    case PASS:
+        if (left < 2)
+            return 0;
+        scene.now += step[1];
+        want();
+        return 2;
+    case WAKE:
+        if (want() == MD_WAIT || (scene.is_under_way && scene.line.wake_ns > scene.now))
+            scene.now = scene.line.wake_ns;
+        want();
+        return 1;
+    case TAKE:
+        take(left > 1 ? step[1] : 0);
+        return 2;
+    case NOISE_COMES:
+        len = left < 2 ? 0 : step[1] < left - 2 ? step[1] : left - 2;
+        for (size_t i = 0; i < len; i++)
+            scene.is_spoiled |= step[2 + i] < 0xF8; /* it may be a frame, or a part of one */
+        hear(step + 2, len, NOISE);
+        want();
+        return 2 + len;
+    case ANSWER_COMES:
+    case PIECE_COMES:
+        if (left < 3)
+            return 0;
+        let_answer(step[1], step[0] % STEPS == PIECE_COMES ? step[2] : MD_MOST_FRAME, step[0] & 0x80 ? step[2] : 0);
+        want();
+        return 3;
+    default:
+        fail(EIO);
+        return 1;
+    }
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
+{
+    if (size < HEADER || size > MOST)
+        return 0;
+    static uint8_t ring[1 << 16];
+    memset(&scene, 0, sizeof scene);
+    scene.tap = (struct md_tap){.ring = ring, .room = sizeof ring, .put = data[3] * 7919u, .taken = data[3] * 7919u};
+    scene.now = scene.last_heard = 1000;
+    for (int i = 0; i < DRIVES; i++)
+        scene.drives[i] = (struct md_drive){.least_timeout_ns = 1 + data[1], .most_timeout_ns = 1 + data[1] + 4 * data[2]};
+    scene.adapter_echoes = data[3] & 1;
+    md_line_init(&scene.line, scene.now);
+    scene.line.tap = &scene.tap;
+    size_t used;
+    for (size_t at = HEADER; at < size; at += used)
+        if ((used = act(data + at, size - at)) == 0)
+            break;
+    for (int steps = 0; want() != MD_DONE; steps++) { /* and nothing comes any more */
+        must(steps < 16);
+        if (md_line_want(&scene.line, scene.now) == MD_WRITE)
+            take(MD_MOST_FRAME);
+        else
+            scene.now = scene.line.wake_ns;
+    }
+    return 0;
+}
+
+/* Noise that may be a frame; as the reply to the request that was the last to begin before it. */
+int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
+{
+    size_t found = 0, at = HEADER, used = 0;
+    struct md_message request = {0};
+    int framing = -1;
+    for (; at < size; at += used) {
+        int step = data[at] % STEPS;
+        used = step == BEGIN ? 3 + REQUEST_BYTES : step == PASS || step == TAKE ? 2 : step == ANSWER_COMES || step == PIECE_COMES ? 3 : 1;
+        if (step == BEGIN && at + used <= size) {
+            framing = data[at + 3] % 3;
+            request = request_of(data + at + 3);
+            request.address %= 8;
+        }
+        if (step != NOISE_COMES)
+            continue;
+        if (at + 2 > size)
+            break;
+        size_t len = data[at + 1] < size - at - 2 ? data[at + 1] : size - at - 2;
+        used = 2 + len;
+        if (found++ && (seed >> 8) % found) /* each is as likely as another */
+            continue;
+        *wire = (struct wire){.at = at + 2, .len = len, .length_at = at + 1, .framing = framing,
+                              .is_reply = framing >= 0 && (seed & 3), .request = request};
+    }
+    return found > 0;
+}

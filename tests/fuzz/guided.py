@@ -1,0 +1,57 @@
+"""Fuzzes one of the Python readers, guided by coverage: `guided.py NAME CORPUS... [libFuzzer's options]`.
+
+Needs atheris, which is libFuzzer for Python.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+import tempfile
+import tomllib._parser
+import types
+from functools import partial
+from pathlib import Path
+
+import atheris
+from readers import read
+
+import multidrop.capture
+import multidrop.mistakes
+import multidrop.models
+import multidrop.plant
+import multidrop.recording
+import multidrop.sim.faults
+from multidrop.capture import columns
+
+PACKAGES = (multidrop.capture, multidrop.recording)
+MODULES = (multidrop.plant, multidrop.mistakes, multidrop.models, multidrop.sim.faults, tomllib._parser)
+
+
+def instrument(module: types.ModuleType) -> None:
+    """Let the fuzzer see which lines of this module's functions are run."""
+    owners = [module, *(it for it in vars(module).values() if isinstance(it, type))]
+    for owner in owners:
+        for function in list(vars(owner).values()):
+            if isinstance(function, types.FunctionType) and function.__module__ == module.__name__:
+                atheris.instrument_func(function)
+
+
+def main() -> None:
+    name, *arguments = sys.argv[1:]
+    columns.ROWS = 2048  # of a batch: less to fill, and more batches; one request may ask for 2000
+    for package in PACKAGES:
+        for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
+            instrument(importlib.import_module(found.name))
+    for module in MODULES:
+        instrument(module)
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+        one = partial(read, name, folder=Path(folder))
+        again = f"{sys.executable} {__file__} {name}"  # how it starts itself, to merge
+        atheris.Setup([again, *arguments], lambda data: one(data))
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""Files that others may have written or damaged, read: each is taken, or refused in one sentence.
+
+Nothing else may happen: no other exception, no hang, no memory without bound. What is taken is
+written and read again, and must be the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+from multidrop.batch import Row, Rows
+from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
+from multidrop.core import Splitter
+from multidrop.plant import Plant, PlantError, load_plant
+from multidrop.recording import Metadata, open_reader, open_writer, repair
+from multidrop.sim.faults import load_faults
+
+PLANT = """
+[[line]]
+name = "hall-1"
+port = "/dev/ttyUSB0"
+baudrate = 9600
+format = "8N1"
+
+[[line.drive]]
+name = "pump-1"
+model = "innovert-ibd"
+address = 1
+framing = "rtu"
+every = "50 ms"
+poll = ["output_current", { register = "motor_speed", every = "20 ms" }]
+
+[[line.drive]]
+name = "fan"
+model = "erman-er-g-220"
+address = 2
+baudrate = 38400
+
+[[line.drive]]
+name = "belt"
+model = "delixi-native"
+address = 3
+"""
+
+
+@contextmanager
+def refused(kind: type[ValueError], path: Path) -> Iterator[None]:
+    """One error is allowed, and each of its sentences names the file."""
+    mistakes: list[ValueError] = []
+    try:
+        yield
+    except kind as mistake:
+        mistakes.append(mistake)
+    for mistake in mistakes:
+        assert type(mistake) is kind, repr(mistake)
+        for sentence in str(mistake).split("\n"):
+            assert sentence.startswith(str(path)), mistake
+            assert len(sentence) > len(str(path)) + 10, mistake
+
+
+def read_plant(path: Path) -> None:
+    with refused(PlantError, path):
+        plant = load_plant(path)
+        names = [polled.drive.name for line in plant.lines for polled in line.drives]
+        assert len(names) == len(set(names)) > 0
+        json.dumps(plant.metadata())
+
+
+def read_faults(path: Path) -> None:
+    with refused(ValueError, path):
+        load_faults(path)
+
+
+def read_recording(path: Path) -> None:
+    with refused(ValueError, path):
+        reader = open_reader(path)
+        batches = list(reader)
+        rows = _comparable(batches)
+        assert _written_again(path, ".arrows", reader.metadata, batches) == rows
+        if reader.torn:
+            assert repair(path) == reader.torn
+            again = open_reader(path)
+            assert (again.torn, _comparable(again)) == (0, rows)
+
+
+@cache
+def known_plant(folder: Path) -> Plant:
+    (folder / "known.toml").write_text(PLANT)
+    return load_plant(folder / "known.toml")
+
+
+def read_capture(path: Path) -> None:
+    for known in (known_plant(path.parent), None):
+        with refused(CaptureError, path), Capture(path) as capture:
+            for batch in Decoding(capture, known):
+                assert len(_comparable([batch])) == len(batch)
+    with refused(CaptureError, path), Capture(path) as capture:
+        _pair(capture)
+
+
+def _pair(capture: Capture) -> None:
+    """What is told is what the spans hold, and every byte of junk is counted."""
+    pairings: list[Pairing] = []
+    splitters: list[Splitter] = []
+    junk = exchanges = 0
+    for _ in capture:
+        for at, heard in enumerate(capture.heard):
+            if at == len(pairings):
+                pairings.append(Pairing())
+                splitters.append(Splitter())
+            told = list(pairings[at].pair(splitters[at].spans(heard)))
+            junk += sum(len(it.raw) for it in told if isinstance(it, Junk))
+            exchanges += sum(1 for it in told if not isinstance(it, Junk) and it.request and it.reply)
+    for pairing in pairings:
+        junk += sum(len(it.raw) for it in pairing.rest() if isinstance(it, Junk))
+    assert junk == sum(it.junk_bytes for it in pairings)
+    assert exchanges == sum(it.exchanges for it in pairings)
+
+
+def _comparable(batches: Iterable[Rows]) -> list[Row]:
+    """All rows; a value that is no number is told by its name, because it equals nothing."""
+    rows = [row for batch in batches for row in batch]
+    return [
+        row._replace(value=None, status=f"nan {row.status}") if row.value != row.value else row
+        for row in rows
+    ]
+
+
+def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Rows]) -> list[Row]:
+    copy = path.with_name("again" + suffix)
+    with open_writer(copy, metadata) as writer:
+        for batch in batches:
+            writer.write(batch)
+    assert json.dumps(open_reader(copy).metadata) == json.dumps(metadata)
+    return _comparable(open_reader(copy))
+
+
+READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix, and who reads it
+    "plant": (".toml", read_plant),
+    "faults": (".toml", read_faults),
+    "arrows": (".arrows", read_recording),
+    "csv": (".csv", read_recording),
+    "parquet": (".parquet", read_recording),
+    "pcap": (".pcapng", read_capture),
+}
+
+
+def read(name: str, data: bytes, folder: Path) -> None:
+    """Let one of the readers have a file of these bytes."""
+    suffix, reader = READERS[name]
+    path = folder / f"fuzzed{suffix}"
+    path.write_bytes(data)
+    reader(path)

@@ -1,0 +1,146 @@
+"""What the fuzzers begin with: the documents' own frames, captures of them, and files that are right.
+
+python tests/fuzz/seeds.py HARNESS DIRECTORY
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from batches import counting, example
+from frames import PRINTED, Printed
+from readers import PLANT
+
+from multidrop.capture import CaptureWriter, Side
+from multidrop.core import Message
+from multidrop.recording import open_writer
+
+EXCHANGES = [it for it in PRINTED if it.request is not None]
+WAKE, TAKE, NOISE = 2, 3, 4  # steps of fuzz_line.c
+TIME = 1_700_000_000
+
+
+def asked(it: Printed) -> bytes:
+    """The request as a harness has it."""
+    message = it.request or it.says
+    assert isinstance(message, Message)
+    data = (message.data + bytes(2))[:2]
+    return struct.pack(
+        ">BBBHH2s", it.framing, message.address, message.function, message.start, message.count, data
+    )
+
+
+def frame() -> Iterator[bytes]:
+    for it in EXCHANGES:
+        yield asked(it) * 2 + it.frame
+        yield asked(it) * 2 + it.request_frame
+
+
+def line() -> Iterator[bytes]:
+    header = bytes([0, 20, 20, 0])
+    for it in EXCHANGES:
+        begun = bytes([0, 4, 40]) + asked(it) + bytes([WAKE, TAKE, 255])
+        yield header + begun + bytes([WAKE, NOISE, len(it.frame)]) + it.frame
+        yield header + begun + bytes([WAKE, WAKE, NOISE, len(it.frame)]) + it.frame + begun
+
+
+def split() -> Iterator[bytes]:
+    pieces = [
+        bytes([0, len(it.request_frame)]) + it.request_frame + bytes([8, len(it.frame)]) + it.frame
+        for it in EXCHANGES
+    ]
+    yield from pieces
+    yield b"".join(pieces)[:2000]
+
+
+def rtac(it: Printed) -> Iterator[bytes]:
+    """Packets with the header of RTAC serial (link type 250)."""
+    for event, raw in ((1, it.request_frame), (2, it.frame)):
+        yield struct.pack(">IIBBH", TIME, 5000 * event, event, 0, 0) + raw
+
+
+def pcap(packets: list[bytes]) -> bytes:
+    return b"".join(struct.pack("<4I", TIME, 0, len(it), len(it)) + it for it in packets)
+
+
+def ours() -> tuple[bytes, int]:
+    """A capture as we write it, and where its packets begin."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.pcapng"
+        with CaptureWriter(path) as capture:
+            for number, it in enumerate(EXCHANGES):
+                capture.write(it.request_frame, Side.ASKING, TIME * 10**9 + number, "hall-1")
+                begin = 0 if number else path.stat().st_size
+                capture.write(it.frame, Side.ANSWERING, TIME * 10**9 + number, "hall-1")
+                if number == 0:
+                    first = begin
+        whole = path.read_bytes()
+    return whole, first
+
+
+def capture() -> Iterator[bytes]:
+    packets = [packet for it in EXCHANGES for packet in rtac(it)]
+    yield bytes([0b0000, 9]) + pcap(packets)
+    yield bytes([0b1000, 0]) + pcap([it.request_frame + it.frame for it in EXCHANGES])
+    whole, first = ours()
+    yield bytes([0b10101, 1]) + whole[first:][:4000]
+
+
+def columns() -> Iterator[bytes]:
+    for wire in range(10):
+        field = bytes([0, 1, wire, 3, 4, 9])
+        yield bytes([4, 9, 4, 99, 5, 0x55, 0, 1]) + field * 4 + bytes(range(200, 230))
+
+
+def plant() -> Iterator[bytes]:
+    yield PLANT.encode()
+    yield b'[[line]]\nname = "a"\nport = "b"\n[[line.drive]]\nname = "c"\nmodel = "yd1000"\naddress = 1\n'
+
+
+def faults() -> Iterator[bytes]:
+    yield b'seed = 7\ndrop = 0.01\nflip = 0.5\nlate = "100 ms"\nburst = 32\nhang_up = 0\naway = "1 s"\n'
+
+
+def recorded(suffix: str) -> Iterator[bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a{suffix}"
+        with open_writer(path, {"plant": "a.toml"}) as writer:
+            writer.write(example())
+            writer.write(counting(3))
+        yield path.read_bytes()
+
+
+def captures() -> Iterator[bytes]:
+    yield ours()[0][:1500]
+    magic = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 250)
+    yield magic + pcap([packet for it in EXCHANGES[:6] for packet in rtac(it)])
+
+
+SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
+    "frame": frame,
+    "line": line,
+    "split": split,
+    "capture": capture,
+    "columns": columns,
+    "plant": plant,
+    "faults": faults,
+    "arrows": lambda: recorded(".arrows"),
+    "csv": lambda: recorded(".csv"),
+    "parquet": lambda: recorded(".parquet"),
+    "pcap": captures,
+}
+
+
+def main(harness: str, directory: str) -> None:
+    for number, seed in enumerate(SEEDS[harness]()):
+        (Path(directory) / f"seed-{number}").write_bytes(seed)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
