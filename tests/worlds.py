@@ -79,7 +79,8 @@ class WorldPort:
         self._driver = LineDriver()
         self._driver.now = world.now
         self._queue: deque[tuple[Exchange, int]] = deque()
-        self._round: deque[Exchange] = deque()
+        self._cycle: list[Exchange] = []
+        self._round: deque[Exchange] = deque()  # the next one first
         self._turn = Turn.NOBODYS
         self._under_way: Exchange | None = None
         self._failures = 0
@@ -96,8 +97,10 @@ class WorldPort:
         self._queue += zip(exchanges, not_before_ns, strict=True)
         return len(exchanges)
 
-    def repeat(self, exchanges: Sequence[Exchange]) -> None:
-        self._round = deque(exchanges)
+    def repeat(self, exchanges: Sequence[Exchange]) -> int:
+        following = self._cycle.index(self._round[0]) if self._round else 0
+        self._cycle, self._round = list(exchanges), deque(exchanges)
+        return following
 
     @property
     def repeating(self) -> bool:
