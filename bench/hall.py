@@ -1,4 +1,4 @@
-"""Hostile lines with all families on them, in a process of their own, and what their values prove.
+"""Simulated lines in a process of their own, of all families and hostile, and what their values prove.
 
 The demo's eight variants hold values that name drive and register (EncodedDrive). A ninth drive on
 each line has a motor, so that its starts can bring noise.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -20,7 +20,7 @@ from threading import Thread
 from multidrop.cli.demo import DRIVES, OPTIONS
 from multidrop.drives import MODELS
 from multidrop.plant import Plant, load_plant
-from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, load_faults, proof, serve, simulated
+from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, Wire, proof, serve, simulated
 
 MOTOR = "fan"
 EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
@@ -79,13 +79,29 @@ class Hall:
         return late
 
 
+def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
+    """The plant's lines with these faults, each drive but the motors' one of encoded values."""
+    return [
+        HostileWire(
+            [
+                simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
+                for it in line.drives
+            ],
+            faults,
+            name=line.name,
+            port=line.port,
+        )
+        for line in load_plant(plant).lines
+    ]
+
+
 @contextmanager
-def running(plant: Path, faults: Path) -> Iterator[Hall]:
-    """The plant's lines, simulated with these faults."""
+def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[Hall]:
+    """The wires that this makes, in a process of their own, to which the function is handed over."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     late = context.Value("d", 0.0)
-    process = context.Process(target=_simulate, args=(plant, load_faults(faults), theirs, late), daemon=True)
+    process = context.Process(target=_simulate, args=(make, arguments, theirs, late), daemon=True)
     process.start()
     try:
         if not ours.poll(PATIENCE):
@@ -99,27 +115,20 @@ def running(plant: Path, faults: Path) -> Iterator[Hall]:
         theirs.close()
 
 
-def _simulate(plant: Path, faults: Faults, connection: Connection, late: Synchronized[float]) -> None:
+def _simulate(
+    make: Callable[..., Sequence[Wire]],
+    arguments: Sequence[object],
+    connection: Connection,
+    late: Synchronized[float],
+) -> None:
     with suppress(OSError):  # so that the line keeps its time on a machine that has much else to do
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    wires = [
-        HostileWire(
-            [
-                simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
-                for it in line.drives
-            ],
-            faults,
-            name=line.name,
-            port=line.port,
-        )
-        for line in load_plant(plant).lines
-    ]
     Thread(target=_watch, args=(late,), daemon=True).start()
 
     def announce(simulator: Simulator) -> None:
         connection.send([wire.path for wire in simulator.wires])
 
-    serve(wires, announce)
+    serve(make(*arguments), announce)
 
 
 def _watch(late: Synchronized[float]) -> None:

@@ -27,6 +27,7 @@ from multidrop.errors import BusError
 from multidrop.plant import Plant, load_plant, parse_duration
 from multidrop.poller import Poller
 from multidrop.recording import open_reader, open_writer
+from multidrop.sim import load_faults
 
 HERE = Path(__file__).parent
 MOST_GROWTH_KB = 2048  # of resident memory, from the end of the first period on
@@ -224,7 +225,7 @@ def main() -> int:
         os.environ["XDG_STATE_HOME"] = name  # of the ledger of EEPROM writes
         directory = Path(name)
         path = hall.write_plant(directory, arguments.lines)
-        with hall.running(path, arguments.faults) as simulator:
+        with hall.running(hall.hostile_wires, path, load_faults(arguments.faults)) as simulator:
             plant = load_plant(path)
             lines = [replace(it, port=port) for it, port in zip(plant.lines, simulator.ports, strict=True)]
             plant = replace(plant, lines=tuple(lines))

@@ -21,6 +21,10 @@ class Acquaintance:
     def is_known(self, drive: Drive) -> bool:
         return self._known.get(drive, self) is self._exchanges.line.queue
 
+    def forget(self, drive: Drive) -> None:
+        self._known.pop(drive, None)
+        self._unheard.pop(drive, None)
+
     def make(self, drive: Drive, attempts: int = READ_ATTEMPTS) -> None:
         """Look, once; Refused when it is of another family, NoReply when it cannot be heard.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -66,6 +67,8 @@ class Bus:
         book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
         self._writer = Writer(self._exchanges, book, log, expiry)
         self._parting: Parting | None = None
+        self._stopping = 0  # calls of stop_all under way, in which no drive may leave
+        self._stopped = threading.Condition()
         self._opened_ns = now_ns()
         self._reset_at = look(0.0, {}, self.line.overruns())
         self._at_last: LineStatistics | None = None  # when it was closed
@@ -111,8 +114,20 @@ class Bus:
         drive.perform = lambda script: self.perform(drive, script)
         drive.introduce = lambda: self.introduce(drive)
         self._exchanges.add(drive)
-        self.drives.append(drive)
+        self.drives = [*self.drives, drive]  # anew, for others may be going through them
         return drive
+
+    def detach(self, drive: Drive) -> None:
+        """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
+
+        Nothing is sent: its motor goes on as it is. Waits until `stop_all`, if it is under way, is done.
+        """
+        with self._stopped:
+            self._stopped.wait_for(lambda: not self._stopping)
+            self.respondent(drive)
+            self.drives = [it for it in self.drives if it is not drive]
+            self._exchanges.remove(drive)
+            self._writer.acquaintance.forget(drive)
 
     # ---- reading ----
 
@@ -220,9 +235,16 @@ class Bus:
         By broadcast where all drives are of one family that has it, and known to be; and then each of
         them, in turns, until it is seen to stand. Never raises for one drive: the others go on.
         """
-        at_once = self._stop_by_broadcast()
-        silent_last = sorted(self.drives, key=lambda drive: self.respondent(drive).failures)
-        return stop_together(silent_last, self._step, lambda: now_ns() / 1e9, sleep, at_once)
+        with self._stopped:
+            self._stopping += 1
+        try:
+            at_once = self._stop_by_broadcast()
+            silent_last = sorted(self.drives, key=lambda drive: self.respondent(drive).failures)
+            return stop_together(silent_last, self._step, lambda: now_ns() / 1e9, sleep, at_once)
+        finally:
+            with self._stopped:
+                self._stopping -= 1
+                self._stopped.notify_all()
 
     def _stop_by_broadcast(self) -> bool:
         """Whether a stop was broadcast, which it is only where that harms none and all are known."""

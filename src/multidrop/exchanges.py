@@ -48,13 +48,19 @@ class Exchanges:
     def __init__(self, line: Line) -> None:
         self.line = line
         self._respondents: dict[Drive, Respondent] = {}
+        self._known: dict[tuple[int, float, float], Respondent] = {}  # by address, also of those that left
         self._heard: dict[Drive, object] = {}  # the open port on which it answered last
 
     def add(self, drive: Drive) -> None:
-        self._respondents[drive] = Respondent(
-            least_timeout=min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay)),
-            most_timeout=drive.response_timeout,
-        )
+        least = min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay))
+        key = drive.address, least, drive.response_timeout
+        made = Respondent(least_timeout=least, most_timeout=drive.response_timeout)
+        # One that comes back may still owe the answer to what it was asked before it left.
+        self._respondents[drive] = self._known.setdefault(key, made)
+
+    def remove(self, drive: Drive) -> None:
+        del self._respondents[drive]
+        self._heard.pop(drive, None)
 
     def respondent(self, drive: Drive) -> Respondent:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""

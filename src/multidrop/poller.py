@@ -26,7 +26,7 @@ from multidrop.errors import LineError
 from multidrop.ledger import Ledger
 from multidrop.line import Wake, now_ns, sleep
 from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
-from multidrop.plant import Plant
+from multidrop.plant import Plant, PolledDrive
 from multidrop.register import Register
 from multidrop.schedule import Job, Schedule
 from multidrop.statistics import LineStatistics, Statistics
@@ -95,6 +95,9 @@ class _PolledLine:
         self._port: Port | None = None  # that was tended last
         self._done = 0  # exchanges on it, when it was tended last
         self._jobs: list[_Asked] = []  # all there ever were: the core may still look at them
+        self._declared: dict[PolledDrive, list[_Asked]] = {}
+        self._lock = threading.Lock()  # of all above and below: drives come and go on any thread
+        self._is_started = False
         self._ahead_ns = 0  # what is queued will take
         self._learnt_ns = 0
         self.switching = declared.switching  # s; in the end as measured
@@ -106,23 +109,54 @@ class _PolledLine:
         self._queued: deque[tuple[_Asked, int]] = deque()  # what the core has not carried out yet
         try:
             for polled in declared.drives:
-                self.bus.attach(polled.drive)
-                self._asked_of.append((polled.drive, self.bus.respondent(polled.drive)))
-                self._declare(polled)
-            for job in self._jobs:
-                self.bus.line.require(job.exchange.settings)
+                self.add(polled)
         except BaseException:
             self.bus.close()
             raise
 
-    def _declare(self, polled: plant.PolledDrive) -> None:
+    def add(self, polled: PolledDrive) -> None:
+        with self._lock:
+            drive = self.bus.attach(polled.drive)
+            try:
+                jobs = self._jobs_of(polled)
+            except BaseException:
+                self.bus.detach(drive)
+                raise
+            self._asked_of.append((drive, self.bus.respondent(drive)))
+            for job in jobs if self._is_started else []:
+                self.schedule.add(job, now_ns())
+        self._inbox.call(self._number)
+
+    def _jobs_of(self, polled: PolledDrive) -> list[_Asked]:
+        """A drive that comes back has the jobs that it had."""
         drive = polled.drive
+        self.bus.line.require((drive.settings.baudrate, drive.settings.format))
+        if polled in self._declared:
+            return self._declared[polled]
         rates: dict[float | None, list[Register[Any]]] = {}
         for poll in polled.polls:
             rates.setdefault(poll.every, []).append(poll.register)
+        jobs: list[_Asked] = []
         for every, registers in rates.items():
             period_ns = None if every is None else round(every * 1e9)
-            self._jobs += [self._job(drive, block, period_ns) for block in blocks(drive, registers)]
+            jobs += [self._job(drive, block, period_ns) for block in blocks(drive, registers)]
+        self._jobs += jobs
+        self._declared[polled] = jobs
+        return jobs
+
+    def remove(self, drive: Drive) -> None:
+        with self._lock:
+            now = now_ns()
+            jobs = [it for it in self.schedule.jobs if it.owner is drive]
+            slots = [(it, it.due_ns) for it in jobs if it.period_ns and it.due_ns <= now]
+            self._miss(slots, Result.POLL_ENDED)
+            for job in jobs:
+                self.schedule.remove(job)
+            self.schedule.forget(drive.address)
+            self.set_aside = [it for it in self.set_aside if it.owner is not drive]
+            self._asked_of = [it for it in self._asked_of if it[0] is not drive]
+        self.bus.detach(drive)
+        self._inbox.call(self._number)
 
     def _job(self, drive: Drive, block: Block, period_ns: int | None) -> _Asked:
         fields = self._codes.fields(drive, block)
@@ -141,11 +175,14 @@ class _PolledLine:
         return job
 
     def start(self) -> None:
-        self.started_ns = now_ns()
-        self.bus.reset_statistics()
-        place = {drive: at for at, drive in enumerate(in_order(self.bus.drives, self.switching))}
-        for job in sorted(self._jobs, key=lambda job: place[job.owner]):
-            self.schedule.add(job, self.started_ns)
+        with self._lock:
+            self.started_ns = now_ns()
+            self.bus.reset_statistics()
+            polled = {it.drive: jobs for it, jobs in self._declared.items()}
+            for drive in in_order(self.bus.drives, self.switching):
+                for job in polled[drive]:
+                    self.schedule.add(job, self.started_ns)
+            self._is_started = True
 
     @property
     def is_steady(self) -> bool:
@@ -154,6 +191,10 @@ class _PolledLine:
 
     def tend(self, now: int) -> None:
         """See what became of what was queued, and queue what comes next."""
+        with self._lock:
+            self._tend(now)
+
+    def _tend(self, now: int) -> None:
         port = self.bus.line.queue
         if port is None:
             self._regain(now)
@@ -284,6 +325,10 @@ class _PolledLine:
         return port is not None and port.end()
 
     def close(self) -> None:
+        with self._lock:
+            self._close()
+
+    def _close(self) -> None:
         ended_ns = self.ended_ns or now_ns()
         port = self.bus.line.queue
         if port:
@@ -297,6 +342,10 @@ class _PolledLine:
         self.bus.close()
 
     def summary(self) -> dict[str, Any]:
+        with self._lock:
+            return self._summary()
+
+    def _summary(self) -> dict[str, Any]:
         seconds = max(((self.ended_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
         drives = {drive.name: self._told(drive, seconds) for drive in self.bus.drives}
         tallies = [self.bus.respondent(drive).tally() for drive in self.bus.drives]
@@ -335,8 +384,8 @@ class Poller:
     """Polls a plant as its file says, from `with` on until the block is left.
 
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
-    missing. Any thread may take batches; commands go through `bus(line)`, ahead of the polling, and are
-    counted in `ledger` and noted in `audit`, as Bus says.
+    missing. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
+    of the polling, and are counted in `ledger` and noted in `audit`, as Bus says.
     """
 
     def __init__(
@@ -353,6 +402,7 @@ class Poller:
         self._is_watched = False  # somebody waits for `fileno`
         self._lines: list[_PolledLine] = []
         self._closing = False
+        self._changing = threading.Lock()  # one drive comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         try:
             for number, declared in enumerate(plant.lines):
@@ -409,6 +459,35 @@ class Poller:
             seconds = LOOK_S if restless or self._is_watched else REST_S
             called = dict.fromkeys([*restless, *(self._lines[it] for it in self._inbox.await_calls(seconds))])
 
+    def add(self, line: str, polled: PolledDrive) -> None:
+        """Poll one more drive on this line, from now on.
+
+        Raises ValueError when there is no such line, or its name or address is taken.
+        """
+        with self._changing:
+            names = {drive.name for bus in self.buses.values() for drive in bus.drives}
+            if polled.drive.name in names:
+                raise ValueError(f"another drive is called {polled.drive.name}; give every one its own name")
+            self._line(line).add(polled)
+
+    def remove(self, line: str, drive: str) -> None:
+        """Poll the drive of this name no more; its motor goes on as it is.
+
+        What is queued of it is still asked. Raises ValueError when there is none.
+        """
+        with self._changing:
+            found = self._line(line)
+            for it in found.bus.drives:
+                if it.name == drive:
+                    return found.remove(it)
+        raise ValueError(f"there is no drive {drive!r} on line {line!r}")
+
+    def _line(self, name: str) -> _PolledLine:
+        for line in self._lines:
+            if line.name == name:
+                return line
+        raise ValueError(f"there is no line {name!r}; there are {', '.join(self.buses)}")
+
     @property
     def buses(self) -> dict[str, Bus]:
         """The lines' buses, by name."""
@@ -416,9 +495,7 @@ class Poller:
 
     def bus(self, line: str) -> Bus:
         """The bus of the line with this name."""
-        if line not in self.buses:
-            raise ValueError(f"there is no line {line!r}; there are {', '.join(self.buses)}")
-        return self.buses[line]
+        return self._line(line).bus
 
     def fileno(self) -> int:
         """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""

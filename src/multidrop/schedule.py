@@ -99,6 +99,10 @@ class Schedule(Generic[J]):
             self._next -= at < self._next
             self._turn.pop(at)
 
+    def forget(self, drive: int) -> None:
+        """A drive of which no job is left."""
+        self._health.pop(drive, None)
+
     def _await(self, job: J) -> None:
         heapq.heappush(self._waiting, (job.due_ns, job.number, job))
 
@@ -237,7 +241,7 @@ class Schedule(Generic[J]):
         elif has_answered_late:
             health.asleep_until_ns = now_ns
         self._ill = any(it.failures for it in self._health.values())
-        self._late_until_ns = max(it.late_until_ns for it in self._health.values())
+        self._late_until_ns = max((it.late_until_ns for it in self._health.values()), default=0)
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self._health[drive]
