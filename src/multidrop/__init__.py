@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from multidrop.outcome import Outcome as Outcome
     from multidrop.plant import Plant as Plant
     from multidrop.plant import PlantError as PlantError
+    from multidrop.plant import Polled as Polled
+    from multidrop.plant import PolledDrive as PolledDrive
     from multidrop.plant import load_plant as load_plant
     from multidrop.poller import Poller as Poller
     from multidrop.recording import convert as convert
@@ -73,7 +75,7 @@ _HOMES = {
     "ledger": ("Ledger",),
     "motion": ("ramp", "start_staggered"),
     "outcome": ("Effect", "Outcome"),
-    "plant": ("Plant", "PlantError", "load_plant"),
+    "plant": ("Plant", "PlantError", "Polled", "PolledDrive", "load_plant"),
     "poller": ("Poller",),
     "recording": ("convert", "open_reader", "open_writer"),
     "register": ("Register", "command", "reading", "setting"),
