@@ -230,7 +230,16 @@ static const struct {
     {"words written", MD_RTU, 8, {.address = 1, .function = 0x10, .count = 123}},
     {"too many words written", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 124}},
     {"an answer to a broadcast", MD_RTU, 0, {.function = 6, .data_len = 2}},
+    {"words written, and words", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 1, .data_len = 2}},
+    {"a value written", MD_RTU, 8, {.address = 1, .function = 6, .data_len = 2}},
+    {"half a value written", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 1}},
+    {"two values written by one's function", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 4}},
+    {"an answer to what nobody here knows", MD_RTU, 0, {.address = 1, .function = 0x17, .data_len = 2}},
+    {"an answer from a reserved address", MD_RTU, 0, {.address = 248, .function = 6, .data_len = 2}},
     {"a value", MD_DELIXI, 21, {.address = 1, .function = 7, .data_len = 4}},
+    {"half a value", MD_DELIXI, 0, {.address = 1, .function = 7, .data_len = 2}},
+    {"a value of no command", MD_DELIXI, 0, {.address = 1, .function = 1, .data_len = 4}},
+    {"a value of a command too far", MD_DELIXI, 0, {.address = 1, .function = 8, .data_len = 4}},
     {"a refusal of an unknown command", MD_DELIXI, 21, {.address = 1, .function = 9, .exception = 0xF0}},
     {"a refusal that is none", MD_DELIXI, 0, {.address = 1, .function = 2, .exception = 0x02}},
 };
@@ -283,6 +292,9 @@ static const struct {
     {"another byte count", "01 03 02", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 3, .count = 2}},
     {"an answer to no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
     {"another command", ":0106", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
+    {"no state", ":010300000000000004\\r\\n", MD_DELIXI, MD_BAD_ECHO, {.address = 1, .function = 3, .data_len = 4}},
+    {"a state", ":010300010000000005\\r\\n", MD_DELIXI, 21, {.address = 1, .function = 3, .data_len = 4}},
+    {"a state of two bytes", ":010301000000000005\\r\\n", MD_DELIXI, 21, {.address = 1, .function = 3, .data_len = 4}},
     {"a refusal below the refusals", ":01FB", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
 };
 
