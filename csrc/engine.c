@@ -20,7 +20,8 @@
 enum {
     READY = 256,              /* ports that are dealt with at a time */
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
-    MOST_LATENESS = 60000     /* ns of a wake-up that are reckoned with */
+    MOST_LATENESS = 80000,    /* ns of a wake-up that are reckoned with */
+    MOST_SPINNING = 4         /* ports; with more of them the processor has better to do */
 };
 static const int64_t NEVER = INT64_MAX;
 static const int64_t RETRY_WRITE_NS = 1000000;
@@ -81,7 +82,7 @@ struct md_engine {
     struct md_bell bell;
     struct md_port *arriving; /* clients wait for these to be opened */
     struct md_port **ports;
-    int64_t *wakes; /* when each port wants to be looked at, whatever happens */
+    int64_t *wakes; /* when the thread is to wake for each port, whatever happens */
     unsigned count, room;
     int64_t lateness_ns; /* of the thread's waking, as is usual */
     int stopping;
@@ -311,14 +312,37 @@ static void finish(struct md_port *port)
     }
 }
 
+/* The request is out: what is waited for is its reply. */
+static int is_asked(const struct md_port *port)
+{
+    return port->turn != NOBODYS && port->line.completion->sent_ns;
+}
+
+/* A sleeping processor wakes late, and by much the same time again and again: where requests must leave
+ * in time the sleep is shortened by what is usual, and what is then too early is spun away, with few
+ * lines some 20 us of each exchange. Nothing is spun away before a look at a reply, which may be early. */
+static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
+{
+    if (until_ns - *now_ns > MOST_LATENESS || port->engine->count > MOST_SPINNING || port->progress.lost)
+        return 0;
+    if (!port->emptied) /* what came meanwhile is looked for now, not when the request must leave */
+        *now_ns = pump_in(port);
+    while (*now_ns < until_ns)
+        *now_ns = md_now_ns();
+    return 1;
+}
+
 /* Carry on until there is nothing to do but to wait. */
 static void advance(struct md_port *port, int64_t now_ns)
 {
     struct md_line *line = &port->line;
     int64_t wake_ns;
     for (;;) {
-        if (port->turn == NOBODYS && !take_up(port, &wake_ns, now_ns))
+        if (port->turn == NOBODYS && !take_up(port, &wake_ns, now_ns)) {
+            if (spin_until(port, wake_ns, &now_ns))
+                continue;
             break;
+        }
         int want = md_line_want(line, now_ns);
         if (want == MD_DONE) {
             finish(port);
@@ -339,6 +363,8 @@ static void advance(struct md_port *port, int64_t now_ns)
                 now_ns = pump_in(port);
             continue;
         }
+        if (want == MD_WAIT && !is_asked(port) && spin_until(port, wake_ns, &now_ns))
+            continue;
         port->blind = want == MD_WAIT;
         break;
     }
@@ -347,7 +373,9 @@ static void advance(struct md_port *port, int64_t now_ns)
         watch(port, 0);
     else if (!port->blind)
         watch(port, 1);
-    port->engine->wakes[port->index] = wake_ns;
+    int is_early = wake_ns != NEVER && (port->blind || port->turn == NOBODYS) &&
+                   (is_asked(port) || port->engine->count <= MOST_SPINNING);
+    port->engine->wakes[port->index] = wake_ns - (is_early ? port->engine->lateness_ns : 0);
 }
 
 /* ---- the thread ---- */
@@ -361,21 +389,17 @@ static int64_t earliest(const struct md_engine *engine)
     return least;
 }
 
-/* Sleeping processors wake late, and by much the same time again and again: the sleep is shortened
- * by what is usual, and what is then too early is spun away. */
 static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 {
     if (until_ns == NEVER)
         return md_waiter_wait(engine->waiter, ready, READY, -1);
-    int64_t wake_ns = until_ns - engine->lateness_ns, left = wake_ns - md_now_ns();
+    int64_t left = until_ns - md_now_ns();
     int n = md_waiter_wait(engine->waiter, ready, READY, left > 0 ? left : 0);
-    int64_t late = md_now_ns() - wake_ns;
+    int64_t late = md_now_ns() - until_ns;
     if (n == 0 && left > 0 && late >= 0) { /* else it could not sleep for so short a time */
-        engine->lateness_ns += (late - engine->lateness_ns) / 8;
+        engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
         if (engine->lateness_ns > MOST_LATENESS)
             engine->lateness_ns = MOST_LATENESS;
-        while (md_now_ns() < until_ns)
-            ;
     }
     return n;
 }
