@@ -20,7 +20,7 @@ from lines import polled, proofs, rows_of
 from test_mixed_line import REASONS, VARIANTS
 from worlds import World, WorldWire
 
-from multidrop import poller, schedule
+from multidrop import polled_line, poller, schedule
 from multidrop.batch import Row
 from multidrop.core import Framing, Message, Result
 from multidrop.drive import Drive
@@ -135,7 +135,7 @@ class Story:
         """
         cost = sum(drive.response_timeout for drive in self.drives)
         longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
-        longest += Faults().away + poller.REOPEN_NS / S + poller.LOOK_S
+        longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
         ended = self.world.now
         asked: dict[str, int] = {}
         while len(asked) < len(self.drives):

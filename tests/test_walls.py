@@ -44,7 +44,7 @@ FLOORS = [
         "motion",
     },
     {"bus", "exchanges", "acquaintance", "writing", "batch", "models"},
-    {"recording", "sim", "scan", "poller", "plant"},
+    {"recording", "sim", "scan", "poller", "polled_line", "plant"},
     {"capture", "look"},
     {"cli"},
 ]

@@ -19,7 +19,7 @@ from line_driver import LineDriver
 from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import lib
 
-from multidrop import bus, poller
+from multidrop import bus, polled_line, poller
 from multidrop.batch import Row
 from multidrop.core import Exchange, Inbox, Message, Result, new_completion
 from multidrop.drive import Drive
@@ -250,7 +250,7 @@ class World:
         self._threads = {*threading.enumerate()}
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", lambda port: WorldLine(self))
-        for module in (bus, poller):
+        for module in (bus, poller, polled_line):
             patch.setattr(module, "now_ns", lambda: self.now)
         patch.setattr(poller, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
         patch.setattr(poller, "Inbox", self._inbox)

@@ -1,0 +1,370 @@
+"""A line that is polled: its schedule, what is queued on it, and what to do when that fails.
+
+Where all its drives answer and are polled as fast as it allows, the core repeats the bus cycle by
+itself; else its queue is topped up, many exchanges at a time and some way ahead. A register that is
+refused is set aside, and a port that was lost is opened again.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop import core, plant
+from multidrop.bus import Bus, exchange
+from multidrop.core import EXCEPTION_STATUS, STATUSES, Exchange, Field, Inbox, Port, Respondent, Result
+from multidrop.drive import Drive
+from multidrop.errors import LineError
+from multidrop.line import now_ns
+from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
+from multidrop.plant import PolledDrive
+from multidrop.register import Register
+from multidrop.schedule import Job, Schedule
+from multidrop.statistics import Statistics
+
+AHEAD_NS = 300_000_000  # so far ahead the lines are planned
+LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
+REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
+SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
+REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
+
+
+class Codes:
+    """The names that rows are made of, each with its number."""
+
+    def __init__(self) -> None:
+        self.drives: dict[str, int] = {}
+        self.registers: dict[str, int] = {}
+
+    def fields(self, drive: Drive, block: Block) -> core.Block:
+        return core.Block(
+            self.drives.setdefault(drive.name, len(self.drives)),
+            [
+                Field(
+                    block.offset(register),
+                    register.wire,
+                    self.registers.setdefault(register.name, len(self.registers)),
+                    register.scale.numerator,
+                    register.scale.denominator,
+                )
+                for register in block.registers
+            ],
+        )
+
+
+@dataclass(eq=False, kw_only=True)
+class Asked(Job):
+    """A job with what the core needs to carry it out and to make rows of it."""
+
+    owner: Drive
+    block: Block
+    exchange: Exchange
+    fields: core.Block
+
+    def expected_ns(self, response_delay: float) -> int:
+        """How long it takes from the end of the one before."""
+        return round((silence(self.owner) + sending(self.owner, self.block) + response_delay) * 1e9)
+
+
+class PolledLine:
+    """A line's bus, its schedule, and what is queued on it. `number` is what the core calls it by."""
+
+    def __init__(self, declared: plant.Line, number: int, bus: Bus, inbox: Inbox, codes: Codes) -> None:
+        self.name = declared.name
+        self.bus = bus
+        self.schedule: Schedule[Asked] = Schedule()
+        self.started_ns = now_ns()
+        self.ended_ns: int | None = None
+        self.set_aside: list[Asked] = []  # a single register that the drive refuses again and again
+        self._number = number
+        self._inbox = inbox
+        self._codes = codes
+        self._port: Port | None = None  # that was tended last
+        self._done = 0  # exchanges on it, when it was tended last
+        self._jobs: list[Asked] = []  # all there ever were: the core may still look at them
+        self._declared: dict[PolledDrive, list[Asked]] = {}
+        self._lock = threading.Lock()  # of all above and below: drives come and go on any thread
+        self._is_started = False
+        self._ahead_ns = 0  # what is queued will take
+        self._learnt_ns = 0
+        self.switching = declared.switching  # s; in the end as measured
+        self._asked_of: list[tuple[Drive, Respondent]] = []
+        self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
+        self._reopening: threading.Thread | None = None
+        self._reopen_ns = 0
+        self._cycle: list[Asked] = []  # what the core repeats
+        self._queued: deque[tuple[Asked, int]] = deque()  # what the core has not carried out yet
+        try:
+            for polled in declared.drives:
+                self.add(polled)
+        except BaseException:
+            self.bus.close()
+            raise
+
+    def add(self, polled: PolledDrive) -> None:
+        with self._lock:
+            drive = self.bus.attach(polled.drive)
+            try:
+                jobs = self._jobs_of(polled)
+            except BaseException:
+                self.bus.detach(drive)
+                raise
+            self._asked_of.append((drive, self.bus.respondent(drive)))
+            for job in jobs if self._is_started else []:
+                self.schedule.add(job, now_ns())
+        self._inbox.call(self._number)
+
+    def _jobs_of(self, polled: PolledDrive) -> list[Asked]:
+        """A drive that comes back has the jobs that it had."""
+        drive = polled.drive
+        self.bus.line.require((drive.settings.baudrate, drive.settings.format))
+        if polled in self._declared:
+            return self._declared[polled]
+        rates: dict[float | None, list[Register[Any]]] = {}
+        for poll in polled.polls:
+            rates.setdefault(poll.every, []).append(poll.register)
+        jobs: list[Asked] = []
+        for every, registers in rates.items():
+            period_ns = None if every is None else round(every * 1e9)
+            jobs += [self._job(drive, block, period_ns) for block in blocks(drive, registers)]
+        self._jobs += jobs
+        self._declared[polled] = jobs
+        return jobs
+
+    def remove(self, drive: Drive) -> None:
+        with self._lock:
+            now = now_ns()
+            jobs = [it for it in self.schedule.jobs if it.owner is drive]
+            slots = [(it, it.due_ns) for it in jobs if it.period_ns and it.due_ns <= now]
+            self._miss(slots, Result.POLL_ENDED)
+            for job in jobs:
+                self.schedule.remove(job)
+            self.schedule.forget(drive.address)
+            self.set_aside = [it for it in self.set_aside if it.owner is not drive]
+            self._asked_of = [it for it in self._asked_of if it[0] is not drive]
+        self.bus.detach(drive)
+        self._inbox.call(self._number)
+
+    def _job(self, drive: Drive, block: Block, period_ns: int | None) -> Asked:
+        fields = self._codes.fields(drive, block)
+        request, respondent = block.request(drive.address), self.bus.respondent(drive)
+        job = Asked(
+            drive=drive.address,
+            kind=kind(drive),
+            period_ns=period_ns,
+            duration_ns=0,
+            owner=drive,
+            block=block,
+            exchange=exchange(drive, request, respondent, fields, period=(period_ns or 0) / 1e9),
+            fields=fields,
+        )
+        job.duration_ns = job.expected_ns(drive.response_delay)
+        return job
+
+    def start(self) -> None:
+        with self._lock:
+            self.started_ns = now_ns()
+            self.bus.reset_statistics()
+            polled = {it.drive: jobs for it, jobs in self._declared.items()}
+            for drive in in_order(self.bus.drives, self.switching):
+                for job in polled[drive]:
+                    self.schedule.add(job, self.started_ns)
+            self._is_started = True
+
+    @property
+    def is_steady(self) -> bool:
+        """Nothing is to be done for it until the core calls."""
+        return bool(self._cycle)
+
+    def tend(self, now: int) -> None:
+        """See what became of what was queued, and queue what comes next."""
+        with self._lock:
+            self._tend(now)
+
+    def _tend(self, now: int) -> None:
+        port = self.bus.line.queue
+        if port is None:
+            self._regain(now)
+            return
+        if port is not self._port:
+            self._port, self._done = port, 0
+            port.report_to(self._inbox, self._number)
+        self._forget_done(port)
+        if port.lost:
+            self._lose(port, now)
+            return
+        self._observe(now)
+        self._heed_refusals(now)
+        self._keep_busy(port, now)
+
+    def _forget_done(self, port: Port) -> None:
+        done = port.done
+        for _ in range((done - self._done) & 0xFFFF_FFFF):
+            self._ahead_ns -= self._queued.popleft()[0].duration_ns
+        self._done = done
+
+    def _lose(self, port: Port, now: int) -> None:
+        """The port failed: what was queued on it is missed."""
+        port.stop()
+        self._forget_done(port)
+        self._miss(list(self._queued), Result.LINE_LOST)
+        self._queued.clear()
+        self._cycle = []
+        self._ahead_ns = 0
+        self.bus.line.close()
+        self._reopen_ns = now
+
+    def _observe(self, now: int) -> None:
+        if now - self._learnt_ns >= LEARN_NS:
+            self._learn(now)
+        seen = [(respondent.failures, respondent.late_until_ns) for _, respondent in self._asked_of]
+        if seen == self._seen:
+            return
+        self._seen = seen
+        for (drive, _), (failures, late_until_ns) in zip(self._asked_of, seen, strict=True):
+            self.schedule.observe(
+                drive.address,
+                failures,
+                now,
+                late_until_ns=late_until_ns,
+                cost_ns=round(drive.response_timeout * 1e9),
+            )
+
+    def _learn(self, now: int) -> None:
+        """How long exchanges take, by the drives' own response delays."""
+        self._learnt_ns = now
+        delays = {drive: respondent.response_delay for drive, respondent in self._asked_of}
+        for job in self.schedule.jobs:
+            job.duration_ns = job.expected_ns(delays[job.owner] or job.owner.response_delay)
+        self._ahead_ns = sum(job.duration_ns for job, _ in self._queued)
+
+    def _heed_refusals(self, now: int) -> None:
+        """Registers that are refused together are asked for singly; a single one is set aside.
+
+        So no register is lost because of its neighbours.
+        """
+        for job in [it for it in self.schedule.jobs if it.fields.refusals >= REFUSALS]:
+            if len(job.block.registers) > 1:
+                parts = [self._job(job.owner, alone(it), job.period_ns) for it in job.block.registers]
+            elif job in self.set_aside:
+                continue
+            else:
+                parts = [self._job(job.owner, job.block, SET_ASIDE_NS)]
+                self.set_aside += parts
+            self.schedule.remove(job)
+            for part in parts:
+                self._jobs.append(part)
+                self.schedule.add(part, now)
+
+    def _keep_busy(self, port: Port, now: int) -> None:
+        cycle = self.schedule.cycle(now)
+        if cycle != self._cycle or port.repeating != bool(cycle):
+            following = port.repeat([])
+            if self._cycle:
+                self.schedule.go_on(self._cycle[following])
+            self._cycle = self.schedule.cycle(now)
+            if self._cycle:
+                port.repeat([job.exchange for job in self._cycle])
+        if not self._cycle:
+            self._top_up(port, now)
+        if self.schedule.unasked:
+            self._miss(self.schedule.unasked, Result.NOT_ASKED)
+            self.schedule.unasked = []
+
+    def _top_up(self, port: Port, now: int) -> None:
+        done_ns = max(now + self._ahead_ns, self._queued[-1][1] if self._queued else 0)
+        queued = self.schedule.take(now, done_ns, now + AHEAD_NS, port.room - len(self._queued))
+        if queued:
+            port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
+            self._queued += queued
+            self._ahead_ns += sum(job.duration_ns for job, _ in queued)
+
+    def _miss(self, slots: list[tuple[Asked, int]], why: Result) -> None:
+        for job, due_ns in slots:
+            job.exchange.respondent.unasked[why] += job.fields.count
+            self._inbox.add_miss(job.fields, why, due_ns)
+
+    def _regain(self, now: int) -> None:
+        """Until the port is back every value that is due is missed because of it."""
+        if now < self._reopen_ns or (self._reopening and self._reopening.is_alive()):
+            return
+        self._miss(self.schedule.pass_all(now), Result.LINE_LOST)
+        self._reopen_ns = now + REOPEN_NS
+        self._reopening = threading.Thread(target=self._reopen, daemon=True)
+        self._reopening.start()
+
+    def _reopen(self) -> None:
+        with suppress(LineError):
+            self.bus.line.reopen()
+
+    def end(self) -> None:
+        """No port is opened again; what is under way goes on."""
+        if self._reopening:
+            self._reopening.join()
+        self.ended_ns = now_ns()
+        if port := self.bus.line.queue:
+            self.switching = port.switching
+
+    @property
+    def is_under_way(self) -> bool:
+        """An exchange that was begun is not over yet."""
+        port = self.bus.line.queue
+        return port is not None and port.end()
+
+    def close(self) -> None:
+        with self._lock:
+            self._close()
+
+    def _close(self) -> None:
+        ended_ns = self.ended_ns or now_ns()
+        port = self.bus.line.queue
+        if port:
+            port.stop()
+            self._forget_done(port)
+            slots = [*self._queued, *self.schedule.pass_slots(ended_ns)]
+            self._miss([(job, due_ns) for job, due_ns in slots if 0 < due_ns <= ended_ns], Result.POLL_ENDED)
+        else:
+            self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
+        self.schedule = Schedule()
+        self.bus.close()
+
+    def summary(self) -> dict[str, Any]:
+        with self._lock:
+            return self._summary()
+
+    def _summary(self) -> dict[str, Any]:
+        seconds = max(((self.ended_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
+        drives = {drive.name: self._told(drive, seconds) for drive in self.bus.drives}
+        tallies = [self.bus.respondent(drive).tally() for drive in self.bus.drives]
+        misses: Counter[str] = sum((Counter(it["misses"]) for it in drives.values()), Counter())
+        return {
+            "seconds": round(seconds, 3),
+            "exchanges": sum(tally.exchanges for tally in tallies),
+            "samples": sum(tally.values for tally in tallies),
+            "misses": dict(misses),
+            "late_replies": sum(tally.late for tally in tallies),
+            "stray_bytes": sum(tally.stray_bytes for tally in tallies),
+            "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
+            "overrun_slots": sum(job.skipped for job in self._jobs),
+            "switching_ms": round(self.switching * 1e3, 3),
+            "set_aside": [f"{job.owner.name}.{job.block.registers[0].name}" for job in self.set_aside],
+            "drives": drives,
+        }
+
+    def _told(self, drive: Drive, seconds: float) -> dict[str, Any]:
+        respondent = self.bus.respondent(drive)
+        tally = respondent.tally()
+        misses = Counter({str(why): count for why, count in tally.missed.items()})
+        misses.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in tally.refused.items()})
+        return {
+            "exchanges": tally.exchanges,
+            "samples": tally.values,
+            "exchanges_per_second": round(tally.answered / seconds, 2),
+            "samples_per_second": round(tally.values / seconds, 2),
+            "response_delay_ms": round(respondent.response_delay * 1e3, 3),
+            "p99_delay_ms": round(Statistics(seconds, tally).delays.p99 * 1e3, 3),
+            "misses": dict(misses),
+        }
