@@ -61,7 +61,7 @@ static void check_rows(const uint8_t *head, const struct md_block *block, const 
             const struct md_field *field = &block->fields[row - before];
             double value = expected(completion->reply.data, completion->reply.data_len, field->at, field->wire);
             int is_value = completion->result >= 0 && !completion->reply.exception;
-            must(rows.drive[row] == field->drive && rows.reg[row] == field->reg && rows.time[row] == rows.sent[row] + 1000);
+            must(rows.drive[row] == block->drive && rows.reg[row] == field->reg && rows.time[row] == rows.sent[row] + 1000);
             must((rows.valid[row / 8] >> row % 8 & 1) == (rows.status[row] == 0));
             if (completion->result < 0)
                 must(rows.status[row] == -completion->result);
@@ -107,7 +107,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     struct md_field fields[FIELDS];
     for (int i = 0; i < FIELDS; i++) {
         const uint8_t *from = data + HEADER + FIELD * i;
-        fields[i] = (struct md_field){.at = (uint16_t)(from[0] << 8 | from[1]), .wire = from[2], .drive = from[3], .reg = from[4],
+        fields[i] = (struct md_field){.at = (uint16_t)(from[0] << 8 | from[1]), .wire = from[2], .reg = (uint16_t)(from[3] << 8 | from[4]),
                                       .multiplier = 1, .divisor = 1 + from[5]};
     }
     const uint8_t *bytes = data + HEADER + FIELDS * FIELD;
@@ -122,7 +122,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
                                        .first_ns = data[7] + 3, .reply = {.data_len = (uint16_t)len}};
     completion.reply.exception = data[0] & 0x40 ? data[6] : 0;
     memcpy(completion.reply.data, bytes, len);
-    check_rows(data, &(struct md_block){.fields = fields, .count = data[0] % 5 % (FIELDS + 1)}, &completion);
+    check_rows(data, &(struct md_block){.fields = fields, .count = data[0] % 5 % (FIELDS + 1), .drive = data[5]}, &completion);
     check_spelling(data, exact, len);
     free(exact);
     return 0;
