@@ -84,16 +84,15 @@ class Exchanges:
         return {register.name: raw[register.name] for register in registers}
 
     def _ask(self, drive: Drive, block: Block, attempts: int) -> Message:
-        for attempt in range(1, attempts + 1):
+        for _ in range(attempts - 1):
             try:
                 return self._read(drive, self.carry_out(drive, block.request(drive.address)))
             except (NoReply, BadReply):
-                if attempt == attempts:
-                    raise
+                continue
             except DriveRefused as refusal:
-                if refusal.code not in drive.damaged or attempt == attempts:
+                if refusal.code not in drive.damaged:
                     raise
-        raise AssertionError("unreachable")
+        return self._read(drive, self.carry_out(drive, block.request(drive.address)))
 
     def carry_out(self, drive: Drive, request: Message, expiry: float = 0.0) -> Completion:
         """One exchange, ahead of any polling; first an answer that may still come late is waited for.
