@@ -13,7 +13,7 @@ from peers import require_program
 
 from multidrop.batch import Row
 from multidrop.capture import Capture, CaptureError, CaptureWriter, Decoding, Side
-from multidrop.core import Framing, Kind, Message, Span, Splitter, build_reply, build_request
+from multidrop.core import Framing, Kind, Message, Span, Splitter, Unpacker, build_reply, build_request
 from multidrop.plant import Plant, load_plant
 
 RTU = [
@@ -268,6 +268,52 @@ def test_a_clock_that_is_off_by_ages_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
     with pytest.raises(CaptureError, match=r"byte 28: its clock is 1099511627776 s off"):
         spans(tmp_path / "a.pcapng")
+
+
+def block(kind: int, body: bytes) -> bytes:
+    return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
+
+
+SECTION, INTERFACE = described()[:28], described()[28:]
+BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (SECTION[:8] + b"\xde\xad\xbe\xef" + SECTION[12:], " is damaged: what begins at byte 0 is no packet"),
+        (SECTION + struct.pack("<III", 1, 7, 7), " is damaged: what begins at byte 28 is no packet"),
+        (SECTION + block(1, bytes(4)), " is damaged: what begins at byte 28 is no packet"),
+        (described((9, b"\x0a")), ": byte 28: its clock is finer than a nanosecond"),
+        (described() + SECTION, ": byte 48: only the first section can be read"),
+        (described() + BIG_ENDIAN_SECTION, ": byte 48: sections of both byte orders cannot be read"),
+        (
+            SECTION + block(3, bytes(8)),
+            ": byte 28: packets without time or of the old kind cannot be read; "
+            "`editcap` turns them into enhanced ones",
+        ),
+        (
+            SECTION + INTERFACE * (Unpacker.MOST_CHANNELS + 1),
+            f": more than {Unpacker.MOST_CHANNELS} interfaces",
+        ),
+    ],
+)
+def test_a_pcapng_file_that_cannot_be_read_is_told_in_a_sentence(
+    tmp_path: Path, content: bytes, sentence: str
+) -> None:
+    path = tmp_path / "a.pcapng"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError) as mistake:
+        spans(path)
+    assert str(mistake.value) == f"{path}{sentence}"
+
+
+def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcapng"
+    path.write_bytes(described()[:-6])
+    with Capture(path) as capture:
+        assert list(capture) == [None]
+        assert (capture.lines, capture.torn) == ([], 14)
 
 
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])

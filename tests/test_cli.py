@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,46 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
 )
 def test_a_mistake_is_a_sentence_and_status_2(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
+
+
+def test_its_version_is_the_package_s(run: Run) -> None:
+    assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
+
+
+@pytest.mark.parametrize("seconds", ["ten", "0", "-1", "nan", "inf"])
+def test_what_is_no_time_to_poll_for_is_a_sentence(run: Run, seconds: str) -> None:
+    status, out, err = run("poll", "plant.toml", f"--seconds={seconds}")
+    assert (status, out) == (2, "")
+    assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
+
+
+def test_a_report_is_a_page_by_its_name(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").touch()
+    status, _, err = run("report", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
+    assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name ends in .html\n")
+
+
+def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
+    )
+    status, _, err = run("simulate", plant, "--ports", tmp_path / "ports")
+    assert (status, err) == (
+        2,
+        "multidrop: line 'hall/1' has a / in its name, which the link to its port cannot have\n",
+    )
+
+
+def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from multidrop.drives.invt_che import InvtCHE, parameter\n\n\n"
+        'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
+        '    ramp = parameter(11, "s", step=0.1, span=(0, 3600))\n'
+    )
+    status, out, _ = run("models", f"{tmp_path / 'mine.py'}:Mine")
+    assert status == 0
+    assert "        kept: EEPROM; written at 800BH, in RAM" in out
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 import multidrop.drives
 from multidrop.core import Message, build_reply, build_request, parse_reply, parse_request, raw_value
-from multidrop.drive import VERBS, Drive
+from multidrop.drive import VERBS, Condition, Direction, Drive, State, Unsupported
 from multidrop.drives import MODELS
 from multidrop.plan import blocks, write_request
-from multidrop.register import Carrier, Register, Wire
+from multidrop.register import Carrier, Register, Wire, reading
 
 FAMILIES = list(MODELS.values())
 
@@ -238,3 +238,23 @@ def test_drives_import_what_they_may() -> None:
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
                 room = node.module.split(".")[1]
                 assert room in {"drive", "register", "drives"}, f"{path.name} imports {node.module}"
+
+
+def test_a_family_without_a_verb_says_so() -> None:
+    class Mute(Drive):
+        """Can only be read."""
+
+        speed = reading(0, "rpm")
+
+    with pytest.raises(ValueError, match=r"^Mute has no option 'rated_frequency'; its options: none$"):
+        Mute(1, rated_frequency=50)
+    for name in VERBS:
+        given = (5.0,) if name == "set_frequency" else ()
+        with pytest.raises(Unsupported, match="the document of Mute has no "):
+            next(getattr(Mute(1), name).script(*given))
+
+
+def test_a_state_is_told_with_all_that_is_known() -> None:
+    said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
+    assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
+    assert str(State(Condition.UNKNOWN)) == "unknown"

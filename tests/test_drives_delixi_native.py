@@ -6,7 +6,7 @@ import pytest
 from scripts import Wire, frame, rows, typed
 from test_drives_delixi_modbus import MONITORS
 
-from multidrop.drive import Condition, Direction, Framing, Refused, State, Unconfirmed, Unsupported
+from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
 from multidrop.drives.delixi_native import PARAMETER_RAM, DelixiNative, Status
 from multidrop.drives.delixi_parameters import Baudrate, Fault, RunSource, parameter
 from multidrop.errors import NoReply
@@ -178,3 +178,11 @@ def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:
 def test_what_the_document_does_not_have(name: str) -> None:
     with pytest.raises(Unsupported, match="Delixi"):
         getattr(Wire(DelixiNative(1)).drive, name)()
+
+
+@pytest.mark.parametrize("status", [Status.FAULT, Status.UNDERVOLTAGE])
+def test_a_fault_that_stands_after_its_reset_is_told(status: Status) -> None:
+    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": Fault.OC_OVERCURRENT})
+    with pytest.raises(NotDone, match=r"the fault reset.*the fault stands: OC_OVERCURRENT"):
+        wire.drive.reset_fault()
+    assert wire.sent == [RESET]  # once

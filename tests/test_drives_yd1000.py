@@ -313,3 +313,13 @@ def test_identify() -> None:
         Wire(YD1000(6), says).drive.identify()
     with pytest.raises(Refused, match="0011H"):
         Wire(YD1000(5), {**says, "maximum_frequency": 0.1}).drive.identify()
+
+
+def test_a_motor_with_a_fault_is_not_started() -> None:
+    wire = Wire(YD1000(1), AT_30_HZ)
+    wire.drive.state()
+    wire.says["fault_record_1"] = [0x0A]  # since then
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match=r"has a fault, code 0AH: see to it, then call reset_fault\(\)$"):
+            verb()
+    assert wire.sent == []

@@ -255,3 +255,9 @@ def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
     assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
     assert gap(fast, slow, switching=0.002) == pytest.approx(longer + 0.002)
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
+
+
+def test_what_has_no_read_function_is_no_block() -> None:
+    table = Table("command word", None, 0x06)
+    with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
+        Block(table, 0, 1, ()).request(1)

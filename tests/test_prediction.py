@@ -256,3 +256,12 @@ def test_framing_counts() -> None:
     ascii_own = (17 + 15) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n", no silence
     assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
+
+
+def test_remedies_are_told_in_a_sentence() -> None:
+    every = 'every = "100 ms" instead of 50 ms'
+    found = Remedies(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
+    assert str(found) == (
+        f"it would fit with {every}, or baudrate = 19200 for fan-1, fan-2, "
+        "or at most 3 of these registers for each drive"
+    )

@@ -271,6 +271,25 @@ def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.Monke
     assert len(hall.written) == 1
 
 
+def test_a_raw_request_that_is_refused_is_noted_as_that(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
+    refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
+    hall.answers = lambda request: refusal if request.function == 6 else None
+    with pytest.raises(DriveRefused, match="code 12H"):
+        hall.bus.raw(drive, 6, 0x1000, b"\0\5")
+    hall.bus.close()
+    assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
+
+
+def test_a_drive_that_refuses_to_tell_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, YD1000(1))
+    refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
+    hall.answers = lambda request: refusal if request.function == 3 else None
+    assert hall.bus.watchdog(drive) == drive.watchdog
+
+
 def test_a_write_whose_turn_comes_too_late_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
