@@ -140,12 +140,13 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...
 def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]]) -> list[Block]:
     """Least total duration by dynamic programming over where the last block begins."""
     registers = sorted(registers, key=lambda register: (register.address, register.words))
+    readable = _readable(drive, table, registers)
     best: list[tuple[float, list[Block]]] = [(0.0, [])]
     for end in range(1, len(registers) + 1):
         choices = []
         for begin in range(end - 1, -1, -1):
             block = _block(table, registers[begin:end])
-            if not _allowed(drive, block):
+            if not _allowed(drive, block, readable):
                 break
             cost, before = best[begin]
             choices.append((cost + duration(drive, block), [*before, block]))
@@ -159,19 +160,23 @@ def _block(table: Table, registers: list[Register[Any]]) -> Block:
     return Block(table, start, end - start, tuple(registers))
 
 
-def _allowed(drive: Drive, block: Block) -> bool:
+def _readable(drive: Drive, table: Table, registers: Iterable[Register[Any]]) -> set[int]:
+    """The addresses at which there is something to read."""
+    return {
+        address
+        for register in (*registers, *drive.registers.values())
+        if register.table == table and register.readable
+        for address in range(register.address, register.address + register.words)
+    }
+
+
+def _allowed(drive: Drive, block: Block, readable: set[int]) -> bool:
     if len(block.registers) == 1:
         return True  # a register is read whole, whatever the limit
     if block.count > drive.most_registers.get(block.table, 1):
         return False
-    known = {
-        address
-        for register in (*block.registers, *drive.registers.values())
-        if register.table == block.table and register.readable
-        for address in range(register.address, register.address + register.words)
-    }
     gaps = drive.readable_gaps.get(block.table, range(0))
-    return all(it in known or it in gaps for it in range(block.start, block.start + block.count))
+    return all(it in readable or it in gaps for it in range(block.start, block.start + block.count))
 
 
 def write_request(drive: Drive, register: Register[Any], raw: int, address: int | None = None) -> Message:
