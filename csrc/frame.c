@@ -446,12 +446,12 @@ int md_is_mistakable(int framing, const struct md_message *one, const struct md_
 {
     if (one->address != other->address || one->function != other->function)
         return 0;
-    if (framing == MD_DELIXI)
+    if (framing == MD_DELIXI && (one->function == STATE_QUERY || one->function == PARAMETER_QUERY))
         return one->start == other->start;
     /* Replies to reads say nothing of what was asked for but its length. */
-    if (find_function(one->function)->reply == DATA)
+    if (framing != MD_DELIXI && find_function(one->function)->reply == DATA)
         return md_reply_length(framing, one) == md_reply_length(framing, other);
-    return one->start == other->start;
+    return 1; /* a write's confirmation says what was written, but a refusal does not say of what it is */
 }
 
 void md_copy_message(struct md_message *to, const struct md_message *from)

@@ -165,6 +165,11 @@ static int parse_at(const struct md_line *line, size_t at, struct md_message *re
     return md_parse_reply(line->exchange->framing, line->rx + at, line->rx_len - at, &line->exchange->request, reply);
 }
 
+static uint64_t function_bit(const struct md_message *request)
+{
+    return UINT64_C(1) << (request->function & 63);
+}
+
 static void expect_late_answer(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -172,6 +177,7 @@ static void expect_late_answer(struct md_line *line)
     int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
     int64_t until_ns = line->quiet_ns + later(3 * timeout_ns(drive), drive->most_timeout_ns) + reply_ns;
     drive->late_others = line->quiet_ns < drive->late_until_ns;
+    drive->late_functions = (drive->late_others ? drive->late_functions : 0) | function_bit(&exchange->request);
     drive->late = exchange->request;
     drive->late_framing = exchange->framing;
     drive->late_until_ns = later(until_ns, drive->late_until_ns);
@@ -186,12 +192,13 @@ static void expect_late_answer(struct md_line *line)
 static int is_ambiguous(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
-    if (now_ns >= drive->late_until_ns)
+    if (exchange->insists || now_ns >= drive->late_until_ns)
         return 0;
     struct md_message other = exchange->request;
     other.start ^= 1; /* mistakable, if replies do not say what was asked */
     return md_is_mistakable(exchange->framing, &drive->late, &exchange->request) ||
-           (drive->late_others && md_is_mistakable(exchange->framing, &other, &exchange->request));
+           (drive->late_others && (drive->late_functions & function_bit(&exchange->request)) &&
+            md_is_mistakable(exchange->framing, &other, &exchange->request));
 }
 
 /* Whether the answer to an earlier request begins there: its length, MD_INCOMPLETE or a reason. That

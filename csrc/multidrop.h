@@ -142,6 +142,7 @@ struct md_drive {
     uint32_t failures;              /* in a row */
     int late_framing;
     int late_others;                /* and answers to requests before that one, too */
+    uint64_t late_functions;        /* of all those requests: a bit each */
     struct md_drive *next_late;     /* on the same line, whose answer may still come */
     struct md_tally tally;
     struct md_message late;
@@ -158,6 +159,7 @@ struct md_exchange {
     int64_t period_ns;      /* between its slots in a queue; 0: it has none */
     struct md_settings settings;
     int framing;
+    int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
     struct md_message request;
 };
 

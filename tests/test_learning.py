@@ -265,6 +265,22 @@ def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Respon
     assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
 
 
+def test_a_refusal_does_not_say_of_which_write_it_is(line: LineDriver, drive: Respondent) -> None:
+    """Told that it was refused one would take a motor for standing that the second write has started."""
+    time_out(line, drive, WRITE)
+    line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+    ask(line, drive, READ)  # no refusal of a write is one of a read
+
+
+def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Respondent) -> None:
+    time_out(line, drive, WRITE)
+    stop = exchange(WRITE, drive)
+    stop.c.insists = 1
+    line.begin(stop)
+    assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
+
+
 def test_what_looks_like_a_damaged_reply_inside_another_frame_is_none(
     line: LineDriver, drive: Respondent
 ) -> None:

@@ -246,6 +246,29 @@ def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
 
 
+@every_family
+def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    insisted: list[bool] = []
+    carry_out = hall.carry_out
+
+    def watched(exchange: Exchange, **times: int) -> Completion:
+        if is_write(exchange.request):
+            insisted.append(bool(exchange.c.insists))
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(hall, "carry_out", watched)
+    drive.set_frequency(20)
+    drive.start()
+    assert not insisted[-1]
+    insisted.clear()
+    drive.stop()
+    assert insisted
+    assert all(insisted)
+
+
 def test_the_first_look_tells_the_watchdog_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -24,6 +24,7 @@ def exchange(
     block: core.Block | None = None,
     *,
     period: float = 0.0,
+    insists: bool = False,
 ) -> Exchange:
     """What the core needs to carry out a request to this drive."""
     settings = drive.settings
@@ -38,6 +39,7 @@ def exchange(
         silence=drive.needed_silence() + settings.bit,
         turnaround=drive.turnaround_delay,
         period=period,
+        insists=insists,
         block=block,
     )
 
@@ -94,12 +96,14 @@ class Exchanges:
                     raise
         return self._read(drive, self.carry_out(drive, block.request(drive.address)))
 
-    def carry_out(self, drive: Drive, request: Message, expiry: float = 0.0) -> Completion:
+    def carry_out(
+        self, drive: Drive, request: Message, expiry: float = 0.0, *, insists: bool = False
+    ) -> Completion:
         """One exchange, ahead of any polling; first an answer that may still come late is waited for.
 
-        After `expiry` seconds it is not sent; 0: never too late.
+        After `expiry` seconds it is not sent; 0: never too late. One that insists waits for no answer.
         """
-        made = exchange(drive, request, self.respondent(drive), NO_ROWS)
+        made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists)
         expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
         while True:
             late_until_ns = made.respondent.late_until_ns

@@ -62,9 +62,10 @@ class Writer:
     def _sent(self, drive: Drive, step: Write, request: Message, asked: Any) -> Outcome:
         register = step.register
         what = f"{register.name} = {register.format(asked)}"
-        seconds = 0.0 if isinstance(step, Insist) else self._expiry
+        insists = isinstance(step, Insist)
+        seconds = 0.0 if insists else self._expiry
         with self._noted(drive, request, what):
-            completion = self._exchanges.carry_out(drive, request, seconds)
+            completion = self._exchanges.carry_out(drive, request, seconds, insists=insists)
             if completion.result == Result.EXPIRED:
                 raise Expired(drive.name, what, seconds)
             outcome = self._outcome(drive, register, asked, completion)

@@ -58,7 +58,8 @@ class Exchange:
 
     Times are in seconds: `character` of one character, `silence` before the request and after
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
-    `block` is what rows are made of.
+    `insists`: not to wait for an earlier answer, which may then pass for its own. `block` is what rows are
+    made of.
     """
 
     __slots__ = ("block", "c", "framing", "request", "respondent", "settings")
@@ -75,6 +76,7 @@ class Exchange:
         silence: float,
         turnaround: float = 0.1,
         period: float = 0.0,
+        insists: bool = False,
         block: Block | None = None,
     ) -> None:
         build_request(framing, request)  # raises for what no frame can say
@@ -93,6 +95,7 @@ class Exchange:
                 "silence_ns": round(silence * 1e9),
                 "turnaround_ns": round(turnaround * 1e9),
                 "period_ns": round(period * 1e9),
+                "insists": insists,
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
             },
