@@ -6,7 +6,6 @@ import json
 import resource
 import signal
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,14 +13,13 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+from terminals import MULTIDROP, on_terminal
 from test_cli import TOY, Run, run
 
 from multidrop.batch import Row
 from multidrop.recording import open_reader
 
 __all__ = ["run"]  # a fixture
-
-MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
 
 
 def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
@@ -257,3 +255,24 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     rows = recorded(out)
     assert {row.drive for row in rows if row.value is not None} == set(drives)
     assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
+
+
+# ---- on a terminal ----
+
+
+def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "2", size=(120, 24)) as terminal:
+        terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
+        terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
+        terminal.wait_for("output_frequency: no")  # of the other: no reply, or not asked
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=20) == 0
+        assert b"\x1b[3F\x1b[J" in terminal.written  # the table and its head, over themselves
+
+
+def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
+        terminal.wait_for("... and 3 drives more")
+        terminal.wait_for("utilisation")
+        table = terminal.text.partition("hall-1: ")[0]
+        assert max(map(len, table.splitlines())) < 40

@@ -7,16 +7,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from terminals import on_terminal
 from test_cli import TOY, Run, run
 from toy import Toy
 
+import multidrop.cli.scan
 from multidrop.cli.scan import sentence
 from multidrop.core import Framing
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.plant import load_plant
-from multidrop.scan import Crowd, Found, Noise, Untried, plant_text
+from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.timing import Settings
 
@@ -156,3 +158,32 @@ def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
 def test_a_plant_file_needs_a_drive() -> None:
     with pytest.raises(ValueError, match="nothing to write a plant file of"):
         plant_text("port", [Found(4, USUAL, Framing.RTU, (), 0.005)], {})
+
+
+# ---- that takes its time ----
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_what_was_found_is_kept_when_it_is_interrupted(
+    run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    def interrupted(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
+        yield next(it for it in findings if isinstance(it, Found))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(multidrop.cli.scan, "_shown", interrupted)
+    plant = tmp_path / "found.toml"
+    status, out, err = run("scan", port, *BRISKLY, "--out", plant, *words)
+    assert (status, err) == (130, "multidrop: interrupted\n")
+    assert [it.drive.address for it in load_plant(plant).lines[0].drives] == [1]
+    assert json.loads(out)["finished"] is False if words else "1 drive found" in out
+
+
+def test_on_a_terminal_progress_is_one_line(port: str) -> None:
+    with on_terminal("scan", port, *BRISKLY) as terminal:
+        terminal.wait_for("address 2; ")
+        terminal.wait_for("3 drives found in ")
+        assert terminal.process.wait(timeout=20) == 0
+        lines = terminal.text.splitlines()
+    assert next(it for it in lines if "innovert-ibd" in it).startswith("address 2: ")
+    assert terminal.written.count(b"\r\x1b[K") > 3

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
-import pty
 import re
-import select
 import string
-import struct
-import subprocess
 import termios
-import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
+from terminals import on_terminal
 from test_cli import Run, run
-from test_cli_poll import MULTIDROP, plant, plant_file
+from test_cli_poll import plant, plant_file
 
 import multidrop.cli.extra
 from multidrop.batch import Row
@@ -31,6 +23,7 @@ from multidrop.cli.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page,
 from multidrop.cli.watched import WatchedPlant
 from multidrop.core import Result, Tally
 from multidrop.plant import Plant, load_plant
+from multidrop.recording import open_reader
 from multidrop.recording.recorded import from_rows
 from multidrop.statistics import LineStatistics, look
 from multidrop.stopping import Seen, Stopped
@@ -308,48 +301,6 @@ def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 # ---- on a terminal ----
 
 
-class Terminal:
-    """A pty on which a command runs, and all that it wrote."""
-
-    def __init__(self, words: list[str], size: tuple[int, int], **environment: str) -> None:
-        self.fd, slave = pty.openpty()
-        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", size[1], size[0], 0, 0))
-        self.before = termios.tcgetattr(slave)
-        self.slave = slave
-        clean = {name: text for name, text in os.environ.items() if name not in ("COLUMNS", "LINES")}
-        self.process = subprocess.Popen(
-            words, stdin=slave, stdout=slave, stderr=slave, env=clean | {"TERM": "xterm"} | environment
-        )
-        self.written = b""
-
-    def wait_for(self, text: str, seconds: float = 20) -> None:
-        end = time.monotonic() + seconds
-        while text not in self.text:
-            assert time.monotonic() < end, self.text[-3000:]
-            if select.select([self.fd], [], [], 0.1)[0]:
-                self.written += os.read(self.fd, 65536)
-
-    @property
-    def text(self) -> str:
-        return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", self.written.decode(errors="replace"))
-
-    def press(self, keys: bytes) -> None:
-        self.written = b""
-        os.write(self.fd, keys)
-
-
-@contextmanager
-def on_terminal(*words: object, size: tuple[int, int] = (80, 24), **environment: str) -> Iterator[Terminal]:
-    it = Terminal([*MULTIDROP, *map(str, words)], size, **environment)
-    try:
-        yield it
-    finally:
-        it.process.kill()
-        it.process.wait()
-        os.close(it.fd)
-        os.close(it.slave)
-
-
 def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         terminal.wait_for("pump-9 silent")
@@ -363,6 +314,19 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
         terminal.press(b"q")
         assert terminal.process.wait(timeout=20) == 0
         assert termios.tcgetattr(terminal.slave) == terminal.before
+
+
+def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
+    out = tmp_path / "seen.arrows"
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+    rows = [row for batch in open_reader(out) for row in batch]
+    assert {row.drive for row in rows} == {"pump-1", "pump-9"}
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("seen.arrows")  # it is there already
+        assert terminal.process.wait(timeout=20) == 2
 
 
 def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:

@@ -1,0 +1,60 @@
+"""Commands on a terminal of their own, and what stands on it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
+
+
+class Terminal:
+    """A pty on which a command runs, and all that it wrote."""
+
+    def __init__(self, words: list[str], size: tuple[int, int], **environment: str) -> None:
+        self.fd, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", size[1], size[0], 0, 0))
+        self.before = termios.tcgetattr(slave)
+        self.slave = slave
+        clean = {name: text for name, text in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        self.process = subprocess.Popen(
+            words, stdin=slave, stdout=slave, stderr=slave, env=clean | {"TERM": "xterm"} | environment
+        )
+        self.written = b""
+
+    def wait_for(self, text: str, seconds: float = 20) -> None:
+        end = time.monotonic() + seconds
+        while text not in self.text:
+            assert time.monotonic() < end, self.text[-3000:]
+            if select.select([self.fd], [], [], 0.1)[0]:
+                self.written += os.read(self.fd, 65536)
+
+    @property
+    def text(self) -> str:
+        return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", self.written.decode(errors="replace"))
+
+    def press(self, keys: bytes) -> None:
+        self.written = b""
+        os.write(self.fd, keys)
+
+
+@contextmanager
+def on_terminal(*words: object, size: tuple[int, int] = (80, 24), **environment: str) -> Iterator[Terminal]:
+    it = Terminal([*MULTIDROP, *map(str, words)], size, **environment)
+    try:
+        yield it
+    finally:
+        it.process.kill()
+        it.process.wait()
+        os.close(it.fd)
+        os.close(it.slave)
