@@ -1,0 +1,75 @@
+"""Does a test fail for every small mistake in these files? `python tests/mutation/run.py [FILE...]`
+
+Mutants that no test can tell from the original are in explained.toml, each with the reason. Fails on
+a survivor that is not there, and on a row there that is no survivor any more.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from queue import SimpleQueue
+
+from edits import Mutant, Name, mutants
+from trials import ROOT, TRIALS, attempt, scratch
+
+EXPLAINED = Path(__file__).with_name("explained.toml")
+
+
+def explained() -> dict[Name, str]:
+    """The reason why a mutant survives, by its name."""
+    rows = tomllib.loads(EXPLAINED.read_text("utf-8"))["mutant"]
+    return {(it["file"], it["function"], it["line"], it["becomes"]): it["why"] for it in rows}
+
+
+def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
+    """How each of the file's mutants ends; None: it survives."""
+    source = (ROOT / path).read_text("utf-8")
+    found = mutants(path, source)
+    trees: SimpleQueue[Path] = SimpleQueue()
+
+    def end(text: str) -> str | None:
+        tree = trees.get()
+        try:
+            return attempt(tree, path, text)
+        finally:
+            trees.put(tree)
+
+    with ExitStack() as stack:
+        jobs = os.cpu_count() or 1
+        for _ in range(jobs):
+            trees.put(stack.enter_context(scratch()))
+        if end(source) not in {None, "same code"}:
+            sys.exit(f"the tests of {path} fail without a mistake, too")
+        tried = stack.enter_context(ThreadPoolExecutor(jobs)).map(end, (it.text for it in found))
+        yield from zip(found, tried, strict=True)
+
+
+def report(path: str) -> int:
+    """Print what survives, and a line of figures; how much of it is not explained."""
+    reasons = {name: why for name, why in explained().items() if name[0] == path}
+    alive: set[Name] = set()
+    count: Counter[str] = Counter()
+    for mutant, end in ends(path):
+        if end is None:
+            alive.add(mutant.name)
+            end = "explained" if mutant.name in reasons else "unexplained"
+        if end == "unexplained":
+            print(f"{mutant}", flush=True)
+        count[end] += 1
+    stale = reasons.keys() - alive
+    for _, function, before, after in sorted(stale):
+        print(f"{path}: explained, but no survivor: {function}\n  - {before}\n  + {after}")
+    figures = ", ".join(f"{count[end]} {end}" for end in sorted(count) if end != "no program")
+    print(f"{path}: {count.total() - count['no program']} mutants: {figures}", flush=True)
+    return count["unexplained"] + len(stale)
+
+
+if __name__ == "__main__":
+    sys.exit(1 if sum(report(path) for path in sys.argv[1:] or TRIALS) else 0)

@@ -1,0 +1,132 @@
+"""A copy of the tree in which one mutant after the other is tried, and never the tree itself."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 20  # s; the slowest trial takes two
+CC = os.environ.get("CC", "cc")
+FLAGS = ["-std=c11", "-D_DEFAULT_SOURCE", "-w", "-Icsrc"]
+SANITIZED = [
+    *FLAGS,
+    "-O1",
+    "-ftrivial-auto-var-init=pattern",
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=all",
+]
+MODULE = [*FLAGS, "-O2", "-fPIC", "-DPy_LIMITED_API=0x030b0000"]
+
+# An editable installation would find its own modules before those of the copy.
+PYTEST = """
+import sys
+sys.meta_path = [it for it in sys.meta_path if isinstance(it, type)]
+sys.path.insert(0, "src")
+import pytest
+sys.exit(pytest.main(sys.argv[1:]))
+"""
+
+Trial = Callable[[Path], str | None]  # the end of a mutant in this tree; None: it survives
+
+
+def by_test_core(tree: Path) -> str | None:
+    """The C core's own test program, with its sanitizers."""
+    if _status(tree, CC, *SANITIZED, "-c", "csrc/frame.c", "-o", "checked/frame.o"):
+        return "no program"
+    _must(tree, CC, *SANITIZED, *_objects(tree, "checked", "test_core"), "-lm", "-o", "test_core")
+    return _end(_status(tree, "./test_core", "tests/data/frames.csv"))
+
+
+def by_compiler(tree: Path) -> str | None:
+    """Nothing to find: the optimiser makes the same code of it."""
+    _must(tree, CC, *MODULE, "-c", "csrc/frame.c", "-o", "module/frame.o")
+    same = (tree / "module" / "frame.o").read_bytes() == (tree / "module" / "original.o").read_bytes()
+    return "same code" if same else None
+
+
+def by_test_frame(tree: Path) -> str | None:
+    """The Python tests of frames; by_compiler has compiled the mutant for the module."""
+    _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
+    return _pytest(tree, "tests/test_frame.py", "tests/test_split.py")
+
+
+def by_test_schedule(tree: Path) -> str | None:
+    return _pytest(tree, "tests/test_schedule.py")
+
+
+TRIALS: dict[str, tuple[Trial, ...]] = {
+    "csrc/frame.c": (by_test_core, by_compiler, by_test_frame),
+    "src/multidrop/schedule.py": (by_test_schedule,),
+}
+
+
+def _core(tree: Path) -> list[str]:
+    """The names of the core's files."""
+    (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", (tree / "csrc" / "CMakeLists.txt").read_text())
+    return [Path(it).stem for it in sources.replace("${WAITER}", "epoll").split()]
+
+
+def _objects(tree: Path, directory: str, main: str) -> list[str]:
+    return [f"{directory}/{name}.o" for name in (main, *_core(tree))]
+
+
+def _pytest(tree: Path, *tests: str) -> str | None:
+    options = ("-q", "-x", "-p", "no:cacheprovider", "--hypothesis-seed=0")
+    return _end(_status(tree, sys.executable, "-c", PYTEST, *options, *tests))
+
+
+def _end(status: int | None) -> str | None:
+    return None if status == 0 else "killed" if status else "timed out"
+
+
+def _status(tree: Path, *command: str) -> int | None:
+    """None: it did not end."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    try:
+        return subprocess.run(command, cwd=tree, timeout=PATIENCE, check=False, **quiet).returncode
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _must(tree: Path, *command: str) -> None:
+    subprocess.run(command, cwd=tree, check=True)
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """The copy, with everything compiled that no mutant changes."""
+    with tempfile.TemporaryDirectory() as directory:
+        tree = Path(directory)
+        for name in ("csrc", "src", "tests"):
+            shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
+        shutil.copy(ROOT / "pyproject.toml", tree)
+        for name in ("checked", "module"):
+            (tree / name).mkdir()
+        _must(tree, sys.executable, "csrc/cdef.py", "csrc/multidrop.h", "module/_core.c")
+        headers = f"-I{sysconfig.get_path('include')}"
+        sources = {name: f"csrc/{name}.c" for name in _core(tree)}
+        for name, source in {"test_core": "tests/c/test_core.c", **sources}.items():
+            _must(tree, CC, *SANITIZED, "-c", source, "-o", f"checked/{name}.o")
+        for name, source in {"_core": "module/_core.c", **sources}.items():
+            _must(tree, CC, *MODULE, headers, "-c", source, "-o", f"module/{name}.o")
+        shutil.copy(tree / "module" / "frame.o", tree / "module" / "original.o")
+        yield tree
+
+
+def attempt(tree: Path, path: str, text: str) -> str | None:
+    """Try the file with this text; the tree is as before afterwards, but for what is built."""
+    original = (tree / path).read_text()
+    (tree / path).write_text(text)
+    try:
+        return next((end for trial in TRIALS[path] if (end := trial(tree))), None)
+    finally:
+        (tree / path).write_text(original)
