@@ -18,6 +18,7 @@ from multidrop.core import Message, Respondent, Result
 from multidrop.drives import YD1000
 from multidrop.errors import LineError
 from multidrop.line import Line
+from multidrop.plant import parse_duration
 from multidrop.sim import Faults, HostileWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
 
@@ -198,6 +199,8 @@ def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
     path.write_text('drop = 1.5\nflips = 0.1\nlate = "soon"\nburst = 0\nseed = "x"\naway = 3\ndelay = true\n')
     with pytest.raises(ValueError, match=re.escape(str(path))) as mistake:
         load_faults(path)
+    with pytest.raises(ValueError, match="is not a duration") as soon:
+        parse_duration("soon")
     assert str(mistake.value).splitlines() == [
         f"{path}: {sentence}"
         for sentence in (
@@ -205,7 +208,7 @@ def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
             "seed = 'x' is not right; write seed = 7",
             "delay = True is not right; write delay = 0.01",
             'away = 3 is not right; write away = "1 s"',
-            '\'soon\' is not a duration above 0, such as "50 ms", "2 s" or "1 min", for late',
+            f"{soon.value}, for late",
             "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01",
             "burst = 0 is not from 1 to 4096 characters",
         )
