@@ -158,3 +158,19 @@ def test_many_threads_do_all_of_it_at_once() -> None:
     done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.endswith("\nnothing misattributed, nothing lost, nothing grows\n")
+
+
+def test_statistics_may_be_looked_at_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive that has left in the middle of a look is no mistake of whoever looks."""
+    with Bus(port) as bus:
+        ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
+        tally = bus.respondent(ours[0]).tally
+
+        def leave_and_tell() -> object:
+            bus.detach(ours[1])
+            return tally()
+
+        monkeypatch.setattr(bus.respondent(ours[0]), "tally", leave_and_tell)
+        assert list(bus.statistics().drives) == ["pump-1", "pump-2"]
+        monkeypatch.undo()
+        assert list(bus.statistics().drives) == ["pump-1"]

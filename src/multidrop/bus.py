@@ -311,6 +311,11 @@ class Bus:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
         return self._exchanges.respondent(drive)
 
+    @property
+    def respondents(self) -> dict[Drive, Respondent]:
+        """What is known of each drive that is on this bus now."""
+        return self._exchanges.respondents
+
     # ---- how it went ----
 
     def statistics(self) -> LineStatistics:
@@ -325,5 +330,5 @@ class Bus:
         self._reset_at = self._at_last or self._counted(self.line.overruns())
 
     def _counted(self, overruns: int | None) -> LineStatistics:
-        tallies = {drive.name: self.respondent(drive).tally() for drive in self.drives}
+        tallies = {drive.name: it.tally() for drive, it in self.respondents.items()}
         return look((now_ns() - self._opened_ns) / 1e9, tallies, overruns)

@@ -64,6 +64,11 @@ class Exchanges:
         del self._respondents[drive]
         self._heard.pop(drive, None)
 
+    @property
+    def respondents(self) -> dict[Drive, Respondent]:
+        """All that are on the line now; drives may come and go meanwhile, on any thread."""
+        return dict(self._respondents)
+
     def respondent(self, drive: Drive) -> Respondent:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
         if drive not in self._respondents:

@@ -337,8 +337,9 @@ class PolledLine:
 
     def _summary(self) -> dict[str, Any]:
         seconds = max(((self.ended_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
-        drives = {drive.name: self._told(drive, seconds) for drive in self.bus.drives}
-        tallies = [self.bus.respondent(drive).tally() for drive in self.bus.drives]
+        respondents = self.bus.respondents
+        drives = {drive.name: self._told(it, seconds) for drive, it in respondents.items()}
+        tallies = [it.tally() for it in respondents.values()]
         misses: Counter[str] = sum((Counter(it["misses"]) for it in drives.values()), Counter())
         return {
             "seconds": round(seconds, 3),
@@ -354,8 +355,7 @@ class PolledLine:
             "drives": drives,
         }
 
-    def _told(self, drive: Drive, seconds: float) -> dict[str, Any]:
-        respondent = self.bus.respondent(drive)
+    def _told(self, respondent: Respondent, seconds: float) -> dict[str, Any]:
         tally = respondent.tally()
         misses = Counter({str(why): count for why, count in tally.missed.items()})
         misses.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in tally.refused.items()})
