@@ -21,6 +21,7 @@ enum {
     READY = 256,              /* ports that are dealt with at a time */
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
     MOST_LATENESS = 80000,    /* ns of a wake-up that are reckoned with */
+    HELD_UP_NS = 200000,      /* no write takes so long by itself */
     MOST_SPINNING = 4         /* ports; with more of them the processor has better to do */
 };
 static const int64_t NEVER = INT64_MAX;
@@ -151,13 +152,15 @@ static int64_t pump_in(struct md_port *port)
     return now_ns;
 }
 
-/* Whether the port took anything. */
-static int pump_out(struct md_port *port, int64_t now_ns)
+/* Whether the port took anything. The request leaves when it is written; where the thread was held up
+ * just then, afterwards: since too early a time its reply, and a late one, would be waited for too short. */
+static int pump_out(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->line;
     ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
+    int64_t done_ns = md_now_ns();
     if (written > 0)
-        md_line_sent(line, (size_t)written, now_ns);
+        md_line_sent(line, (size_t)written, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
     else if (written < 0 && !is_transient(errno))
         lose(port, errno);
     return written != 0 && (written > 0 || port->progress.lost);
