@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ NUMBER = re.compile(r"(?<![\w.])(?:0x[0-9A-Fa-f]+|[0-9][0-9_]*(?:\.[0-9]+)?)(?![
 FUNCTION = re.compile(r"^ *(?:def|class) (\w+)|^\w[\w \*]*?(\w+)\(", re.MULTILINE)
 
 
-Name = tuple[str, str, str, str]  # file, function, the lines before and after
+Name = tuple[str, str, str, str, int]  # file, function, the lines before and after, and which of these
 Edit = tuple[int, int, str]  # from, to, what stands there instead
 
 
@@ -59,12 +60,13 @@ class Mutant:
     function: str
     before: str
     after: str
+    nth: int  # of those in this function that read the same, from 1
     number: int  # of the line
     text: str  # the whole file's
 
     @property
     def name(self) -> Name:
-        return self.path, self.function, self.before, self.after
+        return self.path, self.function, self.before, self.after, self.nth
 
     def __str__(self) -> str:
         return f"{self.path}:{self.number} {self.function}\n  - {self.before}\n  + {self.after}"
@@ -75,26 +77,24 @@ def mutants(path: str, source: str) -> list[Mutant]:
     language = _python if Path(path).suffix == ".py" else _c
     bare, special = language(source)
     found: dict[str, Mutant] = {}
+    alike: Counter[tuple[str, str, str]] = Counter()
     for start, end, text in sorted({*_swaps(bare), *_numbers(bare), *special}):
         mutated = source[:start] + text + source[end:]
-        if mutated != source:
-            found.setdefault(mutated, _mutant(path, source, start, end, mutated))
+        if mutated == source or mutated in found:
+            continue
+        read = _read(source, start, end, mutated)
+        alike[read] += 1
+        found[mutated] = Mutant(path, *read, alike[read], source.count("\n", 0, start) + 1, mutated)
     return list(found.values())
 
 
-def _mutant(path: str, source: str, start: int, end: int, mutated: str) -> Mutant:
+def _read(source: str, start: int, end: int, mutated: str) -> tuple[str, str, str]:
+    """The function, and the lines before and after, on one line each."""
     first = source.rfind("\n", 0, start) + 1
     last = source.find("\n", end)
     before, after = source[first:last], mutated[first : last + len(mutated) - len(source)]
     names = [it[1] or it[2] for it in FUNCTION.finditer(source, 0, start)]
-    return Mutant(
-        path,
-        names[-1] if names else "",
-        " ".join(before.split()),
-        " ".join(after.split()),
-        source.count("\n", 0, start) + 1,
-        mutated,
-    )
+    return names[-1] if names else "", " ".join(before.split()), " ".join(after.split())
 
 
 def _swaps(bare: str) -> Iterator[Edit]:

@@ -25,7 +25,9 @@ EXPLAINED = Path(__file__).with_name("explained.toml")
 def explained() -> dict[Name, str]:
     """The reason why a mutant survives, by its name."""
     rows = tomllib.loads(EXPLAINED.read_text("utf-8"))["mutant"]
-    return {(it["file"], it["function"], it["line"], it["becomes"]): it["why"] for it in rows}
+    return {
+        (it["file"], it["function"], it["line"], it["becomes"], it.get("nth", 1)): it["why"] for it in rows
+    }
 
 
 def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
@@ -64,7 +66,7 @@ def report(path: str) -> int:
             print(f"{mutant}", flush=True)
         count[end] += 1
     stale = reasons.keys() - alive
-    for _, function, before, after in sorted(stale):
+    for _, function, before, after, _ in sorted(stale):
         print(f"{path}: explained, but no survivor: {function}\n  - {before}\n  + {after}")
     figures = ", ".join(f"{count[end]} {end}" for end in sorted(count) if end != "no program")
     print(f"{path}: {count.total() - count['no program']} mutants: {figures}", flush=True)
