@@ -9,11 +9,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.sharedctypes import SynchronizedArray
 from pathlib import Path
 from threading import Thread
 
@@ -26,6 +27,7 @@ MOTOR = "fan"
 EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
 PATIENCE = 30.0  # s, until the simulator has started
 BEAT = 5e-3  # s
+LONG = 30e-3  # s, that with the latest reply and a collision are near the shortest response time-out
 
 
 def write_plant(directory: Path, lines: int) -> Path:
@@ -70,13 +72,17 @@ class Hall:
 
     ports: Sequence[str]
     pid: int
-    _late: Synchronized[float]
+    _late: SynchronizedArray[float]
 
     def latest(self) -> float:
-        """The longest in s that the simulator was held up since this was asked last."""
+        """The longest in s that the simulator or a pty was held up since this was asked last."""
         with self._late.get_lock():
-            late, self._late.value = self._late.value, 0.0
+            late, self._late[0] = self._late[0], 0.0
         return late
+
+    def was_held_up(self, since: float) -> bool:
+        """Whether one of them was, for so long that answers may have come after their time-out."""
+        return max(self._late[1:]) >= since
 
 
 def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
@@ -100,7 +106,7 @@ def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator
     """The wires that this makes, in a process of their own, to which the function is handed over."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    late = context.Value("d", 0.0)
+    late = context.Array("d", 2)  # the longest time held up; when it was so for long the last time
     process = context.Process(target=_simulate, args=(make, arguments, theirs, late), daemon=True)
     process.start()
     try:
@@ -119,7 +125,7 @@ def _simulate(
     make: Callable[..., Sequence[Wire]],
     arguments: Sequence[object],
     connection: Connection,
-    late: Synchronized[float],
+    late: SynchronizedArray[float],
 ) -> None:
     with suppress(OSError):  # so that the line keeps its time on a machine that has much else to do
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
@@ -131,12 +137,20 @@ def _simulate(
     serve(make(*arguments), announce)
 
 
-def _watch(late: Synchronized[float]) -> None:
-    """How long this process is held up: a drive that hears so late answers so late."""
-    before = time.monotonic()
+def _watch(late: SynchronizedArray[float]) -> None:
+    """How long this process is held up, or a pty, through which a worker of the kernel takes the bytes.
+
+    A drive that hears so late answers so late.
+    """
+    master, slave = os.openpty()
+    tty.setraw(slave)
     while True:
+        begun = time.monotonic()
         time.sleep(BEAT)
+        os.write(slave, b"!")
+        os.read(master, 1)
         now = time.monotonic()
         with late.get_lock():
-            late.value = max(late.value, now - before - BEAT)
-        before = now
+            late[0] = max(late[0], now - begun - BEAT)
+            if now - begun - BEAT >= LONG:
+                late[1] = now
