@@ -398,6 +398,12 @@ def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
 # ---- the end ----
 
 
+def test_a_plant_without_lines_is_polled_in_peace() -> None:
+    with Poller(plant()) as poller:
+        assert poller.take() is None
+    assert poller.summary()["lines"] == {}
+
+
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
 def test_nothing_is_left_behind(port: str, end: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()  # what the process has once is there now

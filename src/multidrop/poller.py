@@ -98,14 +98,17 @@ class Poller:
 
     def _poll(self) -> None:
         called: Iterable[PolledLine] = self._lines
-        while not self._closing:
+        while True:
             for line in called:
                 line.tend(now_ns())
             if self._is_watched and self._inbox.chunks:
                 self._wake.set()
             restless = [line for line in self._lines if not line.is_steady]
             seconds = LOOK_S if restless or self._is_watched else REST_S
-            called = dict.fromkeys([*restless, *(self._lines[it] for it in self._inbox.await_calls(seconds))])
+            numbers = self._inbox.await_calls(seconds)
+            if self._closing:  # which is a call too, and not of a line
+                return
+            called = dict.fromkeys([*restless, *(self._lines[it] for it in numbers)])
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
