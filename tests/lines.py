@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,6 +43,36 @@ class Faulty(Wire):
 
 
 # ---- in a process of their own ----
+
+
+class LateWire(Wire):
+    """What `distort` holds up comes later, beside all else."""
+
+    def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
+        super().__init__(drives, **details)
+        self._late: list[tuple[float, bytes]] = []  # a heap
+        self._now = 0.0
+
+    def hold_up(self, reply: bytes, seconds: float) -> bytes:
+        """What is left of it by now: nothing."""
+        heapq.heappush(self._late, (self._now + seconds, reply))
+        return b""
+
+    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
+        self._now = now
+        super().receive(chunk, now, baudrate)
+
+    def advance(self, now: float) -> bytes:
+        self._now = now
+        heard = super().advance(now)
+        while self._late and self._late[0][0] <= now:
+            heard += heapq.heappop(self._late)[1]
+        return heard
+
+    @property
+    def wake(self) -> float | None:
+        times = [at for at, _ in self._late[:1]]
+        return min([*times, *([] if super().wake is None else [super().wake])], default=None)
 
 
 @contextmanager

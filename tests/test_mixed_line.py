@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import heapq
 import random
 from collections import Counter
 from typing import Any
 
-from lines import line, plant, polled, proofs, rows_of, served
+from lines import LateWire, line, plant, polled, proofs, rows_of, served
 
 from multidrop.batch import Row
 from multidrop.core import Framing, Result
@@ -58,37 +57,17 @@ def real_wires() -> list[Wire]:
     return [Wire([EncodedDrive(drive) for drive in real_drives()])]
 
 
-class UnreliableWire(Wire):
+class UnreliableWire(LateWire):
     """Replies are lost, come late or twice."""
 
     def __init__(self, drives: list[EncodedDrive]) -> None:
         super().__init__(drives, unpaced=True)
         self._random = random.Random(8)
-        self._on_their_way: list[tuple[float, bytes]] = []
-        self._now = 0.0
-
-    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        self._now = now
-        super().receive(chunk, now, baudrate)
-
-    def advance(self, now: float) -> bytes:
-        self._now = now
-        heard = super().advance(now)
-        while self._on_their_way and self._on_their_way[0][0] <= now:
-            heard += heapq.heappop(self._on_their_way)[1]
-        return heard
-
-    @property
-    def wake(self) -> float | None:
-        times = [at for at, _ in self._on_their_way[:1]]
-        return min([*times, *([] if super().wake is None else [super().wake])], default=None)
 
     def distort(self, reply: bytes) -> bytes:
         times = self._random.choices([1, 2, 0], [85, 10, 5])[0]
         if times and self._random.random() < 0.1:
-            delay = self._random.uniform(0, LATEST)
-            heapq.heappush(self._on_their_way, (self._now + delay, times * reply))
-            return b""
+            return self.hold_up(times * reply, self._random.uniform(0, LATEST))
         return times * reply
 
 

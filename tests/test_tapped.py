@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import json
 import random
 from collections import Counter
@@ -14,7 +13,7 @@ from typing import Any
 
 import pytest
 from line_driver import MS, LineDriver
-from lines import PATIENCE, Faulty, line, plant, polled, rows_of, served
+from lines import PATIENCE, Faulty, LateWire, line, plant, polled, rows_of, served
 from test_capture import decimal, tshark
 from test_cli import Run, run
 from test_cli_poll import recorded
@@ -38,30 +37,12 @@ FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 
 NEVER_ON_THE_LINE = {str(it) for it in (Result.NOT_ASKED, Result.LATE_ANSWER_DUE, Result.EXPIRED)}
 
 
-class RoughWire(Wire):
+class RoughWire(LateWire):
     """Noise comes before replies and behind them; they are damaged, cut, lost, doubled, or late."""
 
     def __init__(self, seed: int) -> None:
         super().__init__([EncodedDrive(drive) for drive in fast_drives()], unpaced=True)
         self.chance = random.Random(seed)
-        self._late: list[tuple[float, bytes]] = []
-        self._now = 0.0
-
-    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        self._now = now
-        super().receive(chunk, now, baudrate)
-
-    def advance(self, now: float) -> bytes:
-        self._now = now
-        heard = super().advance(now)
-        while self._late and self._late[0][0] <= now:
-            heard += heapq.heappop(self._late)[1]
-        return heard
-
-    @property
-    def wake(self) -> float | None:
-        times = [at for at, _ in self._late[:1]]
-        return min([*times, *([] if super().wake is None else [super().wake])], default=None)
 
     def distort(self, reply: bytes) -> bytes:
         noise = self.chance.randbytes(self.chance.randint(1, 40))
@@ -70,8 +51,7 @@ class RoughWire(Wire):
         fates = [reply, noise + reply, reply + noise, damaged, reply[:at], b"", reply + reply, noise]
         fate = self.chance.choices(fates, [70, 8, 5, 5, 3, 3, 3, 3])[0]
         if self.chance.random() < 0.05:
-            heapq.heappush(self._late, (self._now + self.chance.uniform(0, LATEST), fate))
-            return b""
+            return self.hold_up(fate, self.chance.uniform(0, LATEST))
         return fate
 
 
