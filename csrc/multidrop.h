@@ -479,7 +479,6 @@ struct md_capture {
     int is_pcapng, is_big_endian;
     struct md_channel *channels;
     size_t count;
-    uint64_t packets;
 };
 
 enum md_unpacked {

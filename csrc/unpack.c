@@ -72,7 +72,7 @@ static int put(struct md_channel *channel, const uint8_t *packet, size_t len, ui
 static int unpack_pcap(struct md_capture *capture)
 {
     struct md_channel *channel = capture->channels;
-    for (; capture->at < capture->len; capture->packets++) {
+    while (capture->at < capture->len) {
         const uint8_t *record = capture->bytes + capture->at;
         size_t left = capture->len - capture->at;
         if (left < 16)
@@ -92,7 +92,7 @@ static int unpack_pcap(struct md_capture *capture)
 
 static int unpack_pcapng(struct md_capture *capture)
 {
-    for (; capture->at < capture->len; capture->packets++) {
+    while (capture->at < capture->len) {
         const uint8_t *block = capture->bytes + capture->at;
         size_t left = capture->len - capture->at;
         if (left < 12)

@@ -58,11 +58,6 @@ class Capture:
     def heard(self) -> list[Heard]:
         return self._unpacker.heard if self._unpacker else []
 
-    @property
-    def packets(self) -> int:
-        """How many were read so far."""
-        return self._unpacker.packets if self._unpacker else 0
-
     def close(self) -> None:
         if self._unpacker:
             self._unpacker.close()

@@ -171,10 +171,6 @@ class Unpacker:
     def at(self, at: int) -> None:
         self._c.at = at
 
-    @property
-    def packets(self) -> int:
-        return int(self._c.packets)
-
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
         """The next interface of the file: its link type, whose sent what, and its clock."""
         channel = self._channels[self._c.count]

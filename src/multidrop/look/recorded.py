@@ -111,10 +111,6 @@ class Look:
         known = [drive for drive in self.metadata.get("drives", {}) if drive in there]
         return tuple(dict.fromkeys([*known, *(it.drive for it in self.series)]))
 
-    @property
-    def registers(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(it.register for it in self.series))
-
     @cached_property
     def begin(self) -> int:
         return min(int(it.time.min()) for it in self.series)
