@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from multidrop.batch import Row, Rows
-from multidrop.core import Tally
+from multidrop.core import UNASKED, Tally
 from multidrop.plant import Line, Plant, PolledDrive
 from multidrop.register import Register
 from multidrop.statistics import LineStatistics, Statistics, look
 
 HISTORY = 240  # s, a point each
-UNASKED = "not "  # so begin the reasons of misses that no request left for
 LATELY = 5.0  # s: rates are those of so long
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 

@@ -30,7 +30,7 @@ from multidrop.core.overheard import (
     Unpacker,
 )
 from multidrop.core.ports import Port, now_ns, utc_minus_monotonic_ns
-from multidrop.core.results import EXCEPTION_STATUS, STATUSES, Result, status_text
+from multidrop.core.results import EXCEPTION_STATUS, STATUSES, UNASKED, Result, status_text
 from multidrop.core.settings import REFUSALS, get_settings, set_settings
 from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
 from multidrop.core.taps import Tap, Wrappings
@@ -42,6 +42,7 @@ __all__ = [
     "HEARD_ROOM",
     "REFUSALS",
     "STATUSES",
+    "UNASKED",
     "Block",
     "Columns",
     "Completion",

@@ -52,6 +52,7 @@ _REASONS = {
     Result.POLL_ENDED: "poll ended",
 }
 
+UNASKED = "not "  # so begin the reasons of misses that no request left for
 EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from multidrop.core import Framing, Message, build_request
+from multidrop.core import UNASKED, Framing, Message, build_request
 from multidrop.look.recorded import Array, Look, Series
 from multidrop.look.style import COLOURS, TEXT, days, line_style, new_figure, tell_time, time_edges
 from multidrop.timing import Settings
@@ -21,7 +21,6 @@ BINS = 12  # of the output frequency
 FREQUENCY = "output_frequency"
 ROOM = 2.0  # times the longest delay but one of a hundred: so much a picture shows
 SHORTEST_AXIS = 0.001  # s
-UNASKED = "not "  # so begin the reasons of misses that no request left for
 
 
 @dataclass(frozen=True)
