@@ -400,6 +400,7 @@ def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
 
 def test_a_plant_without_lines_is_polled_in_peace() -> None:
     with Poller(plant()) as poller:
+        assert poller.fileno() >= 0
         assert poller.take() is None
     assert poller.summary()["lines"] == {}
 

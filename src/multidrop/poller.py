@@ -83,7 +83,7 @@ class Poller:
             return
         self._closing = True
         if self._thread.is_alive():
-            self._inbox.call(0)
+            self._wake_up()
             self._thread.join()
         for line in self._lines:
             line.bus.part()  # before the port is closed, on which it stops motors
@@ -98,7 +98,7 @@ class Poller:
 
     def _poll(self) -> None:
         called: Iterable[PolledLine] = self._lines
-        while True:
+        while not self._closing:
             for line in called:
                 line.tend(now_ns())
             if self._is_watched and self._inbox.chunks:
@@ -106,9 +106,12 @@ class Poller:
             restless = [line for line in self._lines if not line.is_steady]
             seconds = LOOK_S if restless or self._is_watched else REST_S
             numbers = self._inbox.await_calls(seconds)
-            if self._closing:  # which is a call too, and not of a line
-                return
-            called = dict.fromkeys([*restless, *(self._lines[it] for it in numbers)])
+            lines = [self._lines[it] for it in numbers if it < len(self._lines)]
+            called = dict.fromkeys([*restless, *lines])
+
+    def _wake_up(self) -> None:
+        """Call the thread by a number that no line has."""
+        self._inbox.call(len(self._lines))
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
@@ -151,7 +154,7 @@ class Poller:
     def fileno(self) -> int:
         """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
         self._is_watched = True
-        self._inbox.call(0)
+        self._wake_up()
         return self._wake.fileno()
 
     def take(self) -> Batch | None:

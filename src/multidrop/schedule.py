@@ -174,9 +174,7 @@ class Schedule(Generic[J]):
 
     def _slot(self, job: J, at_ns: int) -> int:
         """The job is asked at this time: in which of its slots. Those that are over are left out."""
-        if (
-            job.period_ns is None or self._health[job.drive].rest_ns
-        ):  # off any grid, to see whether it answers
+        if job.period_ns is None or self._health[job.drive].rest_ns:  # or asked whether it answers
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return 0
         self._begun.remove(job)
