@@ -300,19 +300,16 @@ class PolledLine:
         with suppress(LineError):
             self.bus.line.reopen()
 
-    def end(self) -> None:
-        """No port is opened again; what is under way goes on."""
+    def end(self) -> bool:
+        """Nothing more is begun, and no port opened again; whether an exchange is still under way."""
         if self._reopening:
             self._reopening.join()
-        self.ended_ns = now_ns()
-        if port := self.bus.line.queue:
-            self.switching = port.switching
-
-    @property
-    def is_under_way(self) -> bool:
-        """An exchange that was begun is not over yet."""
+        self.ended_ns = self.ended_ns or now_ns()
         port = self.bus.line.queue
-        return port is not None and port.end()
+        if port is None:
+            return False
+        self.switching = port.switching
+        return port.end()
 
     def close(self) -> None:
         with self._lock:

@@ -87,10 +87,8 @@ class Poller:
             self._thread.join()
         for line in self._lines:
             line.bus.part()  # before the port is closed, on which it stops motors
-        for line in self._lines:
-            line.end()
         given_up_ns = now_ns() + PARTING_NS
-        while any(line.is_under_way for line in self._lines) and now_ns() < given_up_ns:
+        while sum(line.end() for line in self._lines) and now_ns() < given_up_ns:
             sleep(0.001)
         for line in self._lines:
             line.close()
