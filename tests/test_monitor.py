@@ -333,6 +333,7 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
     environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:
         terminal.wait_for(">pump-1")
+        terminal.wait_for("pump-9 silent")  # and the other has answered
         terminal.press(b"q")
         assert terminal.process.wait(timeout=20) == 0
         assert not re.search(rb"\x1b\[[0-9;]*3[0-9]m", terminal.written)
@@ -345,6 +346,7 @@ def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
         terminal.wait_for("q quit")
         assert b"\x1b" not in terminal.written
         assert len(terminal.text.partition("q quit")[0].splitlines()) == 23
+        terminal.wait_for("pump-9 silent")
         terminal.press(b"q")
         assert terminal.process.wait(timeout=20) == 0
 
