@@ -522,6 +522,8 @@ void md_line_abandon(struct md_line *line, int result, int error)
 {
     if (line->state == IDLE)
         return;
+    if (line->state > SENDING)
+        expect_late_answer(line); /* the port may be back before it comes */
     line->completion->error = error;
     finish(line, result, line->rx, line->rx_len);
 }

@@ -241,6 +241,25 @@ def test_what_a_late_answer_could_be_taken_for_is_not_sent(line: LineDriver, dri
     assert drive.failures == 1  # nothing was asked, so nothing failed
 
 
+def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(
+    line: LineDriver, drive: Respondent
+) -> None:
+    ask(line, drive)
+    line.lose(0)
+    again = LineDriver()
+    again.now = line.now
+    again.begin(exchange(OTHER, drive))
+    assert (again.completion.result, again.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    again.now = drive.late_until_ns
+    ask(again, drive, OTHER)
+
+
+def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: Respondent) -> None:
+    line.begin(exchange(READ, drive))
+    line.lose(0)
+    assert drive.late_until_ns == 0
+
+
 @pytest.mark.parametrize("request_", [LONGER, WRITE], ids=["a longer read", "a write"])
 def test_what_no_late_answer_could_be_taken_for_is_sent(
     line: LineDriver, drive: Respondent, request_: Message
