@@ -23,6 +23,8 @@ struct md_inbox {
     size_t first, count;        /* of the chunks that hold rows */
     struct md_columns *spare[MOST_SPARE];
     size_t spares;
+    size_t lent;                /* chunks that were taken and not given back yet */
+    int is_done;                /* its client needs it no more */
     uint64_t dropped;
     int64_t utc_minus_monotonic_ns, asked_ns;
     uint64_t called[MD_MOST_NUMBERS / 64]; /* a bit for each number */
@@ -73,7 +75,7 @@ struct md_inbox *md_inbox_new(size_t chunk_rows, size_t most_chunks)
     return inbox;
 }
 
-void md_inbox_free(struct md_inbox *inbox)
+static void destroy(struct md_inbox *inbox)
 {
     for (size_t i = 0; i < inbox->count; i++)
         md_columns_free(inbox->chunks[(inbox->first + i) % inbox->most_chunks]);
@@ -83,6 +85,17 @@ void md_inbox_free(struct md_inbox *inbox)
     pthread_mutex_destroy(&inbox->mutex);
     free(inbox->chunks);
     free(inbox);
+}
+
+/* A chunk may be looked at for longer than its inbox: a collector of garbage ends them in any order. */
+void md_inbox_free(struct md_inbox *inbox)
+{
+    pthread_mutex_lock(&inbox->mutex);
+    inbox->is_done = 1;
+    int is_last = inbox->lent == 0;
+    pthread_mutex_unlock(&inbox->mutex);
+    if (is_last)
+        destroy(inbox);
 }
 
 /* ---- rows ---- */
@@ -138,6 +151,7 @@ struct md_columns *md_inbox_take(struct md_inbox *inbox)
         chunk = inbox->chunks[inbox->first];
         inbox->first = (inbox->first + 1) % inbox->most_chunks;
         inbox->count--;
+        inbox->lent++;
     }
     pthread_mutex_unlock(&inbox->mutex);
     return chunk;
@@ -150,9 +164,12 @@ void md_inbox_give_back(struct md_inbox *inbox, struct md_columns *columns)
     int is_kept = inbox->spares < MOST_SPARE;
     if (is_kept)
         inbox->spare[inbox->spares++] = columns;
+    int is_last = --inbox->lent == 0 && inbox->is_done;
     pthread_mutex_unlock(&inbox->mutex);
     if (!is_kept)
         md_columns_free(columns);
+    if (is_last)
+        destroy(inbox);
 }
 
 size_t md_inbox_chunks(struct md_inbox *inbox)

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from frames import words
 
+from multidrop._core import ffi
 from multidrop.core import (
     EXCEPTION_STATUS,
     REFUSALS,
@@ -309,6 +310,32 @@ def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
         del columns, inbox
         gc.collect()
         assert list(values) == list(range(100))
+
+
+def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        inbox = Inbox()
+        port.report_to(inbox, 0)
+        port.submit(queued := [read(7)], [0])
+        wait_until(lambda: port.pending == 0)
+        columns = inbox.take()
+    assert columns is not None and queued
+    ffi.release(inbox.c)  # as a collector of garbage does that finds both at once
+    assert list(columns.array("value")) == [7]
+    del columns
+
+
+def test_a_port_that_was_forgotten_is_let_go_of() -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    port = Port(near.fileno(), NO_SETTINGS)
+    port.submit([read(0)], [now_ns() + 60_000_000_000])
+    del port
+    gc.collect()
+    far.send(b"not for the core")
+    assert near.recv(64) == b"not for the core"
+    near.close()
+    far.close()
 
 
 def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:

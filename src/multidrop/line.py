@@ -117,8 +117,8 @@ class Line:
         self.port = port
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
+        self._core: Port | None = None  # dropped before the descriptor that it looks at
         self._serial: serial.SerialBase | None = None
-        self._core: Port | None = None
         self._tap: Tap | None = None
         self._lock = threading.RLock()  # one opens or closes at a time
         self._waiting = 0  # callers that wait for an exchange

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
+from weakref import finalize
 
 from multidrop._core import ffi, lib
 from multidrop.core.exchanges import Completion, Exchange, Respondent, completion
@@ -28,6 +30,11 @@ def _engine() -> _Engine:
     return _Engine()
 
 
+def _let_go(port: Any) -> None:
+    lib.md_port_stop(port)
+    lib.md_port_free(port)
+
+
 class Port:
     """A line driven on a descriptor by the core's thread (struct md_port).
 
@@ -42,7 +49,8 @@ class Port:
         self.room = room
         # Read in place: a call of the core would let go of the interpreter, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
-        self._stopped = False
+        self._free = finalize(self, _let_go, self.c)  # before that at which the core still looks
+        self._free.atexit = False  # others may still use it then
         self._kept: set[Exchange | Respondent] = set()  # at which the core may still look
         self._inbox: Inbox | None = None
         self._round: object = None
@@ -58,14 +66,12 @@ class Port:
 
     def stop(self) -> None:
         """Nothing more is carried out, and the descriptor is the caller's."""
-        if not self._stopped:
+        if self._free.alive:
             lib.md_port_stop(self.c)
-            self._stopped = True
 
     def close(self) -> None:
         """Stop, and let go of its memory."""
-        self.stop()
-        lib.md_port_free(self.c)
+        self._free()
         self.c = self._progress = None
 
     def report_to(self, inbox: Inbox, number: int) -> None:
