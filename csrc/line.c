@@ -37,7 +37,7 @@ static int64_t clamp(int64_t value, int64_t least, int64_t most)
 static int64_t early_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    return later(0, drive->delay_ns - 2 * drive->deviation_ns - exchange->character_ns / 2);
+    return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
 }
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
