@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 HERE = Path(__file__).parent
+PROCESSORS = sorted(os.sched_getaffinity(0))
 CORE = HERE.parent / "csrc"
 CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that take the core's own checksums
 FRAMES = (*CHECKSUM, str(CORE / "frame.c"))
@@ -69,9 +70,9 @@ def paced_line(**options: Any) -> Iterator[Talker]:
 
 
 @contextmanager
-def on_one_processor() -> Iterator[None]:
-    """Programs that are started meanwhile stay on the first processor (where the system can do that)."""
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})
+def on_processor(number: int) -> Iterator[None]:
+    """Programs that are started meanwhile stay on that processor, or on the last there is."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {PROCESSORS[min(number, len(PROCESSORS) - 1)]})
     yield
-    os.sched_setaffinity(0, allowed)
+    os.sched_setaffinity(0, before)

@@ -13,7 +13,7 @@ from typing import Any
 import rivals
 import tables
 from jobs import Job
-from programs import on_one_processor, paced_line
+from programs import on_processor, paced_line
 
 
 def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def main() -> None:
     )
 
     rows = []
-    with on_one_processor():
+    with on_processor(0):
         for master in arguments.masters:
             rows += compared("pty", master, arguments)
         for master in arguments.masters:
