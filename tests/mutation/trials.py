@@ -28,7 +28,7 @@ SANITIZED = [
 ]
 MODULE = [*FLAGS, "-O2", "-fPIC", "-DPy_LIMITED_API=0x030b0000"]
 
-# An editable installation would find its own modules before those of the copy.
+# An editable installation would find its own modules before those of the copy, as workers of xdist do.
 PYTEST = """
 import sys
 sys.meta_path = [it for it in sys.meta_path if isinstance(it, type)]
@@ -82,7 +82,7 @@ def _objects(tree: Path, directory: str, main: str) -> list[str]:
 
 
 def _pytest(tree: Path, *tests: str) -> str | None:
-    options = ("-q", "-x", "-p", "no:cacheprovider", "--hypothesis-seed=0")
+    options = ("-q", "-x", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0")
     return _end(_status(tree, sys.executable, "-c", PYTEST, *options, *tests))
 
 
