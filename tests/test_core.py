@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 from frames import words
-
 from multidrop._core import ffi
+
 from multidrop.core import (
     EXCEPTION_STATUS,
     REFUSALS,
@@ -316,10 +316,11 @@ def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         inbox = Inbox()
         port.report_to(inbox, 0)
-        port.submit(queued := [read(7)], [0])
+        queued = [read(7)]
+        port.submit(queued, [0])
         wait_until(lambda: port.pending == 0)
         columns = inbox.take()
-    assert columns is not None and queued
+    assert columns is not None
     ffi.release(inbox.c)  # as a collector of garbage does that finds both at once
     assert list(columns.array("value")) == [7]
     del columns
