@@ -43,7 +43,7 @@ struct wish {
 };
 
 /* Whose exchange is under way. */
-enum turn { NOBODYS, WISHED, QUEUED, REPEATED };
+enum turn { NOBODYS, TELLERS, WISHED, QUEUED, REPEATED };
 
 struct md_port {
     struct md_engine *engine;
@@ -62,6 +62,7 @@ struct md_port {
     uint32_t number; /* there */
 
     enum turn turn;
+    const struct md_exchange *told; /* before this one its teller has had its turn */
     uint32_t failures; /* of the drive, before its exchange */
     int blind;         /* nothing is worth reading before the port's waking time */
     int watched;       /* the waiter tells when it can be read */
@@ -188,14 +189,24 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
         port->settings = *settings;
 }
 
-static void begin(struct md_port *port, enum turn turn, const struct md_exchange *exchange,
-                  struct md_completion *completion, int64_t now_ns)
+/* Whether it was begun, and not its teller. */
+static int begin(struct md_port *port, enum turn turn, const struct md_exchange *exchange,
+                 struct md_completion *completion, int64_t now_ns)
 {
+    if (exchange->teller && port->line.echo == MD_ECHO_UNKNOWN && port->told != exchange) {
+        port->told = exchange;
+        turn = TELLERS;
+        exchange = exchange->teller;
+        completion = &port->completion;
+    } else {
+        port->told = NULL;
+    }
     port->turn = turn;
     port->failures = exchange->drive->failures;
     md_line_begin(&port->line, exchange, completion, now_ns);
     if (port->progress.lost)
         md_line_abandon(&port->line, MD_LINE_LOST, port->lost_error);
+    return turn != TELLERS;
 }
 
 static unsigned pending(struct md_port *port)
@@ -223,8 +234,7 @@ static int take_from_queue(struct md_port *port, int64_t *wake_ns, int64_t now_n
 {
     const struct slot *slot = &port->slots[port->progress.done & (port->room - 1)];
     if (now_ns >= slot->not_before_ns) {
-        begin(port, QUEUED, slot->exchange, &port->completion, now_ns);
-        if (is_over(port, slot, now_ns))
+        if (begin(port, QUEUED, slot->exchange, &port->completion, now_ns) && is_over(port, slot, now_ns))
             md_line_abandon(&port->line, MD_EXPIRED, 0);
         return 1;
     }
@@ -233,11 +243,11 @@ static int take_from_queue(struct md_port *port, int64_t *wake_ns, int64_t now_n
     return 0;
 }
 
-/* The next one of those that are repeated. With many lines what those behind it need is out of the
- * caches by now, and is fetched while there is time. */
-static const struct md_exchange *take_next(struct md_port *port)
+/* To the next one of those that are repeated. With many lines what it and those behind it need is out
+ * of the caches by now, and is fetched while there is time. */
+static void move_on(struct md_port *port)
 {
-    unsigned at = port->round_at, second = at + 1 < port->round_len ? at + 1 : 0;
+    unsigned second = port->round_at + 1 < port->round_len ? port->round_at + 1 : 0;
     unsigned third = second + 1 < port->round_len ? second + 1 : 0;
     port->round_at = second;
     const struct md_exchange *soon = port->round[second];
@@ -246,7 +256,6 @@ static const struct md_exchange *take_next(struct md_port *port)
     __builtin_prefetch(soon->block);
     __builtin_prefetch(soon->drive);
     __builtin_prefetch(&soon->drive->tally);
-    return port->round[at];
 }
 
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
@@ -254,8 +263,8 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
     struct wish *wish = port->wishes;
     if (wish && now_ns >= wish->not_before_ns) {
-        begin(port, WISHED, wish->exchange, wish->completion, now_ns);
-        if (wish->expires_ns && now_ns > wish->expires_ns)
+        int is_begun = begin(port, WISHED, wish->exchange, wish->completion, now_ns);
+        if (is_begun && wish->expires_ns && now_ns > wish->expires_ns)
             md_line_abandon(&port->line, MD_EXPIRED, 0);
         return 1;
     }
@@ -265,7 +274,8 @@ static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
     if (pending(port) && take_from_queue(port, wake_ns, now_ns))
         return 1;
     if (port->round_len) {
-        begin(port, REPEATED, take_next(port), &port->completion, now_ns);
+        if (begin(port, REPEATED, port->round[port->round_at], &port->completion, now_ns))
+            move_on(port);
         return 1;
     }
     if (!pending(port)) {
@@ -297,6 +307,8 @@ static void finish(struct md_port *port)
 {
     enum turn turn = port->turn;
     port->turn = NOBODYS;
+    if (turn == TELLERS)
+        return;
     if (turn == WISHED) {
         struct wish *wish = port->wishes;
         port->wishes = wish->next;

@@ -71,6 +71,7 @@ static int is_failure(int result)
     case MD_BAD_CHECKSUM:
     case MD_BAD_CHARACTER:
     case MD_LATE_ANSWER_DUE:
+    case MD_MAYBE_ECHO:
     case MD_EXPIRED:
     case MD_LINE_LOST:
     case MD_POLL_ENDED:
@@ -240,30 +241,31 @@ static void recognise_late_answers(struct md_line *line, int64_t now_ns)
 
 static void time_out(struct md_line *line)
 {
+    const struct md_exchange *exchange = line->exchange;
     struct md_message reply;
     size_t begin = is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
-    if (begin > 0 && begin == line->rx_len)
-        line->echoes = 1; /* nobody else says it again and no more */
+    int is_alone = begin > 0 && begin == line->rx_len;
+    int is_doubtful = is_alone && line->echo == MD_ECHO_UNKNOWN && parse_at(line, 0, &reply) > 0;
+    if (is_alone && !is_doubtful)
+        line->echo = MD_ECHO; /* nobody else says it again and no more */
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
     /* Only a damaged frame of its own says that the drive has answered: others' and noise do not, and
      * what looks like one further on may be the inside of another. */
     if (first != MD_BAD_CHECKSUM && first != MD_BAD_CHARACTER)
         expect_late_answer(line);
-    const struct md_exchange *exchange = line->exchange;
     int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
-    finish(line, reason, line->rx, line->rx_len);
+    finish(line, is_doubtful ? MD_MAYBE_ECHO : reason, line->rx, line->rx_len);
 }
 
-/* A reply that is no copy of the request tells whether a copy goes before replies on this line. */
+/* A reply that is no copy of the request tells whether a copy goes before replies on this line; so do
+ * two copies. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
-    if (is_copy(line, reply_at))
-        return;
-    if (line->completion->skipped == 0)
-        line->echoes = 0;
+    if (line->completion->skipped == 0 && !is_copy(line, reply_at))
+        line->echo = MD_NO_ECHO;
     for (size_t at = 0; at + line->tx_len <= reply_at; at++)
         if (is_copy(line, at))
-            line->echoes = 1;
+            line->echo = MD_ECHO;
 }
 
 /* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
@@ -297,7 +299,7 @@ static void search(struct md_line *line, int64_t now_ns)
     while (at < line->rx_len) {
         int used = parse_at(line, at, &reply);
         if (used > 0 && line->echo_due && is_copy(line, at)) {
-            line->echo_due = 0; /* the adapter's, not the drive's */
+            line->echo_due = 0; /* the adapter's, or it cannot be told from that */
             first_open = SIZE_MAX;
             at += line->tx_len;
             continue;
@@ -367,7 +369,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = 0;
-    line->echo_due = line->echoes;
+    line->echo_due = line->echo != MD_NO_ECHO;
     line->silence_ns = later(line->silence_ns, exchange->silence_ns);
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     line->state = SILENT;

@@ -44,7 +44,9 @@ enum md_result {
     MD_EXPIRED = -14,          /* not sent: its time was over before its turn came */
     /* of a value that was due (only seen in columns) */
     MD_NOT_ASKED = -15,        /* the drive is silent and was given a rest */
-    MD_POLL_ENDED = -16        /* before its answer was there, or its turn came */
+    MD_POLL_ENDED = -16,       /* before its answer was there, or its turn came */
+    /* and of a whole exchange again */
+    MD_MAYBE_ECHO = -17        /* what could be the reply could be the adapter's echo */
 };
 
 /* One frame's meaning, whatever its framing. Which fields count depends on the function:
@@ -127,8 +129,8 @@ struct md_tally {
     int64_t longest_ns;   /* response delay */
     uint64_t late;        /* answers that came after their time-out */
     uint64_t delays[128]; /* replies, by their response delay: bucket n is from md_delay_edge(n) to that of n + 1 */
-    uint64_t ended[17];   /* exchanges that were not answered, by -result; 0: broadcasts */
-    uint64_t missed[17];  /* values, by -result */
+    uint64_t ended[18];   /* exchanges that were not answered, by -result; 0: broadcasts */
+    uint64_t missed[18];  /* values, by -result */
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7, 6 */
     uint32_t refused[256]; /* values, by exception code */
 };
@@ -159,6 +161,9 @@ struct md_exchange {
     int64_t period_ns;      /* between its slots in a queue; 0: it has none */
     struct md_settings settings;
     int framing;
+    /* Goes first where nobody knows whether the adapter echoes: unlike this one's, its reply is never a
+     * copy of its request. NULL: none does. */
+    const struct md_exchange *teller;
     int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
     struct md_message request;
 };
@@ -184,6 +189,8 @@ enum md_want {
     MD_READ   /* bytes, or to be asked again at wake_ns */
 };
 
+enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
+
 struct md_tap;
 
 struct md_line {
@@ -199,7 +206,7 @@ struct md_line {
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
     uint16_t rx_len, rx_from; /* no reply begins before rx_from */
-    int echoes;               /* the adapter echoes what it sends: learnt, never forgotten by failures */
+    int echo;                 /* of what the adapter sends (enum md_echo): learnt, never forgotten by failures */
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
     int looks;                /* how often the line was looked at since the request left */
     struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */

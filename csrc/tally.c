@@ -7,7 +7,7 @@
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
-_Static_assert(sizeof((struct md_tally){0}).missed == (1 - MD_POLL_ENDED) * sizeof(uint64_t), "every reason has a place");
+_Static_assert(sizeof((struct md_tally){0}).missed == (1 - MD_MAYBE_ECHO) * sizeof(uint64_t), "every reason has a place");
 
 static int bucket(int64_t ns)
 {

@@ -35,6 +35,15 @@ class LineDriver:
         return int(self._line.wake_ns)
 
     @property
+    def echo(self) -> int:
+        """What it knows of its adapter's (enum md_echo)."""
+        return int(self._line.echo)
+
+    @echo.setter
+    def echo(self, known: int) -> None:
+        self._line.echo = known
+
+    @property
     def completion(self) -> Completion:
         return completion(self.found)
 

@@ -107,7 +107,8 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
         found = bus.read_many(ours, ours.readings())
         tally = bus.respondent(ours).tally()
     assert found == {register.name: proof(ours, register) for register in ours.readings()}
-    assert tally.answered == REQUESTS[family]  # a host that looks too late asks again
+    tellers = 1 if ours.telling else 0  # on a line of which it is not known whether its adapter echoes
+    assert tally.answered == REQUESTS[family] + tellers  # a host that looks too late asks again
     assert (
         there.counters.requests == tally.exchanges
     )  # a busy host may be too late for a reply, and asks again

@@ -7,6 +7,7 @@ import re
 import pytest
 from frames import PRINTED, Printed, words
 from line_driver import LineDriver
+from multidrop._core import lib
 
 from multidrop.core import (
     Completion,
@@ -52,8 +53,9 @@ def exchange(framing: Framing, request: Message) -> Exchange:
 
 
 def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 4096) -> Completion:
-    """What becomes of a request when these bytes are all that comes back."""
+    """What becomes of a request when these bytes are all that comes back, of an adapter without echo."""
     line = LineDriver()
+    line.echo = lib.MD_NO_ECHO
     line.begin(exchange(framing, request))
     line.wait_until_write()
     line.receive(received, piece)

@@ -24,7 +24,7 @@ from multidrop import polled_line, poller, schedule
 from multidrop.batch import Row
 from multidrop.core import Framing, Message, Result
 from multidrop.drive import Drive
-from multidrop.drives import YD1000
+from multidrop.drives import YD1000, DelixiNative
 from multidrop.plant import PolledDrive
 from multidrop.sim import EncodedDrive, Faults, simulated
 from multidrop.sim.faults import RATES
@@ -212,6 +212,18 @@ def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story.rows += rows_of(story.world.poller)
     story.judge()
     assert {row.status for row in story.rows} <= {"ok", "poll ended"}
+
+
+@pytest.mark.parametrize("echo", [0, 1], ids=["no echo", "an echo"])
+@pytest.mark.parametrize("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
+def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) -> None:
+    """Nothing else is polled on the line: what is asked for may have the value that its query says."""
+    drive = DelixiNative(1, name="drive-1")
+    asked = polled(drive, [drive.register(register)])
+    with World(WorldWire([simulated(drive)], Faults(echo=echo)), [asked]) as world:
+        rows = world.run(HEALTHY)
+    assert len(rows) > 10
+    assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 
 
 @pytest.mark.parametrize("kind", KINDS)

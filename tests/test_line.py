@@ -522,6 +522,35 @@ def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
     assert (line.completion.result, line.completion.skipped) == (8, 0)
 
 
+def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.raw) == (Result.MAYBE_ECHO, confirmation())
+    ask(line, WRITE)
+    answer(line, confirmation() + confirmation())  # it was
+    assert (line.completion.result, line.completion.skipped) == (8, 8)
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_a_reply_without_an_echo_before_it_tells_that_there_is_none(line: LineDriver) -> None:
+    ask(line)
+    answer(line, reply_of(1))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.skipped) == (8, 0)
+
+
+def test_an_echo_alone_tells_of_itself(line: LineDriver) -> None:
+    """No reply to a read is a copy of its request: the drive is dead."""
+    ask(line)
+    answer(line, rtu("01 03 00 00 00 01"))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
 def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:
     """Its echo is a reply that says 0; the state query, which has no such answer, tells of the echo."""
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"

@@ -112,6 +112,7 @@ def counted(known: Respondent) -> Counter[str]:
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_the_guides_counters(line: LineDriver, drive: Respondent, ending: str) -> None:
     request, received, expected = ENDINGS[ending]
+    line.echo = lib.MD_NO_ECHO
     ask(line, drive, request)
     line.now += 20 * CHARACTER
     line.receive(received)

@@ -58,9 +58,10 @@ class Turn(Enum):
     """Whose exchange is under way."""
 
     NOBODYS = 0
-    WISHED = 1
-    QUEUED = 2
-    REPEATED = 3
+    TELLERS = 1
+    WISHED = 2
+    QUEUED = 3
+    REPEATED = 4
 
 
 class WorldPort:
@@ -83,6 +84,7 @@ class WorldPort:
         self._round: deque[Exchange] = deque()  # the next one first
         self._turn = Turn.NOBODYS
         self._under_way: Exchange | None = None
+        self._put_off: tuple[Turn, Exchange] | None = None  # until its teller has had its turn
         self._failures = 0
         self._heard = b""
         self._has_ended = False
@@ -156,23 +158,32 @@ class WorldPort:
 
     def _take_up(self) -> bool:
         now = self._world.now
-        if self.urgent:
-            self._begin(Turn.WISHED, self.urgent.popleft())
+        if self._put_off:
+            (turn, exchange), self._put_off = self._put_off, None
+            self._begin(turn, exchange)
+        elif self.urgent:
+            self._ask(Turn.WISHED, self.urgent.popleft())
         elif self._has_ended:
             return False
         elif self._queue and (self._queue[0][1] <= now or self.lost):
             exchange, due_ns = self._queue.popleft()
-            self._begin(Turn.QUEUED, exchange)
-            if exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
+            self._ask(Turn.QUEUED, exchange)
+            if self._turn is Turn.QUEUED and exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
                 again = (at_ns for other, at_ns in self._queue if other is exchange)
                 if now >= next(again, NEVER):
                     self._driver.abandon(Result.EXPIRED)
         elif self._round:
-            self._begin(Turn.REPEATED, self._round[0])
+            self._ask(Turn.REPEATED, self._round[0])
             self._round.rotate(-1)
         else:
             return False
         return True
+
+    def _ask(self, turn: Turn, exchange: Exchange) -> None:
+        if exchange.teller and self._driver.echo == lib.MD_ECHO_UNKNOWN:
+            self._put_off = turn, exchange
+            turn, exchange = Turn.TELLERS, exchange.teller
+        self._begin(turn, exchange)
 
     def _begin(self, turn: Turn, exchange: Exchange) -> None:
         self._turn, self._under_way = turn, exchange
@@ -184,7 +195,7 @@ class WorldPort:
         assert self._under_way
         turn, exchange, found = self._turn, self._under_way, self._driver.found
         self._turn, self._under_way = Turn.NOBODYS, None
-        if turn is Turn.WISHED:
+        if turn in (Turn.WISHED, Turn.TELLERS):
             return
         self._report(exchange, found)
         if turn is Turn.QUEUED:

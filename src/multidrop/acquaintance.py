@@ -55,7 +55,7 @@ class Acquaintance:
         self._known[drive] = self._exchanges.line.queue
 
     def _read_something(self, drive: Drive, attempts: int) -> None:
-        register = next((it for it in drive.registers.values() if it.readable), None)
+        register = drive.telling or next((it for it in drive.registers.values() if it.readable), None)
         if register is not None:
             with suppress(DriveRefused):  # an answer too
                 self._exchanges.values(drive, [register], attempts)

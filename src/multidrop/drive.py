@@ -280,6 +280,11 @@ class Drive:
         """What is polled when nothing else is said."""
         return tuple(it for it in cls.registers.values() if it.access is Access.READING and it.readable)
 
+    @property
+    def telling(self) -> Register[Any] | None:
+        """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
+        return None
+
     def exception(self, code: int) -> str:
         """The meaning of an exception code in this family."""
         return self.exceptions.get(code, "a code that the document does not explain")

@@ -9,7 +9,7 @@ from multidrop.core import Completion, Exchange, Message, Respondent, Result, ra
 from multidrop.drive import Drive
 from multidrop.errors import BadReply, DriveRefused, NoReply
 from multidrop.line import Line, now_ns, sleep
-from multidrop.plan import Block, blocks
+from multidrop.plan import Block, alone, blocks
 from multidrop.register import Register
 
 READ_ATTEMPTS = 3
@@ -25,6 +25,7 @@ def exchange(
     *,
     period: float = 0.0,
     insists: bool = False,
+    teller: Exchange | None = None,
 ) -> Exchange:
     """What the core needs to carry out a request to this drive."""
     settings = drive.settings
@@ -41,7 +42,24 @@ def exchange(
         period=period,
         insists=insists,
         block=block,
+        teller=teller,
     )
+
+
+def reading(
+    drive: Drive,
+    block: Block,
+    respondent: Respondent,
+    rows: core.Block = NO_ROWS,
+    *,
+    period: float = 0.0,
+) -> Exchange:
+    """What reads a block from this drive, whose reply is not taken from an adapter's echo."""
+    teller = None
+    if drive.telling and drive.telling not in block.registers:
+        teller = exchange(drive, alone(drive.telling).request(drive.address), respondent, NO_ROWS)
+    request = block.request(drive.address)
+    return exchange(drive, request, respondent, rows, period=period, teller=teller)
 
 
 class Exchanges:
@@ -91,15 +109,16 @@ class Exchanges:
         return {register.name: raw[register.name] for register in registers}
 
     def _ask(self, drive: Drive, block: Block, attempts: int) -> Message:
+        made = reading(drive, block, self.respondent(drive))
         for _ in range(attempts - 1):
             try:
-                return self._read(drive, self.carry_out(drive, block.request(drive.address)))
+                return self._read(drive, self._carry_out(made))
             except (NoReply, BadReply):
                 continue
             except DriveRefused as refusal:
                 if refusal.code not in drive.damaged:
                     raise
-        return self._read(drive, self.carry_out(drive, block.request(drive.address)))
+        return self._read(drive, self._carry_out(made))
 
     def carry_out(
         self, drive: Drive, request: Message, expiry: float = 0.0, *, insists: bool = False
@@ -109,6 +128,9 @@ class Exchanges:
         After `expiry` seconds it is not sent; 0: never too late. One that insists waits for no answer.
         """
         made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists)
+        return self._carry_out(made, expiry)
+
+    def _carry_out(self, made: Exchange, expiry: float = 0.0) -> Completion:
         expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
         while True:
             late_until_ns = made.respondent.late_until_ns

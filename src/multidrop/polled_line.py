@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from multidrop import core, plant
-from multidrop.bus import Bus, exchange
+from multidrop.bus import Bus
 from multidrop.core import EXCEPTION_STATUS, STATUSES, Exchange, Field, Inbox, Port, Respondent, Result
 from multidrop.drive import Drive
 from multidrop.errors import LineError
+from multidrop.exchanges import reading
 from multidrop.line import now_ns
 from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
 from multidrop.plant import PolledDrive
@@ -150,7 +151,7 @@ class PolledLine:
 
     def _job(self, drive: Drive, block: Block, period_ns: int | None) -> Asked:
         fields = self._codes.fields(drive, block)
-        request, respondent = block.request(drive.address), self.bus.respondent(drive)
+        respondent = self.bus.respondent(drive)
         job = Asked(
             drive=drive.address,
             kind=kind(drive),
@@ -158,7 +159,7 @@ class PolledLine:
             duration_ns=0,
             owner=drive,
             block=block,
-            exchange=exchange(drive, request, respondent, fields, period=(period_ns or 0) / 1e9),
+            exchange=reading(drive, block, respondent, fields, period=(period_ns or 0) / 1e9),
             fields=fields,
         )
         job.duration_ns = job.expected_ns(drive.response_delay)

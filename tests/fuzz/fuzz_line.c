@@ -25,7 +25,7 @@ struct scene {
     struct md_completion done;
     struct md_drive drives[DRIVES];
     struct md_exchange exchange;
-    int is_under_way, has_asked, adapter_echoes, knew_echo, is_spoiled;
+    int is_under_way, has_asked, adapter_echoes, is_spoiled;
     int number; /* of the exchange */
     int64_t now, begun, ends; /* by then it must be over */
     int64_t last_heard, silence; /* the line's last activity, and the silence demanded after it */
@@ -102,12 +102,12 @@ static void check_completion(void)
         must(scene.has_asked && done->raw_len == used);
         must(md_parse_reply(exchange->framing, done->raw, done->raw_len, &exchange->request, &again) == done->result);
         must(is_same(&again, &done->reply));
-        if (!scene.is_spoiled && (scene.knew_echo || !scene.adapter_echoes))
+        if (!scene.is_spoiled)
             check_origin(done->raw, done->raw_len);
     } else if (done->result == 0)
         must(exchange->request.address == 0 && scene.after == 0);
     else
-        must(done->result >= MD_EXPIRED && done->reply.address == 0);
+        must((done->result >= MD_EXPIRED || done->result == MD_MAYBE_ECHO) && done->reply.address == 0);
     if (done->result == MD_NO_REPLY) /* nothing, or the request's own echo; others' answers do not count */
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
@@ -117,7 +117,7 @@ static void check_tallies(void)
     for (int i = 0; i < DRIVES; i++) {
         const struct md_tally *tally = &scene.drives[i].tally;
         uint64_t values = tally->values, ended = tally->answered, delays = 0;
-        for (size_t reason = 0; reason < 16; reason++) {
+        for (size_t reason = 0; reason < sizeof tally->missed / sizeof *tally->missed; reason++) {
             values += tally->missed[reason];
             ended += tally->ended[reason];
         }
@@ -234,7 +234,6 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     scene.has_asked = 0;
     scene.before = scene.after = 0;
     scene.left_over = scene.line.rx_len;
-    scene.knew_echo = scene.line.echoes;
     scene.is_under_way = 1;
     if (scene.silence < silence)
         scene.silence = silence;

@@ -59,10 +59,11 @@ class Exchange:
     Times are in seconds: `character` of one character, `silence` before the request and after
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
     `insists`: not to wait for an earlier answer, which may then pass for its own. `block` is what rows are
-    made of.
+    made of. `teller` goes first where nobody knows yet whether the adapter echoes: unlike this one's, its
+    reply is never a copy of its request.
     """
 
-    __slots__ = ("block", "c", "framing", "request", "respondent", "settings")
+    __slots__ = ("block", "c", "framing", "request", "respondent", "settings", "teller")
 
     def __init__(
         self,
@@ -78,14 +79,16 @@ class Exchange:
         period: float = 0.0,
         insists: bool = False,
         block: Block | None = None,
+        teller: Exchange | None = None,
     ) -> None:
         build_request(framing, request)  # raises for what no frame can say
         self.framing = framing
         self.request = request
         self.respondent = respondent
         self.block = block
+        self.teller = teller
         self.settings = (baudrate, format)
-        self.c = ffi.new(
+        self.c: Any = ffi.new(
             "struct md_exchange *",
             {
                 "framing": framing,
@@ -98,6 +101,7 @@ class Exchange:
                 "insists": insists,
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
+                "teller": teller.c if teller else ffi.NULL,
             },
         )
 

@@ -27,6 +27,7 @@ class Result(IntEnum):
     EXPIRED = lib.MD_EXPIRED
     NOT_ASKED = lib.MD_NOT_ASKED
     POLL_ENDED = lib.MD_POLL_ENDED
+    MAYBE_ECHO = lib.MD_MAYBE_ECHO
 
     def __str__(self) -> str:
         return _REASONS[self]
@@ -50,6 +51,7 @@ _REASONS = {
     Result.EXPIRED: "not sent: expired",
     Result.NOT_ASKED: "not asked: drive is silent",
     Result.POLL_ENDED: "poll ended",
+    Result.MAYBE_ECHO: "maybe the adapter's echo",
 }
 
 UNASKED = "not "  # so begin the reasons of misses that no request left for

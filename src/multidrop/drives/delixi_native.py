@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
 from multidrop.drive import (
     Condition,
@@ -18,7 +19,7 @@ from multidrop.drive import (
     write,
 )
 from multidrop.drives.delixi_parameters import DelixiParameters, parameter
-from multidrop.register import Carrier, Kept, Table, command, reading, setting
+from multidrop.register import Carrier, Kept, Register, Table, command, reading, setting
 
 COMMAND = Table("run command", None, 0x02, Carrier.NUMBER)
 STATE = Table("run state", 0x03, None, Carrier.NUMBER)
@@ -104,6 +105,11 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         place="P00.02",
         note="Used if P00.01 = 1.",
     )
+
+    @property
+    def telling(self) -> Register[Any]:
+        """A parameter's request has the value 0 in it; no state is 0 (part 3, section 5: K = 03 and 07)."""
+        return self.status
 
     @verb
     def identify(self) -> Script[None]:

@@ -116,7 +116,7 @@ class _Scan:
     def ask(self, sweep: Sweep, request: Message, respondent: Respondent) -> Completion:
         """One exchange; what only echoes the request is no reply."""
         completion = self._once(sweep, sweep.framing, request, respondent)
-        if completion.result > 0 and completion.raw == build_request(sweep.framing, request):
+        if completion.raw == build_request(sweep.framing, request):
             # Where a reply may be a copy of its request, the core learns of an echo from another framing.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._listener(sweep))
