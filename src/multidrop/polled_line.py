@@ -78,7 +78,8 @@ class PolledLine:
         self.bus = bus
         self.schedule: Schedule[Asked] = Schedule()
         self.started_ns = now_ns()
-        self.ended_ns: int | None = None
+        self._ended_ns: int | None = None  # nothing is due any more
+        self._over_ns: int | None = None  # nor under way
         self.set_aside: list[Asked] = []  # a single register that the drive refuses again and again
         self._number = number
         self._inbox = inbox
@@ -305,7 +306,7 @@ class PolledLine:
         """Nothing more is begun, and no port opened again; whether an exchange is still under way."""
         if self._reopening:
             self._reopening.join()
-        self.ended_ns = self.ended_ns or now_ns()
+        self._ended_ns = self._ended_ns or now_ns()
         port = self.bus.line.queue
         if port is None:
             return False
@@ -317,7 +318,7 @@ class PolledLine:
             self._close()
 
     def _close(self) -> None:
-        ended_ns = self.ended_ns or now_ns()
+        ended_ns = self._ended_ns or now_ns()
         port = self.bus.line.queue
         if port:
             port.stop()
@@ -326,6 +327,7 @@ class PolledLine:
             self._miss([(job, due_ns) for job, due_ns in slots if 0 < due_ns <= ended_ns], Result.POLL_ENDED)
         else:
             self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
+        self._over_ns = now_ns()
         self.schedule = Schedule()
         self.bus.close()
 
@@ -334,7 +336,7 @@ class PolledLine:
             return self._summary()
 
     def _summary(self) -> dict[str, Any]:
-        seconds = max(((self.ended_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
+        seconds = max(((self._over_ns or now_ns()) - self.started_ns) / 1e9, 1e-9)
         respondents = self.bus.respondents
         drives = {drive.name: self._told(it, seconds) for drive, it in respondents.items()}
         tallies = [it.tally() for it in respondents.values()]
