@@ -273,6 +273,16 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         ValueError,
         "this acceleration_time is no register of pump, which is a Rig",
     ),
+    "a name is read": (
+        lambda bus, rig: bus.read(rig, "target"),
+        TypeError,
+        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "a name is written": (
+        lambda bus, rig: bus.write(rig, "target", 5.0),
+        TypeError,
+        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+    ),
     "a broadcast that the document does not have": (
         lambda bus, rig: bus.broadcast(rig.target, 0),
         Refused,

@@ -39,7 +39,13 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> int:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """ValueError for another family's register: the same address means something else there."""
+    """ValueError for another family's register: the same address means something else there.
+
+    TypeError for what is none, such as a name.
+    """
+    if not isinstance(register, Register):
+        hint = "use its attribute, or drive.register(NAME)"
+        raise TypeError(f"{register!r} is no register of {drive.name}: {hint}")
     if drive.registers.get(register.name) is not register:
         family = drive.title or type(drive).__name__
         raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
