@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
+import checksums
 import pytest
 from frames import PRINTED, Printed, words
 from line_driver import LineDriver
@@ -137,6 +139,15 @@ def test_length_of_a_good_reply_is_known_beforehand(printed: Printed) -> None:
     assert isinstance(printed.says, Message)
     if not printed.says.exception:
         assert reply_length(printed.framing, printed.request) == len(printed.frame)
+
+
+@pytest.mark.parametrize(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])
+def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], bytes]) -> None:
+    data = bytes(range(250))
+    frame = finish(f"0103FA{data.hex().upper()}")
+    used, reply = parse_reply(framing, frame, Message(1, 0x03, 0, 125))
+    assert (used, reply and reply.data) == (len(frame), data)
+    assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (Result.INCOMPLETE, None)
 
 
 # ---- never wrong data: what others were seen to take for an answer ----
