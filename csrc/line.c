@@ -258,10 +258,11 @@ static void time_out(struct md_line *line)
 }
 
 /* A reply that is no copy of the request tells whether a copy goes before replies on this line; so do
- * two copies. */
+ * two copies. A few stray bytes are no echo, but what is left of one where there is known to be one. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
-    if (line->completion->skipped == 0 && !is_copy(line, reply_at))
+    uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
+    if (line->completion->skipped <= most_stray && !is_copy(line, reply_at))
         line->echo = MD_NO_ECHO;
     for (size_t at = 0; at + line->tx_len <= reply_at; at++)
         if (is_copy(line, at))

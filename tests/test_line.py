@@ -542,6 +542,17 @@ def test_a_reply_without_an_echo_before_it_tells_that_there_is_none(line: LineDr
     assert (line.completion.result, line.completion.skipped) == (8, 0)
 
 
+@pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
+def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
+    """A drive's driver that brings a zero before every reply costs no confirmation."""
+    ask(line)
+    answer(line, bytes(stray) + reply_of(1))
+    assert line.completion.reply.data == words(1)
+    ask(line, WRITE)
+    answer(line, bytes(stray) + confirmation())
+    assert (line.completion.result == 8) is told
+
+
 def test_an_echo_alone_tells_of_itself(line: LineDriver) -> None:
     """No reply to a read is a copy of its request: the drive is dead."""
     ask(line)
