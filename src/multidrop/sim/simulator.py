@@ -54,7 +54,8 @@ class Simulator:
     def open(self) -> None:
         """Open every wire's port, or none; the paths are known then."""
         self._selector = selectors.DefaultSelector()
-        self._ears, self._bell = os.pipe()
+        self._ears, self.bell = os.pipe()
+        os.set_blocking(self.bell, False)
         self._selector.register(self._ears, selectors.EVENT_READ, None)
         try:
             for number, wire in enumerate(self.wires):
@@ -69,11 +70,11 @@ class Simulator:
             wire.close()
         self._selector.close()
         os.close(self._ears)
-        os.close(self._bell)
+        os.close(self.bell)
 
     def interrupt(self) -> None:
-        """Make `run` return; from any thread or signal handler."""
-        os.write(self._bell, b"!")
+        """Make `run` return; from any thread."""
+        os.write(self.bell, b"!")
 
     def run(self) -> None:
         """Run the wires until interrupted. Blocks."""
@@ -141,12 +142,15 @@ def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda 
     """
     simulator = Simulator(wires)
     simulator.open()
-    before = signal.signal(signal.SIGTERM, lambda *_: simulator.interrupt())
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    # A signal that comes just before it sleeps has no handler called until it wakes: it rings the bell.
+    bell = signal.set_wakeup_fd(simulator.bell)
     try:
         announce(simulator)
         simulator.run()
     except KeyboardInterrupt:
         pass
     finally:
+        signal.set_wakeup_fd(bell)
         signal.signal(signal.SIGTERM, before)
         simulator.close()
