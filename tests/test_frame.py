@@ -291,6 +291,13 @@ def test_request_out_of_bounds(message: Message) -> None:
         exchange(RTU, message)
 
 
+def test_the_last_address_and_the_one_behind_it() -> None:
+    reply = Message(247, 0x03, data=words(7))
+    assert build_reply(RTU, reply) == checksums.rtu("F7 03 02 00 07")
+    with pytest.raises(ValueError, match="no rtu frame can say"):
+        build_reply(RTU, Message(248, 0x03, data=words(7)))
+
+
 def test_request_with_too_much_data() -> None:
     with pytest.raises(ValueError, match="251 data bytes do not fit a frame: 250 at most"):
         build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))

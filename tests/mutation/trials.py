@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 10  # s of the processor, however busy it is; the slowest trial takes five
+PATIENCE = 20  # s of the processor, however busy it is; the slowest trial takes eight
 CC = os.environ.get("CC", "cc")
 FLAGS = ["-std=c11", "-D_DEFAULT_SOURCE", "-w", "-Icsrc"]
 SANITIZED = [
@@ -56,9 +56,9 @@ def by_compiler(tree: Path) -> str | None:
 
 
 def by_test_frame(tree: Path) -> str | None:
-    """The Python tests of frames; by_compiler has compiled the mutant for the module."""
+    """The Python tests of frames, and of a line that takes them; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
-    return _pytest(tree, "tests/test_frame.py", "tests/test_split.py")
+    return _pytest(tree, *(f"tests/test_{name}.py" for name in ("frame", "split", "learning", "line")))
 
 
 def by_test_schedule(tree: Path) -> str | None:
