@@ -56,7 +56,7 @@ def by_compiler(tree: Path) -> str | None:
 
 
 def by_test_frame(tree: Path) -> str | None:
-    """The Python tests of frames, and of a line that takes them; by_compiler has compiled the mutant for the module."""
+    """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
     return _pytest(tree, *(f"tests/test_{name}.py" for name in ("frame", "split", "learning", "line")))
 
