@@ -6,7 +6,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +15,7 @@ from multidrop.bus import Bus
 from multidrop.cli.monitor import is_possible, watch
 from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.drives import MODELS
+from multidrop.errors import Unconfirmed
 from multidrop.plant import Line, load_plant
 
 DRIVES = (  # name, model, framing
@@ -71,8 +72,9 @@ def _start_motors(line: Line) -> None:
     with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
-            drive.set_frequency(20.0 + 3 * number)
-            drive.start()
+            with suppress(Unconfirmed):  # the machine is busy: whether it turns is seen
+                drive.set_frequency(20.0 + 3 * number)
+                drive.start()
 
 
 @contextmanager
