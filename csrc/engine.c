@@ -33,8 +33,10 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
         return md_waiter_wait(engine->waiter, ready, READY, -1);
     int64_t left = until_ns - md_now_ns();
     int n = md_waiter_wait(engine->waiter, ready, READY, left > 0 ? left : 0);
+    if (n > 0)
+        return n;
     int64_t late = md_now_ns() - until_ns;
-    if (n == 0 && left > 0 && late >= 0) { /* else it could not sleep for so short a time */
+    if (left > 0 && late >= 0) { /* else it could not sleep for so short a time */
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
         if (engine->lateness_ns > MD_MOST_LATENESS)
             engine->lateness_ns = MD_MOST_LATENESS;
@@ -120,10 +122,11 @@ static void *run(void *argument)
         int n = wait_until(engine, ready, until_ns);
         pthread_mutex_lock(&engine->mutex);
         int told = 0;
+        int64_t now_ns = 0;
         for (int i = 0; i < n; i++) {
             struct md_port *port = ready[i];
             if (port)
-                md_port_advance(port, md_port_hear(port));
+                now_ns = md_port_advance(port, md_port_hear(port));
             else
                 told = 1;
         }
@@ -132,10 +135,11 @@ static void *run(void *argument)
             open_ports(engine);
             close_ports(engine);
         }
-        int64_t now_ns = md_now_ns();
+        if (!now_ns)
+            now_ns = md_now_ns();
         for (unsigned i = 0; i < engine->count; i++)
             if (engine->wakes[i] <= now_ns || (told && engine->ports[i]->turn == NOBODYS))
-                md_port_advance(engine->ports[i], now_ns);
+                md_port_advance(engine->ports[i], md_now_ns());
     }
     pthread_mutex_unlock(&engine->mutex);
     return NULL;

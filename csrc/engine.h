@@ -89,8 +89,8 @@ static inline void md_put(uint32_t *counter, uint32_t value)
 /* ---- engine_port.c: on the engine's thread ---- */
 
 int64_t md_port_hear(struct md_port *port); /* what has come; when it was read */
-/* Carry on until there is nothing to do but to wait. */
-void md_port_advance(struct md_port *port, int64_t now_ns);
+/* Carry on until there is nothing to do but to wait; what time it was then. */
+int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 void md_port_finish(struct md_port *port); /* the exchange under way is over */
 
 #endif

@@ -84,13 +84,15 @@ static int same_settings(const struct md_settings *a, const struct md_settings *
            a->stopbits == b->stopbits;
 }
 
-static void apply_settings(struct md_port *port, const struct md_settings *settings)
+/* What time it is then. */
+static int64_t apply_settings(struct md_port *port, const struct md_settings *settings, int64_t now_ns)
 {
     if (port->must_take < 0 || same_settings(&port->settings, settings))
-        return;
+        return now_ns;
     int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
-    port->progress.switching_ns += md_now_ns() - begun_ns;
+    now_ns = md_now_ns();
+    port->progress.switching_ns += now_ns - begun_ns;
     md_put(&port->progress.switches, port->progress.switches + 1);
     if (refused < 0)
         lose(port, -refused);
@@ -98,6 +100,7 @@ static void apply_settings(struct md_port *port, const struct md_settings *setti
         md_line_abandon(&port->line, MD_SETTINGS_REFUSED, refused);
     else
         port->settings = *settings;
+    return now_ns;
 }
 
 /* Whether it was begun, and not its teller. */
@@ -258,7 +261,7 @@ static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
     return 1;
 }
 
-void md_port_advance(struct md_port *port, int64_t now_ns)
+int64_t md_port_advance(struct md_port *port, int64_t now_ns)
 {
     struct md_line *line = &port->line;
     int64_t wake_ns;
@@ -275,8 +278,7 @@ void md_port_advance(struct md_port *port, int64_t now_ns)
         }
         wake_ns = line->wake_ns;
         if (want == MD_WRITE) {
-            apply_settings(port, &line->exchange->settings);
-            now_ns = md_now_ns();
+            now_ns = apply_settings(port, &line->exchange->settings, now_ns);
             if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, now_ns))
                 continue;
             wake_ns = now_ns + RETRY_WRITE_NS;
@@ -301,4 +303,5 @@ void md_port_advance(struct md_port *port, int64_t now_ns)
     int is_early = wake_ns != MD_NEVER && (port->blind || port->turn == NOBODYS) &&
                    (is_asked(port) || port->engine->count <= MOST_SPINNING);
     port->engine->wakes[port->index] = wake_ns - (is_early ? port->engine->lateness_ns : 0);
+    return now_ns;
 }
