@@ -30,7 +30,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
             resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
     return subprocess.run(
-        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=60, preexec_fn=limit
+        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=180, preexec_fn=limit
     )
 
 
