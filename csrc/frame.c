@@ -448,10 +448,10 @@ int md_is_mistakable(int framing, const struct md_message *one, const struct md_
         return 0;
     if (framing == MD_DELIXI && (one->function == STATE_QUERY || one->function == PARAMETER_QUERY))
         return one->start == other->start;
-    /* Replies to reads say nothing of what was asked for but its length. */
-    if (framing != MD_DELIXI && find_function(one->function)->reply == DATA)
-        return md_reply_length(framing, one) == md_reply_length(framing, other);
-    return 1; /* a write's confirmation says what was written, but a refusal does not say of what it is */
+    /* Replies to reads say nothing of what was asked for but its length; a write's confirmation says
+     * what was written, but a refusal does not say of what it is. */
+    return reply_shape(framing, one->function) != DATA ||
+           md_reply_length(framing, one) == md_reply_length(framing, other);
 }
 
 void md_copy_message(struct md_message *to, const struct md_message *from)

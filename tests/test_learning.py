@@ -25,9 +25,9 @@ def drive() -> Respondent:
     return Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
 
 
-def exchange(request: Message, drive: Respondent) -> Exchange:
+def exchange(request: Message, drive: Respondent, framing: Framing = Framing.RTU) -> Exchange:
     return Exchange(
-        Framing.RTU,
+        framing,
         request,
         drive,
         baudrate=9600,
@@ -290,6 +290,33 @@ def test_a_refusal_does_not_say_of_which_write_it_is(line: LineDriver, drive: Re
     line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
     assert line.completion.result == Result.LATE_ANSWER_DUE
     ask(line, drive, READ)  # no refusal of a write is one of a read
+
+
+def delixi(function: int, start: int, value: int = 0) -> Message:
+    return Message(1, function, start, data=words(0, value))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_due"),
+    [
+        (delixi(7, 500), delixi(7, 501), False),  # a reply names its parameter
+        (delixi(7, 500), delixi(7, 500), True),
+        (delixi(3, 0), delixi(3, 0), True),
+        (delixi(3, 0), delixi(7, 0), False),
+        (delixi(6, 2, 5000), delixi(6, 3, 1), True),  # a refusal does not
+        (delixi(2, 2), delixi(2, 1), True),
+    ],
+    ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
+)
+def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
+    line: LineDriver, drive: Respondent, first: Message, second: Message, is_due: bool
+) -> None:
+    line.begin(exchange(first, drive, Framing.DELIXI))
+    line.wait_until_write()
+    line.wait_until_done()
+    assert line.completion.result == Result.NO_REPLY
+    line.begin(exchange(second, drive, Framing.DELIXI))
+    assert (line.completion.result == Result.LATE_ANSWER_DUE) is is_due
 
 
 def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Respondent) -> None:
