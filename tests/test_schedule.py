@@ -525,3 +525,40 @@ class Operation(RuleBasedStateMachine):
 
 TestOperation = Operation.TestCase
 TestOperation.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
+
+
+# ---- jobs that leave ----
+
+
+def test_what_is_due_next_is_known_when_a_job_has_left() -> None:
+    made: Schedule[Job] = Schedule()
+    jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
+    for at, it in jobs.items():
+        made.add(it, at * MS)
+    made.remove(jobs[1])
+    assert take(made, 0, 14) == [(jobs[13], 13)]
+
+
+def test_one_of_several_is_due_before_the_horizon() -> None:
+    made: Schedule[Job] = Schedule()
+    soon, later = job(1, 1000), job(2, 1000)
+    made.add(soon, 10 * MS)
+    made.add(later, 500 * MS)
+    assert take(made, 0, 100) == [(soon, 10)]
+
+
+def test_the_turn_goes_on_where_a_job_has_left() -> None:
+    first, second, third = job(1), job(2), job(3)
+    made = schedule(first, second, third)
+    assert take(made, 0, 1, 1) == [(first, 0)]
+    made.remove(second)  # whose turn it would be
+    assert [it for it, _ in take(made, 5, 1, 1)] == [third]
+
+
+def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
+    made = schedule(silent := job(1), job(2))
+    fail(made, 1, 9, 0)
+    made.remove(silent)
+    made.forget(1)
+    made.add(again := job(1), 0)
+    assert again in [it for it, _ in take(made, 1, 20)]
