@@ -5,8 +5,8 @@
  * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
  * echoes what it sends shows in the replies that are no copies of their requests, and where a copy
- * is all that comes before a time-out; until it does, no copy is taken for the reply. From a drive's replies its response delay is learnt: how long
- * to wait for it, and when it is worth looking. */
+ * is all that comes before a time-out; until it does, no copy is taken for the reply. From a drive's
+ * replies its response delay is learnt: how long to wait for it, and when it is worth looking. */
 #include "multidrop.h"
 
 #include <errno.h>

@@ -281,7 +281,8 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
 
 /* Rows are kept in so many chunks; those that come when all are full are dropped, and counted. */
 struct md_inbox *md_inbox_new(size_t chunk_rows, size_t most_chunks); /* NULL: see errno */
-void md_inbox_free(struct md_inbox *inbox); /* when no port reports to it; what was taken can still be given back */
+/* When no port reports to it; what was taken can still be given back. */
+void md_inbox_free(struct md_inbox *inbox);
 /* Make rows of what became of an exchange, where it has a block. */
 void md_inbox_add(struct md_inbox *inbox, const struct md_block *block, const struct md_completion *completion);
 /* The oldest rows, the caller's until they are given back; NULL when there are none. */
