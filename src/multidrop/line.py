@@ -221,7 +221,8 @@ class Line:
             with self._lock:
                 self._waiting -= 1
                 self._left.notify_all()
-        failure = self._failure(found.result, found.error)
+        waits_in_vain = found.result == Result.LATE_ANSWER_DUE and core.lost
+        failure = self._failure(Result.LINE_LOST if waits_in_vain else found.result, found.error)
         if failure:
             raise failure
         return found
