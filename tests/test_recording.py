@@ -29,6 +29,7 @@ from multidrop.recording import (
     open_writer,
     repair,
 )
+from multidrop.recording.parquet import GROUP_ROWS
 from multidrop.recording.recorded import from_rows
 
 every_format = pytest.mark.parametrize("suffix", FORMATS)
@@ -151,6 +152,16 @@ def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
     assert [Row(*row) for row in parquet] == RECORDED
     text = duckdb.sql(f"select * exclude (time) from '{record(tmp_path / 'a.csv')}'").fetchall()
     assert text == [row[1:] for row in RECORDED]
+
+
+def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path) -> None:
+    batch, times = counting(1024), GROUP_ROWS // 1024 + 1
+    with open_writer(tmp_path / "a.parquet", METADATA) as writer:
+        for _ in range(times):
+            writer.write(batch)
+    about = pa.parquet.read_metadata(tmp_path / "a.parquet")
+    assert [about.row_group(at).num_rows for at in range(about.num_row_groups)] == [GROUP_ROWS, 1024]
+    assert [row for rows in open_reader(tmp_path / "a.parquet") for row in rows] == [*batch] * times
 
 
 def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:

@@ -129,7 +129,9 @@ def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
         raise ValueError("there is a message that is not a batch of rows")
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
-    places = batch.pairs(2)
+    rows, places = batch.number(0, "<q"), batch.pairs(2)
+    if not 0 <= rows <= len(body):  # what it is reckoned with must not wrap around
+        raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
     if len(places) != sum(BUFFERS[kind] for _, kind, _ in COLUMNS):
         raise ValueError(f"there is a batch of {len(places)} buffers")
     buffers = iter([body[at : at + length] for at, length in places])
@@ -139,4 +141,4 @@ def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
         if kind == UTF8:
             str(data[-1], "utf-8")  # raises: libraries that take the batch rely on it
         columns.append((valid or None, *data))
-    return Recorded(assemble(batch.number(0, "<q"), *columns))
+    return Recorded(assemble(rows, *columns))
