@@ -9,6 +9,7 @@ import os
 import random
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.faults import Faults
@@ -142,14 +143,25 @@ class HostileWire(Wire):
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number
+        self._name = os.path.realpath(self.path)  # not that of its link
         self.close()
         self._back_at = now + self._up_to(self.faults.away)
 
     def _come_back(self) -> None:
         self._back_at = None
-        taken = os.openpty() if self._strikes("rename") else ()  # else the old name may be free again
+        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # else it may be free again
         try:
             self.open()
         finally:
             for fd in taken:
                 os.close(fd)
+
+
+def _ptys_up_to(name: str) -> list[int]:
+    """Ptys that stand in the way, until none made now has this name: the lowest free number is given."""
+    taken: list[int] = []
+    while name.startswith("/dev/pts/"):
+        taken += os.openpty()
+        if int(Path(os.ttyname(taken[-1])).name) >= int(Path(name).name):
+            break
+    return taken
