@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from multidrop.cli import COMMANDS, main
+from multidrop.cli.interruption import Interruption
 from multidrop.drives import MODELS
 
 TOY = f"{Path(__file__).parent}/toy.py:Toy"
@@ -251,6 +254,30 @@ def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
     too_wide = [line for line in out.splitlines() if len(line) > 80]
     assert not too_wide
     assert all(register in out for register in MODELS[name].registers)
+
+
+# ---- signals ----
+
+
+def test_a_thread_that_is_not_the_main_one_can_run_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Signals are the main thread's business."""
+    found: list[int] = []
+    before = signal.getsignal(signal.SIGTERM)
+    thread = threading.Thread(target=lambda: found.append(main(["models", TOY])))
+    thread.start()
+    thread.join()
+    assert found == [0]
+    assert "TOY T1" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
+    with Interruption() as interruption:
+        assert not interruption.came
+        signal.raise_signal(signal.SIGINT)
+        assert interruption.came
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
 
 
 # ---- output that cannot be written ----

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from lines import Faulty
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
@@ -101,6 +102,37 @@ def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str
     status, out, err = run("read", port, TOY, 2, "status", "fault")
     assert (status, out) == (1, "status  none\nfault         refused: illegal address\n")
     assert err == ""
+
+
+MUTE = """\
+from enum import IntEnum
+from multidrop.drive import Drive, verb, write
+from multidrop.register import command, reading
+
+class Word(IntEnum):
+    STOP = 0
+
+class Mute(Drive):
+    model = "mute"
+    speed = reading(1, "rpm")
+    control = command(0x14, Word)
+
+    @verb
+    def stop(self):
+        yield from write(Mute.control, Word.STOP)
+"""
+
+
+def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
+    run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
+) -> None:
+    (tmp_path / "mute.py").write_text(MUTE)
+    words = ("stop", port, f"{tmp_path}/mute.py:Mute", 1)
+    status, out, err = run(*words)
+    assert (status, err) == (0, "")
+    assert out.startswith("mute@1: stop done; state: the family cannot say")
+    assert json.loads(run(*words, "--json")[1])["state"] is None
+    assert [(it.address, it.raw) for it in toy.counters.writes] == [(0x14, 0), (0x14, 0)]
 
 
 def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: SimulatedDrive) -> None:
@@ -229,6 +261,16 @@ def test_silence_is_a_sentence_that_says_what_to_check(
 ) -> None:
     sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
     assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
+
+
+def test_a_damaged_reply_is_a_sentence(run: Run, toy: SimulatedDrive) -> None:
+    wire = Faulty([toy], lambda reply: reply[:-1] + b"\0", unpaced=True)
+    with Simulator([wire]):
+        assert run("state", wire.path, TOY, 1) == (
+            1,
+            "",
+            "multidrop: toy@1: bad checksum (received 01 03 02 00 00 B8 00)\n",
+        )
 
 
 def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -193,6 +194,12 @@ def test_poll_shows_them_to_a_person(plant: Path) -> None:
     assert [line.split()[0] for line in told] == ["bus", "utilisation", "pump-1,", "pump-9,"]
     assert told[3].split()[-1] == "0.0"
     assert max(map(len, lines)) <= 80
+
+
+def test_what_switching_took_is_told_where_drives_differ(plant: Path) -> None:
+    plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
+    told = multidrop("poll", plant, "--seconds", 1).stdout
+    assert re.search(r"\n  and with the \d+\.\d\d ms that the port needed to change its settings\n", told)
 
 
 def test_where_drives_wait_to_be_due_no_cycle_is_measured(plant: Path) -> None:

@@ -15,8 +15,12 @@ from typing import IO
 import pytest
 from terminals import MULTIDROP, on_terminal
 from test_cli import TOY, Run, run
+from toy import Toy
 
 from multidrop.batch import Row
+from multidrop.bus import Bus
+from multidrop.capture import Capture, Decoding
+from multidrop.errors import NoReply
 from multidrop.recording import open_reader
 
 __all__ = ["run"]  # a fixture
@@ -87,6 +91,16 @@ def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -
         f"multidrop: {link} is there already: remove it, or choose another directory with --ports\n",
     )
     assert link.read_text() == "mine"
+
+
+def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
+    faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
+    faults.write_text("drop = 1\n")
+    words = ["simulate", plant_file(tmp_path), "--ports", ports, "--unpaced", "--faults", faults]
+    with running(*words) as (_, out):
+        out.readline()
+        with Bus(str(ports / "hall-1")) as bus, pytest.raises(NoReply):
+            bus.read(bus.attach(Toy, 1), Toy.output_current)
 
 
 def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> None:
@@ -217,7 +231,9 @@ def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
 
 def test_a_port_that_is_not_there_is_a_sentence(run: Run, tmp_path: Path) -> None:
     sentence = f"multidrop: {tmp_path}/ports/hall-1: there is no such port\n"
-    assert run("poll", plant_file(tmp_path), "--seconds", 1) == (1, "", sentence)
+    out = tmp_path / "out.csv"
+    assert run("poll", plant_file(tmp_path), "--seconds", 1, "--out", out) == (1, "", sentence)
+    assert not out.exists()
 
 
 def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
@@ -257,7 +273,25 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
 
 
+def test_a_demo_can_be_captured(tmp_path: Path) -> None:
+    capture = tmp_path / "demo.pcapng"
+    done = multidrop("demo", "--seconds", 1, "--out", tmp_path / "demo.arrows", "--capture", capture)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == f"captured in {capture}"
+    with Capture(capture) as found:
+        assert sum(map(len, Decoding(found))) > 0
+
+
 # ---- on a terminal ----
+
+
+def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
+    out = tmp_path / "demo.arrows"
+    with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
+        terminal.wait_for(">erman")
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=20) == 0
+    assert "delixi-native" in {row.drive for row in recorded(out)}
 
 
 def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
@@ -274,5 +308,6 @@ def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
         terminal.wait_for("... and 3 drives more")
         terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=20) == 0
         table = terminal.text.partition("hall-1: ")[0]
         assert max(map(len, table.splitlines())) < 40

@@ -167,11 +167,11 @@ def test_a_plant_file_needs_a_drive() -> None:
 def test_what_was_found_is_kept_when_it_is_interrupted(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
-    def interrupted(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
-        yield next(it for it in findings if isinstance(it, Found))
+    def interrupted(*_: object) -> Iterator[Finding]:
+        yield Found(1, USUAL, Framing.RTU, ("invt-che",), 0.005)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(multidrop.cli.scan, "_shown", interrupted)
+    monkeypatch.setattr(multidrop.cli.scan, "scan", interrupted)
     plant = tmp_path / "found.toml"
     status, out, err = run("scan", port, *BRISKLY, "--out", plant, *words)
     assert (status, err) == (130, "multidrop: interrupted\n")

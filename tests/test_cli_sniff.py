@@ -10,21 +10,23 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from frames import PRINTED
-from lines import PATIENCE
+from lines import PATIENCE, until
 from taps import tapped
 from test_cli import Run, run
 from test_cli_poll import MULTIDROP, multidrop, recorded
 from test_line_ports import SerialServer, pyserials_own
 
 from multidrop.capture import CaptureWriter, Side
+from multidrop.capture.exchanges import Pairing
 from multidrop.cli.listening import Listener
+from multidrop.core import Framing, Heard, Message, Splitter, build_reply, build_request
 from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -141,6 +143,18 @@ def test_a_poll_s_values_are_heard_captured_and_decoded(
 def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
     with Listener(line[1], Settings(9600, "8N1")) as listener, pytest.raises(OSError, match="Bad file"):
         os.write(listener.fileno(), b"\x01")
+
+
+def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> None:
+    master, slave = pty.openpty()
+    with sniffing(os.ttyname(slave)) as sniffer:
+        os.write(master, READ.request_frame)
+        until(lambda: sniffer.told)
+        (told,) = sniffer.told
+        assert (told["result"], told["frames"]) == ("no reply", [READ.request_frame.hex(" ").upper()])
+    assert sniffer.summary["unanswered"] == 1
+    os.close(master)
+    os.close(slave)
 
 
 # ---- behind a network ----
@@ -271,6 +285,75 @@ def test_without_a_plant_raw_registers_are_told(run: Run, capture: Path) -> None
         "values": {"holding_register_500": 5000},
     }
     assert objects[-1]["summary"]["exchanges"] == 2
+
+
+def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[bytes, Side]:
+    build = build_request if asked else build_reply
+    return build(framing, Message(*message)), Side.ASKING if asked else Side.ANSWERING
+
+
+def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
+    """What `decode` says of a capture of these, one in every ms, without its times of day."""
+    with CaptureWriter(path) as it:
+        for number, (raw, side) in enumerate(frames):
+            it.write(raw, side, number * 1_000_000, "hall-1")
+    status, out, err = run("decode", path, *words)
+    assert (status, err) == (0, "")
+    return [line.partition("  ")[2] or line for line in out.splitlines()]
+
+
+def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
+    delixi = (4, 0x02, 1, 0, bytes(4))
+    frames = [
+        frame(False, 1, 0x03, 0, 0, b"\x13\x88"),
+        *(frame(True, 1, 0x03, 500, 1), frame(False, 1, 0x03, 0, 0, b"", 0x02)),
+        frame(True, 0, 0x06, 8193, 0, b"\x13\x88"),
+        *(frame(True, 1, 0x08, 0, 0, b"\xa5\x37"), frame(False, 1, 0x08, 0, 0, b"\xa5\x37")),
+        *(frame(True, *delixi, framing=Framing.DELIXI), frame(False, *delixi, framing=Framing.DELIXI)),
+        frame(True, 1, 0x06, 2, 0, b"\0\x01"),
+    ]
+    assert told(run, tmp_path / "a.pcapng", frames) == [
+        "address 1  function 03: reply without its request: 01 03 02 13 88 B5 12",
+        "address 1  reads holding_register_500: refused, code 02H  (1.0 ms)",
+        "all drives  writes holding_register_8193 = 5000 (broadcast)",
+        "address 1  reads loopback_0 = 42295  (1.0 ms)",
+        "address 4  writes k2_0001 = 1  (1.0 ms)",
+        "address 1  writes holding_register_2 = 1: no reply",
+        "3 exchanges, 1 broadcast, 1 request without a reply, 1 reply without a request, 0 unknown bytes",
+    ]
+
+
+def test_noise_is_told_though_it_does_not_end() -> None:
+    heard, splitter, pairing, told = Heard(), Splitter(), Pairing(), []
+    for time in range(4):
+        heard.put(b"\xff" * 1500, time)
+        told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(heard))])
+    assert told == [[], [], [(0, 4500)], []]
+    assert [(it.time_ns, len(it.raw)) for it in pairing.rest()] == [(3, 1500)]
+
+
+METER = """\
+from multidrop.core import Wire
+from multidrop.drive import Drive
+from multidrop.register import HOLDING, reading
+
+class Meter(Drive):
+    model = "meter"
+    most_registers = {HOLDING: 4}
+    power = reading(7, "kW", wire=Wire.F32, table=HOLDING)
+"""
+
+
+def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> None:
+    """The floating-point format's own, as a meter without a sensor says it."""
+    (tmp_path / "meter.py").write_text(METER)
+    drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
+    plant = tmp_path / "plant.toml"
+    plant.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
+    frames = [frame(True, 1, 0x03, 7, 2), frame(False, 1, 0x03, 0, 0, bytes.fromhex("7F C0 00 00"))]
+    assert told(run, tmp_path / "a.pcapng", frames, "--plant", plant)[0] == "meter  reads power ?  (1.0 ms)"
+    (line, _) = run("decode", tmp_path / "a.pcapng", "--plant", plant, "--json")[1].splitlines()
+    assert json.loads(line)["values"] == {"power": None}
 
 
 def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:

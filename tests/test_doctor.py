@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from test_cli import Run, run
+from test_line_ports import SerialServer, pyserials_own, vanishing_pty
 
 from multidrop.cli.adapter import (
     RS485_ENABLED,
@@ -201,6 +203,36 @@ def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
     assert status == 0
     assert "is a TCP connection" in told
     assert "at the far end" in told
+
+
+@pyserials_own
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
+def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    server = SerialServer(port)
+    status, out, _ = run("doctor", server.url)
+    server.close()
+    told = " ".join(out.split())
+    assert status == 0
+    assert f"{server.url} is a pyserial rfc2217 port, which is copied to by two threads" in told
+    assert "at the far end" in told
+
+
+def test_a_port_that_is_lost_under_the_look_for_an_echo_is_told(run: Run) -> None:
+    port, hang_up = vanishing_pty()
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    out = run("doctor", port)[1]
+    thread.join()
+    assert "not tried: the port was lost (" in " ".join(out.split())
+
+
+def test_what_asks_a_driver_tells_a_port_that_is_gone_from_one_that_lacks_it() -> None:
+    master, slave = os.openpty()
+    os.close(master)
+    os.close(slave)
+    for ask in (low_latency, rs485_mode):
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            ask(slave)
 
 
 def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:

@@ -17,8 +17,8 @@ from test_cli_poll import plant, plant_file
 
 import multidrop.cli.extra
 from multidrop.batch import Row
-from multidrop.cli.keys import DOWN, ENTER, KEYS, UP, next_key
-from multidrop.cli.monitor import _Monitor
+from multidrop.cli.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
+from multidrop.cli.monitor import PAGE, _Monitor
 from multidrop.cli.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
 from multidrop.cli.watched import WatchedPlant
 from multidrop.core import Result, Tally
@@ -186,6 +186,14 @@ def test_the_page_has_every_register(watched: WatchedPlant) -> None:
     assert rows["device"].split()[1] == "..."
 
 
+@pytest.mark.parametrize(
+    ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
+)
+def test_an_age_is_told_as_people_do(watched: WatchedPlant, seconds: int, age: str) -> None:
+    lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
+    assert " ".join(lines[3].split()[6:8]) == age
+
+
 def test_a_wide_overview_has_the_delays(watched: WatchedPlant) -> None:
     lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
     assert lines[2].split()[-2:] == ["DELAY", "HISTORY"]
@@ -289,6 +297,19 @@ def test_drives_that_do_not_stand_come_first(tmp_path: Path, monkeypatch: pytest
     )
 
 
+def test_page_keys_scroll_a_page_and_choose_in_the_overview(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    monitor._obey(PAGE_DOWN)
+    assert (monitor._at.chosen, monitor._at.scrolled) == (2, 0)
+    monitor._obey(ENTER)
+    for key, scrolled in ((PAGE_DOWN, PAGE), (PAGE_DOWN, 2 * PAGE), (PAGE_UP, PAGE), (UP, 0), (PAGE_UP, 0)):
+        monitor._obey(key)
+        assert monitor._at.scrolled == scrolled
+    assert monitor._at.chosen == 1
+
+
 def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = a_monitor(tmp_path, monkeypatch)
     for key in [*string.printable, *KEYS.values()]:
@@ -314,6 +335,27 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
         terminal.press(b"q")
         assert terminal.process.wait(timeout=20) == 0
         assert termios.tcgetattr(terminal.slave) == terminal.before
+
+
+def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"sy")
+        terminal.wait_for("pump-1 has stopped")
+        terminal.press(b"\x1b[Bsy")
+        terminal.wait_for("pump-9 does not answer: check its address")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+
+
+def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"\x1b[B\r")
+        terminal.wait_for("TOY T1  address 9")
+        terminal.wait_for("NoReply")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
 
 
 def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:

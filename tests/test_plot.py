@@ -16,7 +16,7 @@ from test_cli import Run, run
 import multidrop.cli.extra
 from multidrop.batch import Row
 from multidrop.look import Look, load, plot, plot_page, png, report_page
-from multidrop.look.health import delays, miss_shares, reasons_of
+from multidrop.look.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
 from multidrop.look.used import used
 from multidrop.look.values import MOST_PANELS, MOST_POINTS, thinned
 from multidrop.plant import load_plant
@@ -258,6 +258,30 @@ def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
     assert told["hall-1"]["drives"]["pump"]["character_ms"] == pytest.approx(10 / 9.6, abs=1e-6)
 
 
+def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
+    planned = json.loads(json.dumps(PLANNED))
+    planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"] = 100
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    (line,) = used(look)
+    assert line.cycle is None
+    assert line.utilisation > 0.4
+    assert "bus cycle" not in report_page(look)
+
+
+def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
+    planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    (line,) = used(look)
+    assert (line.utilisation, line.cycle) == (0, None)
+    assert "hall-2" in report_page(look)
+
+
+def test_a_motor_that_keeps_its_speed_tells_nothing_of_noise_that_comes_with_it(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
+    rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
+    assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
+
+
 def test_misses_are_told_by_reason(look: Look) -> None:
     assert reasons_of(look, "pump") == {"bad checksum": 200}
     assert reasons_of(look, "fan") == {"no reply": 1}
@@ -311,13 +335,46 @@ def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
     assert low <= 0 < 50 < high
 
 
-def test_what_has_no_room_is_named(tmp_path: Path) -> None:
+def test_zero_is_there_if_it_is_near(tmp_path: Path) -> None:
+    for least, bottom in ((10.0, 0.0), (45.0, None)):
+        rows = [row(at, "pump", "output_frequency", value) for at, value in enumerate((least, 50.0))]
+        (axes,) = plot(load(record(tmp_path / f"{least:g}.arrows", rows)))[0].axes
+        low, _ = axes.get_ylim()
+        assert low == bottom if bottom is not None else 0 < low < least
+
+
+def test_counts_that_have_names_are_named(tmp_path: Path) -> None:
+    states = {"unit": "", "step": 1, "values": {"FORWARD": 1, "STOPPED": 3, "REVERSE": 2}}
+    rows = [row(at, "pump", "status", value) for at, value in enumerate((3, 1, 1, 3))]
+    about = {"drives": {"pump": {"registers": {"status": states}}}}
+    (axes,) = plot(load(record(tmp_path / "it.arrows", rows, about)))[0].axes
+    assert [(it.get_position()[1], it.get_text()) for it in axes.get_yticklabels()] == [
+        (1, "forward"),
+        (3, "stopped"),
+    ]
+
+
+def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
+    rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
+    (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
+    names = [it.get_text() for it in misses.get_legend().get_texts()]
+    assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
+
+
+def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))
     figure, left = plot(look)
     assert len(figure.axes) == MOST_PANELS
     assert left == [f"r{MOST_PANELS}", f"r{MOST_PANELS + 1}"]
     assert plot(look, [], left)[1] == []
+    assert f"<p>Not shown: r{MOST_PANELS}; r{MOST_PANELS + 1}. <code>multidrop plot" in report_page(look)
+    assert run("plot", tmp_path / "it.arrows") == (
+        0,
+        f"{tmp_path}/it.png\nnot shown: r{MOST_PANELS}; r{MOST_PANELS + 1} (choose with --register)\n",
+        "",
+    )
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(look: Look) -> None:
@@ -346,6 +403,19 @@ def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
     page = report_page(look)
     assert "No drive ever answered." in page
     assert "100.00%" in page
+
+
+@pytest.mark.parametrize(("value", "status"), [(0.0, "ok"), (None, "no reply")])
+def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, status: str) -> None:
+    rows = [row(at, "pump", "fault", value, status) for at in range(3)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    assert look.series[0].faults() == []
+    assert "<p>None was seen.</p>" in report_page(look)
+
+
+def test_a_long_recording_is_told_in_hours(tmp_path: Path) -> None:
+    rows = [row(second, "pump", "output_frequency", 50.0) for second in (0, 7384)]
+    assert "UTC, 2 h 03 min; 1 drive; 2 values" in report_page(load(record(tmp_path / "it.arrows", rows)))
 
 
 def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from line_driver import LineDriver
 from toy import Toy
 
 from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
+from multidrop.drive import Drive, Script, verb, write
 from multidrop.drives import MODELS
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.delixi_native import DelixiNative
@@ -18,6 +19,7 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
 from multidrop.errors import LineError
+from multidrop.register import Kept, command, setting
 from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
 from multidrop.sim.dialect import Reason, Refusal
@@ -120,6 +122,7 @@ def declared(*drives: object) -> set[tuple[int, str, str, str]]:
     return {(it.address, it.model, f"{it.settings}", f"{it.framing}") for it in drives}
 
 
+@pytest.mark.story
 def test_all_eight_are_found_at_their_settings_and_nothing_else() -> None:
     line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
     findings = found(line, sweeps(FAMILIES))
@@ -128,6 +131,7 @@ def test_all_eight_are_found_at_their_settings_and_nothing_else() -> None:
     assert not any(it.doubt for it in findings)
 
 
+@pytest.mark.story
 def test_only_reads_are_sent() -> None:
     wire = Pair([simulated(it) for it in ALL_EIGHT])
     line = Line(wire)
@@ -260,6 +264,7 @@ class Everything(Echo, Junk):
     """Echo, stray bytes and noise together."""
 
 
+@pytest.mark.story
 def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address() -> None:
     one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
     one["output_current"], twin["output_current"] = 41.1, 77.7
@@ -323,6 +328,70 @@ def test_a_family_of_one_s_own_is_found() -> None:
     assert drives(findings) == {(7, "toy", "19200 8N1", "rtu"), (2, "invt-che", "9600 8N1", "rtu")}
 
 
+class Addressed(Toy):
+    """A family of one's own, whose drives hold their address."""
+
+    model = "addressed"
+    address_setting = setting(0x20, span=(1, 31), kept=Kept.EEPROM)
+
+
+class Older(SimulatedDrive):
+    """Its firmware does not have the address yet."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start == Addressed.address_setting.address:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().read(function, start, count)
+
+
+@pytest.mark.parametrize(
+    ("kind", "held", "models"),
+    [(SimulatedDrive, 7, ("addressed",)), (SimulatedDrive, 9, ()), (Older, 0, ("addressed",))],
+)
+def test_who_holds_another_address_is_of_another_family(
+    kind: type[SimulatedDrive], held: int, models: tuple[str, ...]
+) -> None:
+    drive = kind(Addressed(7))
+    drive["address_setting"] = held
+    plan = sweeps([Addressed], baudrates=[9600], formats=["8N1"])
+    findings = found(Line(Pair([drive])), plan, [Addressed])
+    assert [(it.address, it.models) for it in findings if isinstance(it, Found)] == [(7, models)]
+
+
+class Meddler(Toy):
+    """A family of one's own, whose author took a write for a look."""
+
+    model = "meddler"
+
+    @verb
+    def identify(self) -> Script[None]:
+        yield from write(Toy.frequency, 10.0)
+
+    def resembles(self) -> Script[bool]:
+        yield from write(Toy.frequency, 10.0)
+        return True
+
+
+def test_a_look_that_would_write_names_nobody_and_writes_nothing() -> None:
+    drive = SimulatedDrive(Meddler(7))
+    plan = sweeps([Meddler], baudrates=[9600], formats=["8N1"])
+    findings = found(Line(Pair([drive])), plan, [Meddler])
+    assert drives(findings) == {(7, "", "9600 8N1", "rtu")}
+    assert not drive.counters.writes
+
+
+class Commanded(Drive):
+    """A family of one's own, of which nothing can be read."""
+
+    model = "commanded"
+    speed = command(1, "rpm")
+
+
+def test_a_family_of_which_nothing_can_be_read_is_not_asked() -> None:
+    plan = sweeps([InvtCHE, Commanded], baudrates=[9600], formats=["8N1"])
+    assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
+
+
 def test_a_drive_that_was_found_is_asked_for_once() -> None:
     line = Line(Pair([simulated(InvtCHE(2, format="8N2"))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1", "8N2"]), [InvtCHE])
@@ -344,6 +413,23 @@ def test_settings_that_the_port_refuses_are_passed_over_and_told() -> None:
     assert drives(findings) == declared(InvtCHE(2))
     untried = {it.settings.format for it in findings if isinstance(it, Untried)}
     assert untried == {"8E1", "8O1", "8E2", "8O2"}
+
+
+class Vanishing(Line):
+    """A port that is lost after some exchanges."""
+
+    def carry_out(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion:
+        if len(self.sent) == 20:
+            raise LineError("port", "the port was lost (hung up)")
+        return super().carry_out(exchange, not_before_ns=not_before_ns)
+
+
+def test_a_port_that_is_lost_ends_the_scan_after_what_was_found() -> None:
+    line = Vanishing(Pair([simulated(InvtCHE(2))]))
+    findings = scan(line.carry_out, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
+    assert drives([next(it for it in findings if isinstance(it, Found))]) == declared(InvtCHE(2))
+    with pytest.raises(LineError, match=r"^port: the port was lost \(hung up\)$"):
+        list(findings)
 
 
 def test_a_port_that_takes_nothing_is_an_error() -> None:

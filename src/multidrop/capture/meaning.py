@@ -22,6 +22,7 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
+_MOST = {Wire.BIT: 2000, Wire.U16: 125}  # in a reply; a request may ask for more, in vain
 _WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # function: a table's
 _DELIXI_READS = (0x03, 0x07)
 _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
@@ -98,8 +99,7 @@ def _offset(register: Register[Any], request: Message) -> int | None:
 def _raw(framing: Framing, request: Message) -> tuple[Place, ...]:
     if framing is Framing.DELIXI:
         return (Place(f"k{request.function}_{request.start:04X}", 0, Wire.U32),)
-    if request.function not in _TABLES:
-        return ()
     table = _TABLES[request.function]
     wire = Wire.BIT if request.function in _BITS else Wire.U16
-    return tuple(Place(f"{table}_{request.start + at}", at, wire) for at in range(max(request.count, 1)))
+    count = min(max(request.count, 1), _MOST[wire])
+    return tuple(Place(f"{table}_{request.start + at}", at, wire) for at in range(count))

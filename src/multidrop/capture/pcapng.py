@@ -44,9 +44,13 @@ class CaptureWriter:
         if comment:
             options.insert(0, (_COMMENT, comment.encode()))
         head = struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)
-        self._append(_block(_SECTION, head + _options(*options)))
-        for line in lines:
-            self._declare(line)
+        try:
+            self._append(_block(_SECTION, head + _options(*options)))
+            for line in lines:
+                self._declare(line)
+        except RecordingError:
+            self.close()
+            raise
 
     def write(self, raw: bytes, side: Side, time_ns: int, line: str) -> None:
         """Append what was on the line at this time (UTC, ns), such as a frame."""

@@ -40,7 +40,7 @@ class Teller:
         return f"{clock}  {who}  {verb}{doubt} {self._answer(overheard, asked, meaning)}"
 
     def _answer(self, heard: Heard, asked: Message, meaning: Meaning) -> str:
-        names = ", ".join(place.name for place in meaning.places[:_MOST_SHOWN]) or f"{asked.start}"
+        names = ", ".join(place.name for place in meaning.places[:_MOST_SHOWN])
         if heard.reply is not None and heard.reply.exception:
             return f"{names}: refused, code {heard.reply.exception:02X}H{_delay(heard)}"
         if heard.reply is None and not meaning.is_write:

@@ -78,7 +78,8 @@ def _guarded(command: str, words: list[str]) -> int:
     """Run it; every foreseeable failure becomes a sentence on stderr."""
     try:
         status = _run(command, words)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as it is where the caller has closed it
+            sys.stdout.flush()
     except KeyboardInterrupt:
         return _say("interrupted", INTERRUPTED)
     except BrokenPipeError:  # whoever reads our output has seen enough

@@ -71,10 +71,10 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
     table = LiveTable(plant, sys.stdout) if show else None
     with ExitStack() as stack:
         interruption = stack.enter_context(Interruption())
+        poller = stack.enter_context(closing(Poller(plant)))  # first: without ports there is no recording
         takers: list[Callable[[Rows], None]] = [table.add] if table else []
         if arguments.out:
             takers.append(stack.enter_context(open_writer(arguments.out, plant.metadata())).write)
-        poller = stack.enter_context(closing(Poller(plant)))
         tapping = stack.enter_context(Tapping(poller, arguments.capture, arguments.flight_recorder))
         with poller:
             for _ in _ticks(arguments.seconds, interruption):

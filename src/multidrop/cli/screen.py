@@ -129,7 +129,7 @@ def _columns(plant: WatchedPlant, width: int) -> dict[str, int]:
     """Widths by head; what is left over goes to the fault's name and the history."""
     longest = max(len(it.name) for it in plant.drives)
     columns = {"DRIVE": max(5, min(longest, 16)), "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10}
-    columns |= {"AGE": 5, "MISSED": 6}
+    columns |= {"AGE": 7, "MISSED": 6}
     if width >= WIDE:
         columns["DELAY"] = 8
     left = max(0, width - 1 - sum(columns.values()) - len(columns))

@@ -131,8 +131,6 @@ def _counted(time: Array, edges: Array) -> Array:
 
 
 def _times_of(series: Series, reason: str) -> Array:
-    if reason not in series.statuses:
-        return series.time[:0]
     return np.asarray(series.time[series.missed & (series.status == series.statuses.index(reason))])
 
 

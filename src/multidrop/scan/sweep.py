@@ -60,9 +60,6 @@ class Sweep:
         """Seconds where nobody answers at all."""
         return len(self.addresses) * self.each
 
-    def __str__(self) -> str:
-        return f"{self.settings} {self.framing}"
-
 
 def sweeps(
     families: Sequence[type[Drive]],
