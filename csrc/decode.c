@@ -68,11 +68,11 @@ static int add_rows(struct md_decoder *decoder, int result, struct md_columns *c
 static int take_request(struct md_decoder *decoder, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
+    if (!add_rows(decoder, decoder->failure, columns))
+        return MD_NO_ROOM;
     const struct md_known *known = place_of(decoder, key_of(span->framing, &span->message));
     if (!known->key)
         return MD_UNKNOWN;
-    if (!add_rows(decoder, decoder->failure, columns))
-        return MD_NO_ROOM;
     decoder->block = known->block;
     decoder->asked_ns = span->time_ns;
     decoder->failure = MD_NO_REPLY;

@@ -37,9 +37,9 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
         return n;
     int64_t late = md_now_ns() - until_ns;
     if (left > 0 && late >= 0) { /* else it could not sleep for so short a time */
+        if (late > MD_MOST_LATENESS)
+            late = MD_MOST_LATENESS;
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
-        if (engine->lateness_ns > MD_MOST_LATENESS)
-            engine->lateness_ns = MD_MOST_LATENESS;
     }
     return n;
 }
@@ -114,7 +114,7 @@ static void *run(void *argument)
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL); /* the default is 50 us */
 #endif
     pthread_mutex_lock(&engine->mutex);
-    while (!engine->stopping) {
+    for (;;) {
         int64_t until_ns = earliest(engine);
         pthread_mutex_unlock(&engine->mutex);
         while (atomic_load(&engine->callers)) /* a mutex is had by who asks first, and that is us */
@@ -141,7 +141,6 @@ static void *run(void *argument)
             if (engine->wakes[i] <= now_ns || (told && engine->ports[i]->turn == NOBODYS))
                 md_port_advance(engine->ports[i], md_now_ns());
     }
-    pthread_mutex_unlock(&engine->mutex);
     return NULL;
 }
 
@@ -179,22 +178,6 @@ struct md_engine *md_engine_start(void)
     pthread_cond_destroy(&engine->changed);
     free(engine);
     return NULL;
-}
-
-void md_engine_stop(struct md_engine *engine)
-{
-    enter(engine);
-    engine->stopping = 1;
-    leave(engine);
-    md_bell_ring(&engine->bell);
-    pthread_join(engine->thread, NULL);
-    md_bell_destroy(&engine->bell);
-    md_waiter_free(engine->waiter);
-    pthread_mutex_destroy(&engine->mutex);
-    pthread_cond_destroy(&engine->changed);
-    free(engine->ports);
-    free(engine->wakes);
-    free(engine);
 }
 
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room)
@@ -308,6 +291,14 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->progress;
 }
 
+/* Whether the one that came first also goes first. A stop goes ahead of what is for other drives, but not of
+ * what came before it for its own: a start that was overtaken would undo it. */
+static int goes_first(const struct md_exchange *first, const struct md_exchange *then)
+{
+    int one = first->request.address, other = then->request.address;
+    return !then->insists || first->insists || one == other || one == 0 || other == 0;
+}
+
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion)
 {
@@ -318,10 +309,14 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
         *completion = (struct md_completion){.result = MD_LINE_LOST};
         wish.done = 1;
     } else {
-        struct wish **last = &port->wishes;
-        while (*last)
-            last = &(*last)->next;
-        *last = &wish;
+        struct wish **at = &port->wishes;
+        if (*at && port->turn == WISHED) /* it is under way */
+            at = &(*at)->next;
+        for (struct wish **it = at; *it; it = &(*it)->next)
+            if (goes_first((*it)->exchange, exchange))
+                at = &(*it)->next;
+        wish.next = *at;
+        *at = &wish;
         md_bell_ring(&engine->bell);
     }
     while (!wish.done)

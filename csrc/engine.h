@@ -73,7 +73,6 @@ struct md_engine {
     int64_t *wakes; /* when the thread is to wake for each port, whatever happens */
     unsigned count, room;
     int64_t lateness_ns; /* of the thread's waking, as is usual */
-    int stopping;
 };
 
 static inline uint32_t md_get(const uint32_t *counter)

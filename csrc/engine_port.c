@@ -94,12 +94,13 @@ static int64_t apply_settings(struct md_port *port, const struct md_settings *se
     now_ns = md_now_ns();
     port->progress.switching_ns += now_ns - begun_ns;
     md_put(&port->progress.switches, port->progress.switches + 1);
+    port->settings = *settings;
     if (refused < 0)
         lose(port, -refused);
-    else if (refused & port->must_take)
+    else if (refused & port->must_take) {
+        port->settings = (struct md_settings){0}; /* some of them may have been taken */
         md_line_abandon(&port->line, MD_SETTINGS_REFUSED, refused);
-    else
-        port->settings = *settings;
+    }
     return now_ns;
 }
 
@@ -172,13 +173,18 @@ static void move_on(struct md_port *port)
     __builtin_prefetch(&soon->drive->tally);
 }
 
+/* Whether nobody wants any more what is under way, and nothing of it has left. */
+static int is_expired(const struct md_port *port, int64_t now_ns)
+{
+    return port->turn == WISHED && port->wishes->expires_ns && now_ns > port->wishes->expires_ns && port->line.tx_at == 0;
+}
+
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
 static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
     struct wish *wish = port->wishes;
     if (wish && now_ns >= wish->not_before_ns) {
-        int is_begun = begin(port, WISHED, wish->exchange, wish->completion, now_ns);
-        if (is_begun && wish->expires_ns && now_ns > wish->expires_ns)
+        if (begin(port, WISHED, wish->exchange, wish->completion, now_ns) && is_expired(port, now_ns))
             md_line_abandon(&port->line, MD_EXPIRED, 0);
         return 1;
     }
@@ -207,12 +213,7 @@ static void report(struct md_port *port)
     const struct md_completion *completion = &port->completion;
     if (port->inbox)
         md_inbox_add(port->inbox, exchange->block, completion);
-    struct md_block *block = exchange->block;
     int is_refusal = completion->result > 0 && completion->reply.exception;
-    if (block && is_refusal)
-        block->refusals++;
-    else if (block && completion->result > 0 && block->refusals)
-        block->refusals = 0;
     if (is_refusal || exchange->drive->failures != port->failures)
         call(port);
 }
@@ -277,6 +278,10 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
             continue;
         }
         wake_ns = line->wake_ns;
+        if (want == MD_WRITE && is_expired(port, now_ns)) {
+            md_line_abandon(line, MD_EXPIRED, 0);
+            continue;
+        }
         if (want == MD_WRITE) {
             now_ns = apply_settings(port, &line->exchange->settings, now_ns);
             if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, now_ns))

@@ -442,18 +442,6 @@ int md_reply_length(int framing, const struct md_message *request)
     return framing == MD_RTU ? body + 2 : 2 * body + 5;
 }
 
-int md_is_mistakable(int framing, const struct md_message *one, const struct md_message *other)
-{
-    if (one->address != other->address || one->function != other->function)
-        return 0;
-    if (framing == MD_DELIXI && (one->function == STATE_QUERY || one->function == PARAMETER_QUERY))
-        return one->start == other->start;
-    /* Replies to reads say nothing of what was asked for but its length; a write's confirmation says
-     * what was written, but a refusal does not say of what it is. */
-    return reply_shape(framing, one->function) != DATA ||
-           md_reply_length(framing, one) == md_reply_length(framing, other);
-}
-
 void md_copy_message(struct md_message *to, const struct md_message *from)
 {
     memcpy(to, from, offsetof(struct md_message, data) + from->data_len);

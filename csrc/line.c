@@ -5,9 +5,9 @@
  * echo and other stations' frames come first on real lines. Neither they nor a damaged frame end
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
  * echoes what it sends shows in the replies that are no copies of their requests, and where a copy
- * is all that comes before a time-out; until it does, no copy is taken for the reply. From a drive's
- * replies its response delay is learnt: how long to wait for it, and when it is worth looking. */
+ * is all that comes before a time-out; until it does, no copy is taken for the reply. */
 #include "multidrop.h"
+#include "times.h"
 
 #include <errno.h>
 #include <string.h>
@@ -21,48 +21,9 @@ enum state {
     ENDING     /* the time-out is over: looks once more, because it may be late to look at all */
 };
 
-static const int64_t WORTH_WAITING = 100000; /* ns; before a shorter time a sleep costs more than a look */
-
-static int64_t later(int64_t a, int64_t b)
-{
-    return a > b ? a : b;
-}
-
-static int64_t clamp(int64_t value, int64_t least, int64_t most)
-{
-    return value < least ? least : value > most ? most : value;
-}
-
-/* Before this delay no reply is to be expected: nothing is worth reading. */
-static int64_t early_ns(const struct md_exchange *exchange)
-{
-    const struct md_drive *drive = exchange->drive;
-    return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
-}
+static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a sleep costs more than a look */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
-
-/* Longer after each failure: the drive may have become slower, or is slower than most. */
-static int64_t timeout_ns(const struct md_drive *drive)
-{
-    int64_t usual = 4 * drive->least_timeout_ns, margin_ns = later(4 * drive->deviation_ns, drive->least_timeout_ns / 4);
-    if (drive->delay_ns)
-        usual = later(drive->delay_ns + margin_ns, drive->least_timeout_ns);
-    return clamp(usual << (drive->failures < 8 ? drive->failures : 8), 0, drive->most_timeout_ns);
-}
-
-/* As TCP learns its retransmission time-out (RFC 6298), from the delay of one reply. */
-static void learn_delay(struct md_drive *drive, int64_t delay_ns)
-{
-    int64_t off = delay_ns - drive->delay_ns;
-    if (drive->delay_ns == 0) {
-        drive->delay_ns = later(delay_ns, 1);
-        drive->deviation_ns = delay_ns / 2;
-        return;
-    }
-    drive->deviation_ns += ((off < 0 ? -off : off) - drive->deviation_ns) / 4;
-    drive->delay_ns = later(drive->delay_ns + off / 8, 1);
-}
 
 /* Whether this says that the drive does not answer, or cannot be reached. Damage says that it does. */
 static int is_failure(int result)
@@ -91,9 +52,28 @@ static void count(const struct md_exchange *exchange, const struct md_completion
         drive->failures = 0;
 }
 
+static void count_refusals(struct md_block *block, const struct md_completion *completion)
+{
+    if (!block || completion->result <= 0)
+        return;
+    if (completion->reply.exception) {
+        block->refusals++;
+        block->refusal = completion->reply.exception;
+    } else if (block->refusals) {
+        block->refusals = 0;
+    }
+}
+
 static int is_copy(const struct md_line *line, size_t at)
 {
     return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
+}
+
+/* Whether all that there is begins as the request does, and there is less of it. */
+static int may_become_copy(const struct md_line *line, size_t at)
+{
+    size_t len = line->rx_len - at;
+    return len < line->tx_len && memcmp(line->rx + at, line->tx, len) == 0;
 }
 
 /* Whether a part of the request at least has left. */
@@ -139,6 +119,7 @@ static void finish(struct md_line *line, int result, const uint8_t *raw, size_t 
         line->silence_ns = line->exchange->silence_ns;
     line->state = IDLE;
     count(line->exchange, completion);
+    count_refusals(line->exchange->block, completion);
 }
 
 /* The reply is there: what it says of the drive's own delay, and what it had to take of the line. */
@@ -153,12 +134,11 @@ static void measure(struct md_line *line, int reply_len)
     if (first_ns < completion->first_ns)
         completion->first_ns = first_ns;
     int64_t delay_ns = later(begun_ns - left_ns, 0);
-    /* A reply that was whole when first looked at may have been so for long. */
-    if (line->looks == 1 && line->ready_ns && early_ns(exchange) < delay_ns)
-        delay_ns = early_ns(exchange);
-    learn_delay(exchange->drive, delay_ns);
+    struct md_drive *drive = exchange->drive;
+    int is_whole = line->waited && line->looks == 1;
+    delay_ns = md_learn_delay(drive, delay_ns, is_whole, exchange->character_ns);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
-    md_tally_answer(&exchange->drive->tally, delay_ns, ideal_ns);
+    md_tally_answer(&drive->tally, delay_ns, ideal_ns);
 }
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
@@ -176,7 +156,7 @@ static void expect_late_answer(struct md_line *line)
     const struct md_exchange *exchange = line->exchange;
     struct md_drive *drive = exchange->drive;
     int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
-    int64_t until_ns = line->quiet_ns + later(3 * timeout_ns(drive), drive->most_timeout_ns) + reply_ns;
+    int64_t until_ns = line->quiet_ns + later(3 * md_timeout_ns(exchange), drive->most_timeout_ns) + reply_ns;
     drive->late_others = line->quiet_ns < drive->late_until_ns;
     drive->late_functions = (drive->late_others ? drive->late_functions : 0) | function_bit(&exchange->request);
     drive->late = exchange->request;
@@ -189,17 +169,14 @@ static void expect_late_answer(struct md_line *line)
     line->late = drive;
 }
 
-/* Whether an answer that is still to come could pass for the reply to this request. */
+/* Whether an answer that is still to come could pass for the reply to this request. An exception says no
+ * more of what was asked than the function, in Delixi's own protocol not even that. */
 static int is_ambiguous(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
     if (exchange->insists || now_ns >= drive->late_until_ns)
         return 0;
-    struct md_message other = exchange->request;
-    other.start ^= 1; /* mistakable, if replies do not say what was asked */
-    return md_is_mistakable(exchange->framing, &drive->late, &exchange->request) ||
-           (drive->late_others && (drive->late_functions & function_bit(&exchange->request)) &&
-            md_is_mistakable(exchange->framing, &other, &exchange->request));
+    return exchange->framing == MD_DELIXI || (drive->late_functions & function_bit(&exchange->request)) != 0;
 }
 
 /* Whether the answer to an earlier request begins there: its length, MD_INCOMPLETE or a reason. That
@@ -239,6 +216,18 @@ static void recognise_late_answers(struct md_line *line, int64_t now_ns)
     }
 }
 
+/* Whether this, at the beginning of what came, says that the drive has answered. Only a damaged frame of its
+ * own does: others', the echo and noise do not, and what looks like one further on may be the inside of another. */
+static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
+{
+    if (begin == 0 && line->echo == MD_ECHO)
+        return 0;
+    if (found == MD_BAD_CHARACTER) /* of which the framing looks at no address */
+        return line->rx_len >= begin + 5 && md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
+               md_hex_byte(line->rx + begin + 3) >= 0;
+    return found == MD_BAD_CHECKSUM;
+}
+
 static void time_out(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -249,9 +238,7 @@ static void time_out(struct md_line *line)
     if (is_alone && !is_doubtful)
         line->echo = MD_ECHO; /* nobody else says it again and no more */
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
-    /* Only a damaged frame of its own says that the drive has answered: others' and noise do not, and
-     * what looks like one further on may be the inside of another. */
-    if (first != MD_BAD_CHECKSUM && first != MD_BAD_CHARACTER)
+    if (!is_damaged_answer(line, begin, first))
         expect_late_answer(line);
     int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
     finish(line, is_doubtful ? MD_MAYBE_ECHO : reason, line->rx, line->rx_len);
@@ -263,7 +250,7 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 {
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
     if (line->completion->skipped <= most_stray && !is_copy(line, reply_at))
-        line->echo = MD_NO_ECHO;
+        line->echo = line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO; /* one may have been lost */
     for (size_t at = 0; at + line->tx_len <= reply_at; at++)
         if (is_copy(line, at))
             line->echo = MD_ECHO;
@@ -299,6 +286,8 @@ static void search(struct md_line *line, int64_t now_ns)
     size_t at = line->rx_from, first_open = SIZE_MAX;
     while (at < line->rx_len) {
         int used = parse_at(line, at, &reply);
+        if (used > 0 && line->echo_due && may_become_copy(line, at))
+            used = MD_INCOMPLETE;
         if (used > 0 && line->echo_due && is_copy(line, at)) {
             line->echo_due = 0; /* the adapter's, or it cannot be told from that */
             first_open = SIZE_MAX;
@@ -349,7 +338,8 @@ static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
-    tell(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
+    if (is_under_way(line)) /* else there is no completion, or its owner has it back */
+        tell(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
     line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);
@@ -409,6 +399,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
     case LISTENING:
         if (line->ready_ns - now_ns > WORTH_WAITING && line->ready_ns < line->give_up_ns) {
             line->wake_ns = line->ready_ns;
+            line->waited = 1;
             return MD_WAIT;
         }
         line->wake_ns = has_begun(line) ? line->give_up_ns : line->begun_by_ns;
@@ -457,17 +448,20 @@ void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
         return;
     }
     int64_t reply_ns = reply_len * exchange->character_ns;
-    line->give_up_ns = line->quiet_ns + timeout_ns(exchange->drive) + reply_ns;
-    line->ready_ns = exchange->drive->delay_ns ? line->quiet_ns + early_ns(exchange) + reply_ns : 0;
+    const struct md_drive *drive = exchange->drive;
+    line->give_up_ns = line->quiet_ns + md_timeout_ns(exchange) + reply_ns;
+    line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
-    if (line->burst > 0 && exchange->drive->failures == 0) {
-        int64_t begun_ns = timeout_ns(exchange->drive) + (line->burst + 2) * exchange->character_ns;
+    if (line->burst > 0 && drive->delay_ns) /* what comes at once is there when the port is ready */
+        line->ready_ns = line->quiet_ns + md_look_ns(drive, exchange->character_ns) + reply_ns;
+    if (line->burst > 0 && drive->failures == 0) {
+        int64_t begun_ns = md_timeout_ns(exchange) + (line->burst + 2) * exchange->character_ns;
         if (line->quiet_ns + begun_ns < line->begun_by_ns)
             line->begun_by_ns = line->quiet_ns + begun_ns;
         if (line->begun_by_ns + begun_ns < line->ready_ns) /* a look is cheaper than so long a wait in vain */
             line->ready_ns = line->begun_by_ns;
     }
-    line->looks = line->sight = 0;
+    line->waited = line->looks = line->sight = 0;
     line->state = LISTENING;
 }
 
@@ -511,10 +505,13 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         completion->first_ns = now_ns;
     completion->last_ns = now_ns;
     completion->skipped += (uint32_t)len;
-    for (size_t at = 0; at < len && line->state != IDLE;) {
+    size_t at = 0;
+    while (at < len && line->state != IDLE) {
         at += keep(line, bytes + at, len - at);
         search(line, now_ns);
     }
+    if (at < len) /* behind the reply, and there was no room for it beside what came before that */
+        md_tap_put(line->tap, MD_NOISE, now_ns, bytes + at, len - at);
     if (line->state == ENDING && now_ns < line->give_up_ns)
         line->state = LISTENING;
     if (line->state == LISTENING)

@@ -75,9 +75,6 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
                    const struct md_message *request, struct md_message *reply);
 
-/* Whether an answer to the one request could pass for the reply to the other. */
-int md_is_mistakable(int framing, const struct md_message *one, const struct md_message *other);
-
 /* Length in bytes of the good reply to `request`; 0 when nobody answers (broadcast). */
 int md_reply_length(int framing, const struct md_message *request);
 
@@ -208,7 +205,7 @@ struct md_line {
     uint16_t rx_len, rx_from; /* no reply begins before rx_from */
     int echo;                 /* of what the adapter sends (enum md_echo): learnt, never forgotten by failures */
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
-    int looks;                /* how often the line was looked at since the request left */
+    int waited, looks;        /* since the request left: whether it was left alone, how often it was looked at */
     struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */
     uint16_t sight_at, sight; /* where the reply may begin, and what there was of it at the first sight */
     uint16_t burst;           /* at most so many characters wait in the adapter; 0: it may be a whole reply */
@@ -225,6 +222,16 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
 
+/* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
+
+/* How long after a request, beside its reply's own time, it is worth looking for that. */
+int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
+int64_t md_timeout_ns(const struct md_exchange *exchange); /* how long its reply is waited for */
+int64_t md_vain_ns(const struct md_drive *drive); /* the same of a drive that stays silent, on average */
+/* It was answered after so long, at most so long where the reply was whole when first looked at; what to
+ * take for its delay. */
+int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
+
 /* ---- tally.c: what became of a drive's exchanges, counted ---- */
 
 /* An exchange is over, as its completion says. */
@@ -240,8 +247,7 @@ struct md_engine;
 struct md_port; /* a descriptor with its line */
 struct md_inbox;
 
-struct md_engine *md_engine_start(void); /* NULL: see errno */
-void md_engine_stop(struct md_engine *engine); /* when all its ports are closed */
+struct md_engine *md_engine_start(void); /* it ends with the process; NULL: see errno */
 
 /* `must_take`: which refusals (enum md_refusal) are failures; -1: a port without settings. `room`
  * for exchanges, a power of two. NULL: see errno. */
@@ -316,6 +322,7 @@ struct md_block {
     const struct md_field *fields;
     int count;
     uint32_t refusals; /* exceptions in a row */
+    uint8_t refusal;   /* the last one's code */
     uint16_t drive;    /* code of its name */
 };
 

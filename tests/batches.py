@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from multidrop.batch import Batch, Row
-from multidrop.core import Block, Columns, Field, Result, Wire, new_completion
+from multidrop.core import Block, Columns, Field, Names, Result, Wire, new_completion
 
 # 2026-11-21 09:30:00.123456789 UTC lies 1 s of monotonic time before UTC_0 + 1 s
 UTC_0 = 1_795_253_399_123_456_789
 SECOND = 1_000_000_000
 
-DRIVES = ("pump-1", 'fan, the "old" one', "насос")
-REGISTERS = ("output_frequency", "motor_speed")
+DRIVES = Names(["pump-1", 'fan, the "old" one', "насос"])
+REGISTERS = Names(["output_frequency", "motor_speed"])
 METADATA = {
     "multidrop": "0.1.0",
     "plant": "завод.toml",

@@ -11,7 +11,7 @@ import pytest
 from batches import EXAMPLE, SECOND, UTC_0, block, completion, counting, example
 
 from multidrop.batch import Batch, Row
-from multidrop.core import Columns, Result
+from multidrop.core import Columns, Names, Result
 
 SCHEMA = pa.schema(
     [
@@ -40,7 +40,7 @@ def test_rows_for_people() -> None:
 
 
 def test_empty_batch() -> None:
-    batch = Batch(Columns(4), ["pump-1"], [])
+    batch = Batch(Columns(4), Names(["pump-1"]), Names())
     assert (len(batch), list(batch)) == (0, [])
     assert pa.record_batch(batch).num_rows == 0
 
@@ -68,7 +68,7 @@ def test_capsules_stay_valid_when_the_batch_is_gone() -> None:
 def test_numbers_are_not_copied() -> None:
     columns = Columns(1)
     assert columns.add(block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
-    taken = pa.record_batch(Batch(columns, ["a"], ["b"]))
+    taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
     columns.c.value[0] = 7.5
     assert taken.column("value")[0].as_py() == 7.5
 
@@ -119,7 +119,7 @@ def test_every_status_can_be_spelt() -> None:
             assert columns.add_miss(block(0, 0), reason, SECOND, UTC_0)
     for code in range(1, 256):
         assert columns.add(block(0, 0), completion(SECOND, exception=code), UTC_0)
-    batch = Batch(columns, ["a"], ["b"])
+    batch = Batch(columns, Names("a"), Names("b"))
     statuses = pa.record_batch(batch).column("status").to_pylist()
     reasons = [str(reason) for reason in Result if reason is not Result.INCOMPLETE]
     assert statuses == reasons + [f"exception {code:02X}" for code in range(1, 256)]

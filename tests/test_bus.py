@@ -435,6 +435,22 @@ def test_a_refusal_has_its_family_s_meaning(
     assert there.counters.requests == 1  # an answer, which asking again would not change
 
 
+@pytest.mark.parametrize(
+    ("drive", "least_ms", "most_ms"),
+    [
+        (InvtCHE(1), 20, 400),
+        (YD1000(1), 110, 500),  # answers after 24 characters of 11 bits
+        (YD1000(1, baudrate=2400), 440, 500),
+        (YD1000(1, baudrate=1200), 500, 500),
+    ],
+    ids=lambda it: f"{it.name} {it.settings}" if isinstance(it, Drive) else None,
+)
+def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, most_ms: int) -> None:
+    with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
+        known = bus.respondent(bus.attach(drive)).c
+    assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)
+
+
 # ---- broadcasts ----
 
 

@@ -1,26 +1,24 @@
-"""The C core's own test program, built by the system's compiler with its sanitizers, and run."""
+"""The C core's own test programs, built by the system's compiler with its sanitizers, and run."""
 
 import os
 import shutil
 import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = [
-    "tests/c/test_core.c",
-    *(f"csrc/{name}.c" for name in ("checksum", "frame", "reason", "tap", "line", "tally", "columns")),
-]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 CC = os.environ.get("CC", "cc")
 
 
-def test_core(tmp_path: Path) -> None:
+def build_and_run(program: Path, *core: str, arguments: Sequence[str] = ()) -> None:
+    """The test program of that name, with these parts of the core."""
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
-    program = tmp_path / "test_core"
     build = [
         CC,
         "-std=c11",
@@ -30,12 +28,25 @@ def test_core(tmp_path: Path) -> None:
         *STRICT,
         *SANITIZERS,
         "-Icsrc",
-        *SOURCES,
+        f"tests/c/{program.name}.c",
+        *(f"csrc/{name}.c" for name in core),
         "-lm",
     ]
     built = subprocess.run([*build, "-o", program], cwd=ROOT, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
-    run = subprocess.run(
-        [program, "tests/data/frames.csv"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    run = subprocess.run([program, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_core(tmp_path: Path) -> None:
+    core = ("checksum", "frame", "reason", "tap", "line", "delay", "tally", "columns")
+    build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
+
+
+def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
+    build_and_run(tmp_path / "test_inbox", "inbox", "columns", "frame", "checksum", "reason")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+def test_no_wait_is_rounded(tmp_path: Path) -> None:
+    build_and_run(tmp_path / "test_waiter", "waiter_epoll")

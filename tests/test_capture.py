@@ -7,20 +7,34 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
+import checksums
 import pytest
+from disks import full_at
 from frames import PRINTED, Printed
 from peers import require_program
 
 from multidrop.batch import Row
 from multidrop.capture import Capture, CaptureError, CaptureWriter, Decoding, Side
-from multidrop.core import Framing, Kind, Message, Span, Splitter, Unpacker, build_reply, build_request
+from multidrop.core import (
+    HEARD_ROOM,
+    Framing,
+    Kind,
+    Message,
+    Span,
+    Splitter,
+    Unpacker,
+    build_reply,
+    build_request,
+)
 from multidrop.plant import Plant, load_plant
+from multidrop.recording import RecordingError
 
 RTU = [
     it
     for it in PRINTED
     if it.request is not None and isinstance(it.says, Message) and it.framing is Framing.RTU
 ]
+READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 TEXT = [it for it in PRINTED if it.request is not None and it.framing is not Framing.RTU]
 BEGIN = 1_700_000_000_123_456_789
 STEP = 5_000_001  # ns between two frames
@@ -274,6 +288,13 @@ def block(kind: int, body: bytes) -> bytes:
     return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
 
 
+def packet(interface: int, content: bytes, told: int | None = None) -> bytes:
+    """An enhanced packet block; `told` is its length as it says itself."""
+    length = len(content) if told is None else told
+    return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
+
+
+NO_PACKET = " is damaged: what begins at byte 48 is no packet"
 SECTION, INTERFACE = described()[:28], described()[28:]
 BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
 
@@ -285,6 +306,9 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         (SECTION + struct.pack("<III", 1, 7, 7), " is damaged: what begins at byte 28 is no packet"),
         (SECTION + block(1, bytes(4)), " is damaged: what begins at byte 28 is no packet"),
         (described((9, b"\x0a")), ": byte 28: its clock is finer than a nanosecond"),
+        (described() + packet(1, READ), NO_PACKET),  # of an interface that is not there
+        (described() + packet(0, READ, told=9), NO_PACKET),  # longer than its block
+        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its two lengths differ
         (described() + SECTION, ": byte 48: only the first section can be read"),
         (described() + BIG_ENDIAN_SECTION, ": byte 48: sections of both byte orders cannot be read"),
         (
@@ -316,6 +340,35 @@ def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tm
         assert (capture.lines, capture.torn) == ([], 14)
 
 
+@pytest.mark.parametrize(
+    "tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"]
+)
+def test_a_packet_that_ends_within_its_tags_holds_nothing(tmp_path: Path, tags: bytes) -> None:
+    """A frame that somebody exported begins behind tags that say what it is; here none does."""
+    path = tmp_path / "a.pcapng"
+    interface = block(1, struct.pack("<HHI", 252, 0, 0))
+    path.write_bytes(SECTION + interface + packet(0, tags) + packet(0, b"\0\0\0\0" + READ))
+    (found,) = spans(path).values()
+    assert [span.raw for span in found] == [READ]
+
+
+@pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, HEARD_ROOM // 700 + 1)])
+@pytest.mark.parametrize("format", ["pcapng", "pcap"])
+def test_a_capture_may_hold_more_than_is_heard_at_once(
+    tmp_path: Path, format: str, content: bytes, count: int
+) -> None:
+    """More packets than there is room for, or more bytes."""
+    path = tmp_path / f"a.{format}"
+    if format == "pcapng":
+        path.write_bytes(described() + packet(0, content) * count)
+    else:
+        header = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 147)
+        path.write_bytes(header + (struct.pack("<IIII", 1, 0, len(content), len(content)) + content) * count)
+    (found,) = spans(path).values()
+    assert b"".join(span.raw for span in found) == content * count
+    assert {span.kind for span in found} == {Kind.REQUEST if content == READ else Kind.JUNK}
+
+
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
 def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) -> None:
     path = write(tmp_path / "a.pcapng", RTU)
@@ -331,6 +384,39 @@ def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) ->
             assert capture.torn < 300
     assert read == sorted(read, reverse=True)
     assert read[0] > read[-1] == 0
+
+
+# ---- what cannot be written ----
+
+
+def test_a_capture_that_finds_no_room_is_told_in_a_sentence(tmp_path: Path) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    path = tmp_path / "a.pcapng"
+    path.symlink_to("/dev/full")
+    files = sorted(Path("/proc/self/fd").iterdir())
+    with pytest.raises(RecordingError) as failure:
+        CaptureWriter(path, ["hall-1"])
+    assert str(failure.value) == f"{path}: cannot be written: No space left on device"
+    assert sorted(Path("/proc/self/fd").iterdir()) == files
+
+
+def test_a_capture_in_a_directory_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "none" / "a.pcapng"
+    with pytest.raises(RecordingError) as failure:
+        CaptureWriter(path)
+    assert str(failure.value) == f"{path}: cannot be written: No such file or directory"
+
+
+def test_a_disk_that_becomes_full_leaves_whole_packets(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcapng"
+    with CaptureWriter(path) as capture:
+        capture.write(READ, Side.ASKING, BEGIN, "hall-1")
+        with full_at(path.stat().st_size + 50), pytest.raises(RecordingError, match="File too large"):
+            capture.write(READ, Side.ASKING, BEGIN + STEP, "hall-1")
+        capture.write(READ, Side.ASKING, BEGIN + 2 * STEP, "hall-1")
+    (found,) = spans(path).values()
+    assert [span.time_ns for span in found] == [BEGIN, BEGIN + 2 * STEP]
 
 
 # ---- columns ----
@@ -432,3 +518,61 @@ def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> No
     assert [(row.register, row.value) for row in found] == [
         (f"{table}_register_{at}", at) for table in ("holding", "input") for at in range(65500)
     ]
+
+
+def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -> Path:
+    """A capture of them, one in every 2 ns."""
+    with CaptureWriter(path) as capture:
+        for number, (asked, reply) in enumerate(exchanges):
+            capture.write(build_request(Framing.RTU, asked), Side.ASKING, 2 * number, "hall-1")
+            if reply:
+                capture.write(build_reply(Framing.RTU, reply), Side.ANSWERING, 2 * number + 1, "hall-1")
+    return path
+
+
+@pytest.mark.parametrize(("data", "end"), [(b"\0\7", (7, "ok")), (b"", (None, "no reply"))])
+def test_more_requests_than_are_remembered_are_decoded_all_the_same(
+    tmp_path: Path, data: bytes, end: tuple[float | None, str]
+) -> None:
+    """Of 16384 places three quarters are taken; long before, two requests come to want the same."""
+    asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
+    replies = (Message(it.address, 3, it.start, 1, data) if data else None for it in asked)
+    path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
+    told = asked if data else asked[:-1]  # nobody knows whether the last one was answered
+    assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
+        (f"address {it.address}", f"holding_register_{it.start}", *end) for it in told
+    ]
+
+
+def test_a_request_for_more_than_a_reply_can_hold_is_rows_of_what_it_can(tmp_path: Path) -> None:
+    """Noise or a mistaken master asks for all there is, of every kind."""
+    path = tmp_path / "a.pcapng"
+    with CaptureWriter(path) as capture:
+        for time, function in enumerate((3, 4, 1, 2, 3)):
+            capture.write(checksums.rtu(f"01 {function:02X} 00 00 FF FF"), Side.ASKING, time, "hall-1")
+    assert [(row.register, row.status) for row in rows(path)] == [
+        (f"{table}_{at}", "no reply")
+        for table, most in (
+            ("holding_register", 125),
+            ("input_register", 125),
+            ("coil", 2000),
+            ("discrete_input", 2000),
+        )
+        for at in range(most)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("reply", "end"), [(Message(1, 3, 0, 100, bytes(200)), (0, "ok")), (None, (None, "no reply"))]
+)
+def test_more_rows_than_a_batch_can_hold_are_more_batches(
+    tmp_path: Path, reply: Message | None, end: tuple[float | None, str]
+) -> None:
+    """The rows of an exchange are never parted."""
+    count = 700 if reply else 701
+    path = frames_of(tmp_path / "a.pcapng", [(Message(1, 3, 0, 100), reply)] * count)
+    with Capture(path) as capture:
+        batches = list(Decoding(capture))
+    assert [len(batch) for batch in batches] == [65_500, 4_500]
+    found = [(row.time, row.register, row.value, row.status) for batch in batches for row in batch]
+    assert found == [(2 * n, f"holding_register_{at}", *end) for n in range(700) for at in range(100)]

@@ -18,7 +18,9 @@ from multidrop.core import (
     Exchange,
     Field,
     Framing,
+    Inbox,
     Message,
+    Names,
     Respondent,
     Result,
     Wire,
@@ -208,13 +210,54 @@ def test_block_without_room_is_left_out_whole() -> None:
 
 
 def test_codes_are_spelt_out() -> None:
-    names = ("pump-1", "вентилятор", "")
+    names = Names(["pump-1", "вентилятор", ""])
     offsets, text = spell(memoryview(array("H", [1, 0, 2, 1])), names)
     ends = list(offsets)
     found = [bytes(text[begin:end]).decode() for begin, end in pairwise(ends)]
     assert found == ["вентилятор", "pump-1", "", "вентилятор"]
 
 
+def test_names_that_are_added_are_spelt_out_too() -> None:
+    names = Names()
+    numbers = [names.number(name) for name in ("pump", "fan", "pump")]
+    spell(memoryview(array("H", numbers)), names)
+    numbers.append(names.number("насос"))
+    _, text = spell(memoryview(array("H", numbers)), names)
+    assert (numbers, bytes(text).decode()) == ([0, 1, 0, 2], "".join(["pump", "fan", "pump", "насос"]))
+
+
 def test_nothing_is_spelt_out() -> None:
-    offsets, text = spell(memoryview(array("H")), ("a",))
+    offsets, text = spell(memoryview(array("H")), Names("a"))
     assert (list(offsets), bytes(text)) == ([0], b"")
+
+
+BLOCK = Block(0, [Field(0, Wire.U16, register, 1.0, 1.0) for register in range(3)])
+
+
+def test_a_block_without_fields_leaves_nothing() -> None:
+    inbox = Inbox()
+    inbox.add_miss(Block(0, []), Result.NOT_ASKED, 5)
+    assert (inbox.chunks, inbox.dropped, inbox.take()) == (0, 0, None)
+
+
+def test_a_block_that_no_chunk_can_hold_is_counted() -> None:
+    inbox = Inbox(chunk_rows=2)
+    inbox.add_miss(BLOCK, Result.NOT_ASKED, 5)
+    assert inbox.dropped == 3
+
+
+def test_chunks_that_were_taken_can_all_be_given_back() -> None:
+    """More of them than are kept for later."""
+    inbox = Inbox(chunk_rows=3, most_chunks=100)
+    for turn in (1, 2):
+        for due in range(100):
+            inbox.add_miss(BLOCK, Result.NOT_ASKED, due * turn)
+        taken = [inbox.take() for _ in range(100)]
+        assert [[*it.array("sent")] for it in taken if it] == [[due * turn] * 3 for due in range(100)]
+        del taken
+    assert (inbox.take(), inbox.dropped) == (None, 0)
+
+
+def test_a_code_without_a_name_is_not_spelt_out() -> None:
+    with pytest.raises(ValueError, match=r"^a code without a name, or more than 2 GiB of names"):
+        spell(memoryview(array("H", [0, 1])), Names(["pump"]))

@@ -13,6 +13,8 @@ from lines import line, plant, polled, rows_of, until
 from toy import Toy
 
 from multidrop.bus import Bus
+from multidrop.drives import InvtCHE
+from multidrop.errors import NoReply
 from multidrop.plant import PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof
@@ -95,6 +97,7 @@ def test_what_cannot_come_or_go(port: str) -> None:
         for polled_drive, sentence in (
             (pump(1, "other"), "address 1 is taken by pump-1"),
             (pump(2, "pump-1"), "another drive is called pump-1; give every one its own name"),
+            (polled(InvtCHE(3), [CURRENT]), "this output_current is no register of invt-che@3"),
         ):
             with pytest.raises(ValueError, match=sentence):
                 poller.add("line", polled_drive)
@@ -103,6 +106,13 @@ def test_what_cannot_come_or_go(port: str) -> None:
         with pytest.raises(ValueError, match="there is no drive 'pump-2' on line 'line'"):
             poller.remove("line", "pump-2")
         assert list(poller.summary()["lines"]["line"]["drives"]) == ["pump-1"]
+
+
+def test_a_drive_of_which_nothing_is_polled_disturbs_nobody(port: str) -> None:
+    with Poller(plant(line(port, pump(1), polled(Toy(3, name="pump-3"), [])))) as poller:
+        seen = Seen(poller)
+        until(lambda: len(seen.of("pump-1")) > 50)
+        assert seen.of("pump-3") == []
 
 
 def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
@@ -117,6 +127,18 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
         assert bus.respondent(again) is respondent  # which knows of answers that may come late
+
+
+def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: str) -> None:
+    with Bus(port) as bus:
+        gone = bus.attach(Toy, address=9)
+        with pytest.raises(NoReply):
+            bus.read(gone, CURRENT)
+        due_ns = bus.respondent(gone).late_until_ns
+        assert due_ns > 0
+        bus.detach(gone)
+        new = bus.attach(InvtCHE, address=9)
+        assert bus.respondent(new).late_until_ns == due_ns
 
 
 def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.MonkeyPatch) -> None:

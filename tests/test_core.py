@@ -5,15 +5,17 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import resource
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import pytest
 from frames import words
+from lines import until
 from multidrop._core import ffi
 
 from multidrop.core import (
@@ -398,6 +400,68 @@ def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
     assert heard == [4]
 
 
+def written(address: int, start: int, *, turnaround: float = 1e-4, insists: bool = False) -> Exchange:
+    return Exchange(
+        Framing.RTU,
+        Message(address, 6, start, data=bytes(2)),
+        Respondent(least_timeout=30.0, most_timeout=30.0),
+        baudrate=115_200,
+        format="8N1",
+        character=1e-6,
+        silence=1e-4,
+        turnaround=turnaround,
+        insists=insists,
+    )
+
+
+def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: Drive) -> None:
+    fd = drive(lambda request: echo_start(request) if request.address else b"")
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
+        found = port.carry_out(read(3), expires_ns=now_ns() + 50_000_000)
+        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+
+
+def test_a_stop_goes_ahead_of_all_but_what_came_before_it_for_its_own_drive(drive: Drive) -> None:
+    """Overtaken, a start would undo it."""
+    heard: list[int] = []
+    go_on = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        if len(heard) == 1:
+            go_on.wait(30)
+        return build_reply(Framing.RTU, request) if request.function == 6 else echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        ahead = [read(0, timeout=30), read(1, timeout=30), written(2, 50), read(2, timeout=30)]
+        wanted = [*ahead, written(3, 51), written(2, 99, insists=True)]
+        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+        for thread in threads:
+            thread.start()
+            time.sleep(0.05)  # those that wait come in this order
+        go_on.set()
+        for thread in threads:
+            thread.join(30)
+    assert heard == [0, 1, 50, 99, 2, 51]
+
+
+def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
+    first = Port(drive(echo_start), NO_SETTINGS)
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        first.close()
+        port.submit([read(1)], [now_ns() + 20_000_000])
+        until(lambda: not port.pending)
+
+
+def test_what_is_queued_lives_until_it_was_carried_out(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
+        gc.collect()
+        assert rows.of("value", 2) == [1, 2]
+
+
 def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
     with closing(Port(fd, NO_SETTINGS)) as port:
@@ -549,6 +613,60 @@ def test_ports_come_and_go(drive: Drive) -> None:
 
     before = come_and_go(0)  # the engine has come by now, and stays
     assert {come_and_go(start) for start in range(1, 1000)} == {before}
+
+
+@pytest.fixture
+def descriptors() -> Iterator[int]:
+    """As many as the system lets a process have."""
+    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    yield most
+    resource.setrlimit(resource.RLIMIT_NOFILE, (least, most))
+
+
+def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
+    """Twice over; each is closed while the others are still under way."""
+    if descriptors < 2500:
+        pytest.skip(f"a process may have no more than {descriptors} descriptors here")
+
+    def come_and_go() -> int:
+        with ExitStack() as stack:
+            lines: list[tuple[Port, Rows, Exchange, socket.socket]] = []
+            for number in range(1024):
+                near, far = map(stack.enter_context, socket.socketpair())
+                near.setblocking(False)
+                port = stack.enter_context(closing(Port(near.fileno(), NO_SETTINGS, room=4)))
+                lines.append((port, Rows(port), read(number, timeout=60.0), far))
+                port.submit([lines[-1][2]], [0])
+            for number, (port, rows, _, far) in enumerate(lines):
+                _, request = parse_request(Framing.RTU, far.recv(64))
+                assert request is not None
+                far.send(echo_start(request))
+                assert rows.of("value", 1) == [number]
+                port.close()
+        return len(list(Path("/dev/fd").iterdir()))
+
+    assert come_and_go() == come_and_go()
+
+
+def test_memory_is_flat_over_many_exchanges(drive: Drive) -> None:
+    asked, inbox = read(0), Inbox(chunk_rows=1000, most_chunks=4)
+    asked.c.silence_ns = 1000
+
+    def resident_after(exchanges: int) -> int:
+        """Bytes."""
+        while exchanges > 0:
+            time.sleep(0.01)
+            while columns := inbox.take():
+                exchanges -= len(columns)
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        port.report_to(inbox, 0)
+        port.repeat([asked])
+        before = resident_after(10_000)
+        assert resident_after(50_000) - before < 1_000_000  # that is 20 bytes each
 
 
 @pytest.mark.parametrize("result", list(Result))

@@ -298,6 +298,13 @@ def test_the_last_address_and_the_one_behind_it() -> None:
         build_reply(RTU, Message(248, 0x03, data=words(7)))
 
 
+@pytest.mark.parametrize("function", [0x00, 0x07, 0x2B, 0xFF])
+def test_nobody_replies_to_what_is_no_function(function: int) -> None:
+    reply = Message(1, function, data=words(7))
+    with pytest.raises(ValueError, match=re.escape(f"no rtu frame can say {reply}")):
+        build_reply(RTU, reply)
+
+
 def test_request_with_too_much_data() -> None:
     with pytest.raises(ValueError, match="251 data bytes do not fit a frame: 250 at most"):
         build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))

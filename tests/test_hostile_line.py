@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,6 +28,8 @@ from multidrop.drives import YD1000, DelixiNative
 from multidrop.plant import PolledDrive
 from multidrop.sim import EncodedDrive, Faults, simulated
 from multidrop.sim.faults import RATES
+
+pytestmark = pytest.mark.story
 
 S = 1_000_000_000
 REGISTERS = 5  # of each drive
@@ -134,7 +136,7 @@ class Story:
 
         It takes until the port is opened again, and silent drives have rested for their share of the line.
         """
-        cost = sum(drive.response_timeout for drive in self.drives)
+        cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
         longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
         ended = self.world.now
@@ -195,7 +197,7 @@ def resident_kb() -> int:
 def test_a_fault_and_its_end(name: str, kind: str) -> None:
     number = LINES[name]
     if VARIANTS[number][1] in NOT_TOLD.get(kind, ()):
-        return
+        pytest.skip("no client can tell this yet")
     before = descriptors(), threading.active_count()
     story = Story(of_one_variant(number))
     story.tell(KINDS[kind])
@@ -234,15 +236,26 @@ def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
     assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
 
 
+def lines_that_tell(kind: str) -> Iterator[list[Drive]]:
+    """Each variant alone, and all on one line."""
+    numbers = [it for it in LINES.values() if VARIANTS[it][1] not in NOT_TOLD.get(kind, ())]
+    yield from map(of_one_variant, numbers)
+    if len(numbers) == len(LINES):
+        yield of_all_variants()
+
+
 def test_nothing_grows_for_hours() -> None:
-    """All families on one line; with all kinds of faults in turn, where there are hours."""
+    """All families on one line; where there are hours, each alone too, with all kinds of faults in turn."""
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))
     end = time.monotonic() + 3600 * hours
-    kinds = [it for it in KINDS if it not in NOT_TOLD] if hours else ["all"]
     seen: list[tuple[int, int, int]] = []
     while len(seen) < 3 or time.monotonic() < end:
-        for kind in kinds:
-            Story(of_all_variants(), seed=len(seen)).tell(KINDS[kind])
+        if hours:
+            for kind in KINDS:
+                for drives in lines_that_tell(kind):
+                    Story(drives, seed=len(seen)).tell(KINDS[kind])
+        else:
+            Story(of_all_variants(), seed=len(seen)).tell(KINDS["all"])
         seen.append((resident_kb(), descriptors(), threading.active_count()))
         print(f"pass {len(seen)}: %d kB, %d descriptors, %d threads" % seen[-1], flush=True)
     assert seen[-1][0] - seen[0][0] <= MOST_GROWTH_KB

@@ -136,6 +136,15 @@ def test_flooded_line_is_given_up_even_when_time_stands_still(line: LineDriver) 
     raise AssertionError("it still looks at the flood")
 
 
+def test_a_flood_while_nothing_is_asked_is_no_part_of_any_exchange(line: LineDriver) -> None:
+    """Also before the first one: there is nobody yet to be told of it."""
+    for value in range(3):
+        line.receive(b"\xff" * 4000)
+        ask(line)
+        answer(line, reply_of(value))
+        assert (line.completion.reply.data, line.completion.skipped) == (words(value), 0)
+
+
 def test_request_counts_to_its_last_bit(line: LineDriver) -> None:
     """A reply that a fast peer gives at once does not shorten the silence after the request's own time."""
     ask(line)
@@ -514,12 +523,29 @@ def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int,
 
 
 def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
+    """Not at once: one echo may have been lost."""
     teach_echo(line)
     ask(line)
     answer(line, reply_of(1))
     ask(line, WRITE)
     answer(line, confirmation())
+    assert line.completion.result == Result.MAYBE_ECHO
+    line.now += 10 * TIMEOUT
+    ask(line)
+    answer(line, reply_of(1))
+    ask(line, WRITE)
+    answer(line, confirmation())
     assert (line.completion.result, line.completion.skipped) == (8, 0)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+def test_the_beginning_of_an_echo_is_no_reply(line: LineDriver, piece: int) -> None:
+    """Seven of its eight bytes are a good reply with one register."""
+    echo = rtu("06 03 02 11 00 01")
+    assert echo[:7] == rtu("06 03 02 11 00")
+    ask(line, Message(6, 3, 0x0211, 1))
+    answer(line, echo + reply_of(7, address=6), piece)
+    assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
 
 
 def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:

@@ -11,11 +11,13 @@ from types import SimpleNamespace
 
 import pytest
 from lines import line, plant, polled, rows_of, until
-from serial import rfc2217
+from serial import Serial, rfc2217
 from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
-from multidrop.errors import LineError
+from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
+from multidrop.core import set_settings
+from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.line import Line
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
@@ -68,6 +70,28 @@ def test_a_pty_at_settings_that_it_cannot_have() -> None:
         for _ in range(2):
             with Bus(sim.wires[0].path, format="8E1") as bus:
                 read_and_write(bus)
+
+
+def test_a_port_is_told_to_hold_no_bytes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As USB adapters do for 16 ms."""
+    told: list[bool] = []
+    monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:
+        read_and_write(bus)
+        bus.line.reopen()
+    assert told == [True, True]
+
+
+@pytest.mark.parametrize("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
+def test_a_port_that_does_hold_bytes_back_is_opened(
+    monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
+) -> None:
+    def refuse(port: Serial, wanted: bool) -> None:
+        raise refusal
+
+    monkeypatch.setattr(Serial, "set_low_latency_mode", refuse)
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:
+        read_and_write(bus)
 
 
 class SerialServer:
@@ -162,6 +186,7 @@ def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServ
         ("rfc2217://:4001", "it needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
         ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
         ("sokcet://127.0.0.1:4001", "invalid URL, protocol 'sokcet' not known"),
+        ("socket://[fe80::1%nowhere]:4001", "Name or service not known"),
         ("spy://{tmp}/absent", "there is no such port"),
     ],
 )
@@ -230,6 +255,19 @@ def vanishing_socket() -> tuple[str, Callable[[], None]]:
     return path, hang_up
 
 
+def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None:
+    master, slave = os.openpty()
+    with Bus(os.ttyname(slave)) as bus:
+        toy = bus.attach(Toy(1))
+        for _ in range(2):
+            for _ in range(4):
+                os.write(master, b"\xff" * 1000)
+            with pytest.raises(NoReply):
+                bus.read(toy, toy.output_current)
+    os.close(slave)
+    os.close(master)
+
+
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
 def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Callable[[], None]]]) -> None:
     path, hang_up = make()
@@ -249,14 +287,78 @@ def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Calla
             bus.read(toy, toy.output_current)
 
 
+@pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
+def test_a_write_on_a_port_that_is_lost_may_have_happened(
+    make: Callable[[], tuple[str, Callable[[], None]]],
+) -> None:
+    path, hang_up = make()
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    with Bus(path) as bus:
+        toy = bus.attach(PatientToy, 1)
+        with pytest.raises(Unconfirmed, match=r"it is not known whether .* took effect: the port was lost"):
+            bus.raw(toy, 6, 0x15, bytes(2))
+        thread.join()
+        with pytest.raises(LineError):  # and this has not
+            bus.raw(toy, 6, 0x15, bytes(2))
+
+
 def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     with Simulator([wire(str(link))]), Bus(str(link)) as bus:
         read_and_write(bus)
+        first = link.readlink()
+        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # its number is not given again so long
     with Simulator([wire(str(link))]):
+        assert link.readlink() != first
         bus.line.reopen()
         assert bus.read(bus.drives[0], Toy.output_current) == 3.25
         bus.close()
+    os.close(held)
+
+
+def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None:
+    with (
+        Simulator([wire()]) as sim,
+        Bus(sim.wires[0].path) as bus,
+        CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as writer,
+        Tapped({"hall-1": bus}, writer) as tapped,
+    ):
+        toy = bus.attach(Toy, 1)
+        tapped.collect()
+        bus.line.reopen()
+        assert bus.read(toy, toy.output_current) == 3.25
+    with Capture(tmp_path / "a.pcapng") as capture:
+        assert [(row.register, row.value) for rows in Decoding(capture) for row in rows] == [
+            ("holding_register_2", 325)
+        ]
+
+
+def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
+    """spy:// is pyserial's own way to watch a port; the drive hears nothing at another baud rate."""
+    with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
+        path = sim.wires[0].path
+        with Bus(f"spy://{path}", baudrate=19200) as bus:
+            toy = bus.attach(Toy, 1)
+            assert bus.read(toy, toy.output_current) == 0
+            with Path(path).open("rb", buffering=0) as port:
+                set_settings(port.fileno(), 9600, "8N1")
+            bus.line.reopen()
+            assert bus.read(toy, toy.output_current) == 0
+
+
+def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
+    master, slave = os.openpty()
+    port = f"spy://{os.ttyname(slave)}"
+    with Bus(port) as bus:
+        toy = bus.attach(Toy, 1)
+        os.close(slave)
+        os.close(master)
+        with pytest.raises(LineError) as caught:
+            bus.read(toy, toy.output_current)
+    assert caught.value.port == port
+    assert "Input/output error" in caught.value.reason
+    assert "\n" not in str(caught.value)
 
 
 def test_a_closed_bus_says_so() -> None:

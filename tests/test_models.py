@@ -77,6 +77,12 @@ def test_what_a_file_lacks_is_said(fan: Path) -> None:
         assert refused(f"fan.py:{name}", here) == expected
 
 
+def test_a_link_to_what_is_no_python_file_is_said(tmp_path: Path) -> None:
+    (tmp_path / "fan.txt").write_text(FAN)
+    (tmp_path / "fan.py").symlink_to("fan.txt")
+    assert refused("fan.py:Fan", tmp_path) == f"{tmp_path}/fan.txt cannot be loaded as Python"
+
+
 @pytest.mark.parametrize(
     ("source", "ending"),
     [

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import os
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
@@ -17,6 +18,7 @@ import checksums
 import pytest
 from lines import Faulty, line, plant, polled, proofs, rows_of, until
 from toy import Toy
+from worlds import World, WorldWire
 
 from multidrop import poller as poller_module
 from multidrop.batch import Row
@@ -24,7 +26,7 @@ from multidrop.core import Inbox, Result
 from multidrop.errors import LineError, Unconfirmed
 from multidrop.plant import Line, PolledDrive
 from multidrop.poller import Poller
-from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
+from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
 
 # What a machine that has much else to do may add to what a test is about.
 HOST_LATE = {
@@ -71,6 +73,7 @@ class Polling:
     def __init__(self, *lines: Line) -> None:
         self.poller = Poller(plant(*lines))
         self.rows: list[Row] = []
+        self.began_ns = time.monotonic_ns()
 
     def __enter__(self) -> Polling:
         self.poller.__enter__()
@@ -109,6 +112,8 @@ class Polling:
                 seen = Counter(row.status for row in rows if row.value is None)
                 assert drive["misses"] == seen
         assert told == misses
+        assert self.began_ns <= min(row.monotonic_ns for row in self.rows)
+        assert max(row.monotonic_ns for row in self.rows) <= time.monotonic_ns()
 
 
 def drive(address: int = 1, name: str = "pump-1") -> Quick:
@@ -166,6 +171,21 @@ def test_neither_starves_the_other(port: str) -> None:
     with Polling(line(port, PolledDrive(drive(), polls))) as polling:
         until(lambda: {row.register for row in polling.look() if row.value is not None} == NAMES)
         polling.until("ok", 100)
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [[{"baudrate": 9600}, {"baudrate": 19_200}], [{"silence": None}, {"silence": 0.01}]],
+    ids=["two baud rates", "two silences"],
+)
+def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) -> None:
+    drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
+    wire = WorldWire([simulated(it) for it in drives], Faults())
+    with World(wire, [polled(it, [Toy.fault]) for it in drives]) as world:
+        rows = world.run(1)[: len(drives)]
+    asked = [int(row.drive.removeprefix("drive-")) for row in rows]
+    assert sorted(asked) == [1, 2, 3, 4, 5, 6]
+    assert len(list(itertools.groupby(asked, lambda at: at % 2))) == 2
 
 
 # ---- rows ----
@@ -348,16 +368,21 @@ def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
 def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     asked = [polled(drive(), ONE), polled(drive(2, "pump-2"), ONE, 0.05)]
+    targets: set[Path] = set()
     with ExitStack() as stack:
         for number in range(2):
             wires = [Wire([simulated(it.drive) for it in asked], port=str(link), unpaced=True)]
             with Simulator(wires):
+                targets.add(link.readlink())
+                # A pty's number is not given again while anybody holds it.
+                stack.callback(os.close, os.open(link, os.O_RDONLY | os.O_NOCTTY))
                 if number == 0:
                     polling = stack.enter_context(Polling(line(str(link), *asked)))
                 for it in asked:
                     polling.until("ok", 3, it.drive.name)
             for it in asked:
                 polling.until("port lost", 2, it.drive.name)
+    assert len(targets) == 2
     assert polling.statuses().keys() <= {"ok", "port lost"} | HOST_LATE
     polling.check_summary()
 

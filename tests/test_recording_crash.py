@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -433,3 +434,15 @@ def suppress_mistake_that_names(path: Path) -> Iterator[None]:
         return
     assert str(path) in sentence
     assert "\n" not in sentence
+
+
+@pytest.mark.parametrize("rows", [-77, -(1 << 59), 1 << 59])
+def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
+    """What is reckoned with their number, in bytes, would wrap around."""
+    path = tmp_path / "run.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(77))
+    damaged = path.read_bytes().replace(struct.pack("<q", 77), struct.pack("<q", rows))
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match=f"is damaged after row 0: there is a batch of {rows} rows"):
+        list(open_reader(path))

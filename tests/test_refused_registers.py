@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+from lines import polled
 from toy import PatientToy, Toy
+from worlds import World, WorldWire
 
+from multidrop import polled_line
 from multidrop.plant import Line, Plant, Polled, PolledDrive
 from multidrop.poller import Poller
-from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.sim import Faults, SimulatedDrive, Simulator, Wire
 from multidrop.sim.dialect import Reason, Refusal
 
 POLLED = ("output_frequency", "output_current", "mystery", "fault", "status")
@@ -46,3 +50,36 @@ def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     assert told["set_aside"] == ["pump-1.mystery"]
     queued_ahead = 256 * len(POLLED)
     assert refused <= 2 * queued_ahead  # it is no longer asked for, but for what was queued
+
+
+class Moody(SimulatedDrive):
+    """Answers every read with an exception, as long as it has one."""
+
+    says: Reason | None = None
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if self.says:
+            raise Refusal(self.says)
+        return super().read(function, start, count)
+
+
+@pytest.mark.parametrize(
+    ("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"]
+)
+def test_what_is_read_after_all_is_polled_as_before(
+    says: Reason, is_set_aside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(polled_line, "SET_ASIDE_NS", 1_000_000_000)
+    drive, moody = Toy(1, name="pump-1"), Moody(Toy(1))
+    with World(WorldWire([moody], Faults()), [polled(drive, [Toy.output_current, Toy.fault])]) as world:
+        before = len(world.run(1.0))
+        moody.says = says
+        world.run(2.0)
+        line = world.poller.summary()["lines"]["line"]
+        assert bool(line["set_aside"]) is is_set_aside
+        moody.says = None
+        world.run(2.0)
+        rows = world.run(1.0)
+        assert world.poller.summary()["lines"]["line"]["set_aside"] == []
+    assert {row.status for row in rows} == {"ok"}
+    assert len(rows) > before / 4

@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from halls import Hall, is_write, one
+from halls import EXCHANGE_TIME, Hall, is_write, one
+from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
+from toy import Toy
 
 from multidrop.audit import read_audit
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
-from multidrop.drive import Condition, Direction, Drive, State
+from multidrop.drive import Condition, Direction, Drive, Script, State, read, verb, wait, write
 from multidrop.drives import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.invt_che import Control, parameter
 from multidrop.errors import (
@@ -31,7 +33,7 @@ from multidrop.exchanges import READ_ATTEMPTS
 from multidrop.ledger import Ledger
 from multidrop.motion import ramp, start_staggered
 from multidrop.outcome import Effect
-from multidrop.register import COIL, Kept, setting
+from multidrop.register import COIL, Kept, reading, setting
 from multidrop.sim import PoweredDrive, simulated
 from multidrop.stopping import Seen
 
@@ -238,6 +240,7 @@ def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None
     hall.loses = lambda request: request.function == 6
     outcome = hall.bus.try_write(drive, drive.frequency, 25.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, None)
+    assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
     assert hall.bus.try_write(drive, drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
@@ -580,10 +583,47 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     assert len(hall.written) == 1
 
 
+def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
+    hall = Hall(monkeypatch, *sims)
+    for it in sims:
+        hall.bus.introduce(hall.attach(it.drive))
+    hall.deafens = lambda request: request.address == 2
+    found = hall.bus.broadcast(InvtCHE.control, Control.STOP)
+    assert hall.written == ["00 06 10 00 00 05 4C D8"]
+    (first, second) = found.values()
+    assert isinstance(first, State)
+    assert first.condition is Condition.STOPPED
+    assert isinstance(second, NoReply)
+    assert second.drive == "invt-che@2"
+
+
 def all_stopped(hall: Hall, sims: list[Any]) -> bool:
     for it in sims:
         it.pass_time(hall.seconds)
     return not any(it.motor.energised for it in sims)
+
+
+def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 ms at least, by the serial-line guide (V1.02, 2.4.1)."""
+    hall, _, _ = one(monkeypatch, InvtCHE(1))
+    made: list[Exchange] = []
+
+    def keep(exchange: Exchange, **times: int) -> Completion:
+        made.append(exchange)
+        return Hall.carry_out(hall, exchange, **times)
+
+    monkeypatch.setattr(hall, "carry_out", keep)
+    hall.bus.broadcast(InvtCHE.control, Control.STOP)
+    stop, look = made[-2:]
+    assert (stop.request.address, look.request.address) == (0, 1)
+    line = LineDriver()
+    line.begin(stop)
+    line.wait_until_write()
+    over = line.now + 8 * stop.c.character_ns
+    line.begin(look)
+    line.wait_until_write()
+    assert line.now == over + 100 * MS
 
 
 def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -599,6 +639,27 @@ def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pyt
     assert hall.frames[begun][1] == "00 06 10 00 00 05 4C D8"
     assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
     assert all(it.seconds < 11 for it in stopped.values())  # one ramp, not three after another
+    assert all_stopped(hall, sims)
+
+
+def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The port fails with it, and comes back."""
+    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    hall = Hall(monkeypatch, *sims)
+    for it in sims:
+        drive = hall.attach(it.drive)
+        drive.set_frequency(20)
+        drive.start()
+
+    def fails(request: Message) -> bytes | None:
+        if request.address == 0:
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    hall.answers = fails
+    stopped = hall.bus.stop_all()
+    assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
+    assert {frame[:17] for frame in hall.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
     assert all_stopped(hall, sims)
 
 
@@ -686,6 +747,14 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
     assert [int(it[12:17].replace(" ", ""), 16) for it in hall.written] == [200, 400]  # 0.01 % of 50 Hz
+
+
+def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = Hall(monkeypatch)
+    toy = hall.attach(Toy(1, name="toy"))
+    with pytest.raises(Refused, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"):
+        ramp(toy, 20.0, rate=5.0)
+    assert hall.frames == []
 
 
 def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -843,6 +912,57 @@ def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch)
     drive = hall.attach(Mine(1))
     with pytest.raises(NoReply):
         hall.bus.write(drive, Mine.speed, 10)
+    assert hall.written == []
+
+
+def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sleepy(Toy):
+        """It says who it is a while after it was asked for the first time."""
+
+        @verb
+        def identify(self) -> Script[None]:
+            yield from read(Toy.status)
+            yield from wait(3.0)
+            yield from read(Toy.fault)
+
+    hall = Hall(monkeypatch, simulated(Sleepy(1)))
+    begun = hall.seconds
+    hall.bus.introduce(hall.attach(Sleepy(1)))
+    assert [(it.start, it.count) for it, _ in hall.frames] == [(5, 1), (4, 1)]
+    assert hall.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
+
+
+def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Meddler(Toy):
+        """Its author took a write for a look."""
+
+        @verb
+        def identify(self) -> Script[None]:
+            yield from write(Toy.frequency, 10.0)
+
+    hall = Hall(monkeypatch, simulated(Meddler(1)))
+    drive = hall.attach(Meddler(1, name="meddler"))
+    with pytest.raises(Refused, match=r"^meddler: a look at its identity must not write$"):
+        drive.set_frequency(20.0)
+    assert hall.frames == []
+
+
+def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Mute(Drive):
+        """A family that has no state."""
+
+        speed = reading(1, "rpm")
+        ratio = setting(2, kept=Kept.RAM, while_running=False)
+
+    hall = Hall(monkeypatch, simulated(Mute(1)))
+    drive = hall.attach(Mute(1, name="mute"))
+    with pytest.raises(Refused) as refusal:
+        hall.bus.write(drive, Mute.ratio, 3)
+    assert str(refusal.value) == (
+        "ratio of mute is not written: it changes only while the motor stands, which the family cannot say"
+    )
     assert hall.written == []
 
 

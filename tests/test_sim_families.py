@@ -376,6 +376,14 @@ def test_ibd_its_outputs_say_what_the_motor_does_if_they_are_programmed(ibd: Ben
     assert ibd.ask(3, 22) == [0x1800]
 
 
+def test_ibd_turns_the_other_way_without_being_told_to_run(ibd: Bench) -> None:
+    assert ibd.write(0x2001, 2000) == 0
+    for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):  # run reverse; forward; the other way
+        assert ibd.write(0x2000, bits) == 0
+        assert ibd.motor.direction == direction
+        assert ibd.motor.energised
+
+
 def test_ibd_clamps_silently(ibd: Bench) -> None:
     assert ibd.write(107, 60_000) == 0
     assert ibd.ask(3, 107) == [36_000]

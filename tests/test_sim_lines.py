@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -120,6 +121,36 @@ def test_the_next_tcp_client_is_served_when_the_first_has_gone() -> None:
             os.write(second, build_request(Framing.RTU, READ))
             assert receive(second, 1, patience=0.05) == b""
         assert parse_reply(Framing.RTU, receive(second, 9), READ)[0] == 9
+
+
+def test_the_next_tcp_client_is_served_when_the_first_has_broken_off() -> None:
+    """As one does whose process dies: what it was sent is thrown away, and the connection reset."""
+    with Simulator([wire(port="socket://127.0.0.1:0")]) as sim:
+        path = sim.wires[0].path
+        host, _, port = path.removeprefix("socket://").partition(":")
+        with socket.create_connection((host, int(port))) as first:
+            exchange(first.fileno(), READ)
+            first.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with opened(path) as second:
+            assert exchange(second, READ).data == expected()
+
+
+class Broken(Wire):
+    """Its test made a mistake."""
+
+    def distort(self, reply: bytes) -> bytes:
+        raise ZeroDivisionError("a mistake of the test's own")
+
+
+def ask_in_vain(broken: Wire) -> None:
+    with Simulator([broken]) as sim, opened(broken.path) as fd:
+        os.write(fd, build_request(Framing.RTU, READ))
+        sim._thread.join(PATIENCE)
+
+
+def test_what_fails_in_the_simulator_s_thread_is_raised_where_it_is_left() -> None:
+    with pytest.raises(ZeroDivisionError, match="a mistake of the test's own"):
+        ask_in_vain(Broken([EncodedDrive(InvtCHE(1))], unpaced=True))
 
 
 def test_two_framings_answer_on_one_line() -> None:

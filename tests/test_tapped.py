@@ -23,7 +23,8 @@ from multidrop.batch import Row
 from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped, flight
 from multidrop.capture.pcapng import WRAPPINGS
 from multidrop.capture.trouble import Watch
-from multidrop.core import Exchange, Framing, Message, Respondent, Result, Splitter
+from multidrop.cli.tapping import tapping_text
+from multidrop.core import Exchange, Framing, Message, Respondent, Result, Splitter, Tap
 from multidrop.core import Wire as Format
 from multidrop.drives import InnovertIBD
 from multidrop.plant import PolledDrive
@@ -196,6 +197,42 @@ def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Pa
     failed, noise = tshark(tmp_path / "a.pcapng")
     assert (failed["mbrtu.unit_id"], failed["mbrtu.crc16.status"]) == ("1", "0")
     assert noise["data.data"] == frame.hex()
+
+
+def test_what_is_not_collected_in_time_is_counted() -> None:
+    """Noise that goes on for as long as there is room, and longer."""
+    driver, tap, told = LineDriver(), Tap(), 0
+    respondent = Respondent(least_timeout=0.02, most_timeout=0.2)
+    driver.begin(
+        Exchange(Framing.RTU, ASK, respondent, baudrate=9600, format="8N1", character=1e-3, silence=4e-3)
+    )
+    driver._line.tap = tap.c
+    while not tap.lost:
+        driver.receive(b"\xff" * 4000)
+        told += 4000
+    assert tap.lost == 4000
+    packets = b"".join(tap.take(WRAPPINGS, 0, 0))
+    assert packets.count(b"\xff" * 4000) == told // 4000 - 1
+    assert list(tap.take(WRAPPINGS, 0, 0)) == []
+    assert tapping_text({"untapped_bytes": tap.lost}) == [
+        "4000 bytes were not captured: this machine was too slow"
+    ]
+
+
+def test_a_capture_has_what_comes_behind_a_reply_amid_much_noise() -> None:
+    """More than the line keeps: noise, the reply, and noise again in one piece with that."""
+    driver, tap = LineDriver(), Tap()
+    respondent = Respondent(least_timeout=0.02, most_timeout=0.2)
+    driver.begin(
+        Exchange(Framing.RTU, ASK, respondent, baudrate=9600, format="8N1", character=1e-3, silence=4e-3)
+    )
+    driver._line.tap = tap.c
+    driver.wait_until_write()
+    driver.receive(b"\xff" * 950)
+    driver.receive(GOOD + b"\xfe" * 400)
+    assert driver.completion.raw == GOOD
+    packets = b"".join(tap.take(WRAPPINGS, 0, 0))
+    assert (packets.count(b"\xff"), packets.count(b"\xfe")) == (950, 400)
 
 
 # ---- the flight recorder ----

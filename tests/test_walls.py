@@ -50,6 +50,11 @@ FLOORS = [
 ]
 
 
+def test_public_names_are_told_before_they_are_used() -> None:
+    """Each is loaded when it is asked for the first time."""
+    assert set(multidrop.__all__) <= set(dir(multidrop))
+
+
 def imports(path: Path) -> set[str]:
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):

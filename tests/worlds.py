@@ -211,8 +211,6 @@ class WorldPort:
         assert exchange.block
         lib.md_inbox_add(self._inbox.c, exchange.block.c, found)
         is_refusal = found.result > 0 and found.reply.exception
-        if found.result > 0:
-            exchange.block.c.refusals = exchange.block.c.refusals + 1 if is_refusal else 0
         if is_refusal or exchange.respondent.failures != self._failures:
             self._call()
 

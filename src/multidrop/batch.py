@@ -9,11 +9,13 @@ needed here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.D
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
-from multidrop.core import STATUSES, Columns, spell
+from multidrop.core import STATUSES, Columns, Names, spell
+
+_STATUSES = Names(STATUSES)
 
 
 class Row(NamedTuple):
@@ -56,10 +58,10 @@ class Rows(ABC):
 class Batch(Rows):
     """Rows that the core made, and the names whose codes they hold."""
 
-    def __init__(self, columns: Columns, drives: Sequence[str], registers: Sequence[str]) -> None:
+    def __init__(self, columns: Columns, drives: Names, registers: Names) -> None:
         self._columns = columns
-        self._drives = tuple(drives)
-        self._registers = tuple(registers)
+        self._drives = drives
+        self._registers = registers
 
     def __len__(self) -> int:
         return len(self._columns)
@@ -87,7 +89,7 @@ class Batch(Rows):
             (None, *spell(column("drive"), self._drives)),
             (None, *spell(column("reg"), self._registers)),
             (valid, column("value")),
-            (None, *spell(column("status"), STATUSES)),
+            (None, *spell(column("status"), _STATUSES)),
         )
 
 

@@ -171,6 +171,7 @@ class Drive:
         6: "busy",
     }
     damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and those that say the drive will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
@@ -285,9 +286,18 @@ class Drive:
         """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
         return None
 
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in self.registers:
+            raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+        super().__setattr__(name, value)
+
     def exception(self, code: int) -> str:
         """The meaning of an exception code in this family."""
         return self.exceptions.get(code, "a code that the document does not explain")
+
+    def is_passing(self, code: int) -> bool:
+        """Whether this exception says nothing against what was asked: it came damaged, or at a bad time."""
+        return code in self.exceptions and code in self.damaged | self.later
 
     def needed_silence(self) -> float:
         """Silence in s that this drive demands before a request and after its reply."""

@@ -17,6 +17,7 @@ class LineError(BusError, OSError):
         super().__init__(f"{port}: {reason}")
         self.port = port
         self.reason = reason
+        self.is_sent = False  # a request had begun to leave
 
 
 class NoReply(BusError, TimeoutError):

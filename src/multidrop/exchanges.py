@@ -75,8 +75,12 @@ class Exchanges:
         least = min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay))
         key = drive.address, least, drive.response_timeout
         made = Respondent(least_timeout=least, most_timeout=drive.response_timeout)
-        # One that comes back may still owe the answer to what it was asked before it left.
-        self._respondents[drive] = self._known.setdefault(key, made)
+        # One that comes back may still owe the answer to what it was asked before it left, and one of
+        # another family at its address would get that.
+        respondent = self._respondents[drive] = self._known.setdefault(key, made)
+        for other, known in self._known.items():
+            if other[0] == drive.address and known.late_until_ns > respondent.late_until_ns:
+                respondent.wait_until(known.late_until_ns)
 
     def remove(self, drive: Drive) -> None:
         del self._respondents[drive]

@@ -217,13 +217,14 @@ class Line:
             self._waiting += 1
         try:
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
+            waits_in_vain = found.result == Result.LATE_ANSWER_DUE and core.lost
         finally:
             with self._lock:
                 self._waiting -= 1
                 self._left.notify_all()
-        waits_in_vain = found.result == Result.LATE_ANSWER_DUE and core.lost
         failure = self._failure(Result.LINE_LOST if waits_in_vain else found.result, found.error)
         if failure:
+            failure.is_sent = found.sent_ns > 0
             raise failure
         return found
 

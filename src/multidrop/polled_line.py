@@ -15,7 +15,17 @@ from typing import Any
 
 from multidrop import core, plant
 from multidrop.bus import Bus
-from multidrop.core import EXCEPTION_STATUS, STATUSES, Exchange, Field, Inbox, Port, Respondent, Result
+from multidrop.core import (
+    EXCEPTION_STATUS,
+    STATUSES,
+    Exchange,
+    Field,
+    Inbox,
+    Names,
+    Port,
+    Respondent,
+    Result,
+)
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.exchanges import reading
@@ -23,7 +33,8 @@ from multidrop.line import now_ns
 from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
 from multidrop.plant import PolledDrive
 from multidrop.register import Register
-from multidrop.schedule import Job, Schedule
+from multidrop.rules import check_own
+from multidrop.schedule import Asking, Job, Schedule
 from multidrop.statistics import Statistics
 
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
@@ -34,20 +45,20 @@ REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 
 
 class Codes:
-    """The names that rows are made of, each with its number."""
+    """The names that rows are made of."""
 
     def __init__(self) -> None:
-        self.drives: dict[str, int] = {}
-        self.registers: dict[str, int] = {}
+        self.drives = Names()
+        self.registers = Names()
 
     def fields(self, drive: Drive, block: Block) -> core.Block:
         return core.Block(
-            self.drives.setdefault(drive.name, len(self.drives)),
+            self.drives.number(drive.name),
             [
                 Field(
                     block.offset(register),
                     register.wire,
-                    self.registers.setdefault(register.name, len(self.registers)),
+                    self.registers.number(register.name),
                     register.scale.numerator,
                     register.scale.denominator,
                 )
@@ -80,7 +91,7 @@ class PolledLine:
         self.started_ns = now_ns()
         self._ended_ns: int | None = None  # nothing is due any more
         self._over_ns: int | None = None  # nor under way
-        self.set_aside: list[Asked] = []  # a single register that the drive refuses again and again
+        self.set_aside: dict[Asked, Asked] = {}  # instead of a single register that is refused: rarely
         self._number = number
         self._inbox = inbox
         self._codes = codes
@@ -98,7 +109,7 @@ class PolledLine:
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         self._cycle: list[Asked] = []  # what the core repeats
-        self._queued: deque[tuple[Asked, int]] = deque()  # what the core has not carried out yet
+        self._queued: deque[Asking[Asked]] = deque()  # what the core has not carried out yet
         try:
             for polled in declared.drives:
                 self.add(polled)
@@ -114,7 +125,8 @@ class PolledLine:
             except BaseException:
                 self.bus.detach(drive)
                 raise
-            self._asked_of.append((drive, self.bus.respondent(drive)))
+            if jobs:
+                self._asked_of.append((drive, self.bus.respondent(drive)))
             for job in jobs if self._is_started else []:
                 self.schedule.add(job, now_ns())
         self._inbox.call(self._number)
@@ -127,6 +139,7 @@ class PolledLine:
             return self._declared[polled]
         rates: dict[float | None, list[Register[Any]]] = {}
         for poll in polled.polls:
+            check_own(drive, poll.register)
             rates.setdefault(poll.every, []).append(poll.register)
         jobs: list[Asked] = []
         for every, registers in rates.items():
@@ -145,7 +158,7 @@ class PolledLine:
             for job in jobs:
                 self.schedule.remove(job)
             self.schedule.forget(drive.address)
-            self.set_aside = [it for it in self.set_aside if it.owner is not drive]
+            self.set_aside = {it: whole for it, whole in self.set_aside.items() if it.owner is not drive}
             self._asked_of = [it for it in self._asked_of if it[0] is not drive]
         self.bus.detach(drive)
         self._inbox.call(self._number)
@@ -205,14 +218,15 @@ class PolledLine:
     def _forget_done(self, port: Port) -> None:
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
-            self._ahead_ns -= self._queued.popleft()[0].duration_ns
+            self._ahead_ns -= self._queued.popleft().job.duration_ns
         self._done = done
 
     def _lose(self, port: Port, now: int) -> None:
         """The port failed: what was queued on it is missed."""
         port.stop()
         self._forget_done(port)
-        self._miss(list(self._queued), Result.LINE_LOST)
+        slots = [(it.job, now if it.due_ns is None else min(it.due_ns, now)) for it in self._queued]
+        self._miss(slots, Result.LINE_LOST)
         self._queued.clear()
         self._cycle = []
         self._ahead_ns = 0
@@ -226,13 +240,9 @@ class PolledLine:
         if seen == self._seen:
             return
         self._seen = seen
-        for (drive, _), (failures, late_until_ns) in zip(self._asked_of, seen, strict=True):
+        for (drive, respondent), (failures, late_until_ns) in zip(self._asked_of, seen, strict=True):
             self.schedule.observe(
-                drive.address,
-                failures,
-                now,
-                late_until_ns=late_until_ns,
-                cost_ns=round(drive.response_timeout * 1e9),
+                drive.address, failures, now, late_until_ns=late_until_ns, cost_ns=respondent.vain_ns
             )
 
     def _learn(self, now: int) -> None:
@@ -241,25 +251,35 @@ class PolledLine:
         delays = {drive: respondent.response_delay for drive, respondent in self._asked_of}
         for job in self.schedule.jobs:
             job.duration_ns = job.expected_ns(delays[job.owner] or job.owner.response_delay)
-        self._ahead_ns = sum(job.duration_ns for job, _ in self._queued)
+        self._ahead_ns = sum(it.job.duration_ns for it in self._queued)
 
     def _heed_refusals(self, now: int) -> None:
         """Registers that are refused together are asked for singly; a single one is set aside.
 
-        So no register is lost because of its neighbours.
+        So no register is lost because of its neighbours. When it is read after all, it is polled as before.
         """
-        for job in [it for it in self.schedule.jobs if it.fields.refusals >= REFUSALS]:
+        for job in [it for it in self.set_aside if not it.fields.refusals]:
+            self._replace(job, [self.set_aside.pop(job)], now)
+        for job in [it for it in self.schedule.jobs if self._is_refused(it)]:
             if len(job.block.registers) > 1:
                 parts = [self._job(job.owner, alone(it), job.period_ns) for it in job.block.registers]
-            elif job in self.set_aside:
-                continue
-            else:
-                parts = [self._job(job.owner, job.block, SET_ASIDE_NS)]
-                self.set_aside += parts
-            self.schedule.remove(job)
-            for part in parts:
-                self._jobs.append(part)
-                self.schedule.add(part, now)
+                self._jobs += parts
+                self._replace(job, parts, now)
+            elif job not in self.set_aside:
+                rare = self._job(job.owner, job.block, SET_ASIDE_NS)
+                rare.fields.refusals, job.fields.refusals = job.fields.refusals, 0
+                self._jobs.append(rare)
+                self.set_aside[rare] = job
+                self._replace(job, [rare], now)
+
+    @staticmethod
+    def _is_refused(job: Asked) -> bool:
+        return job.fields.refusals >= REFUSALS and not job.owner.is_passing(job.fields.refusal)
+
+    def _replace(self, job: Asked, others: list[Asked], now: int) -> None:
+        self.schedule.remove(job)
+        for other in others:
+            self.schedule.add(other, now)
 
     def _keep_busy(self, port: Port, now: int) -> None:
         cycle = self.schedule.cycle(now)
@@ -277,12 +297,12 @@ class PolledLine:
             self.schedule.unasked = []
 
     def _top_up(self, port: Port, now: int) -> None:
-        done_ns = max(now + self._ahead_ns, self._queued[-1][1] if self._queued else 0)
+        done_ns = max(now + self._ahead_ns, self._queued[-1].not_before_ns if self._queued else 0)
         queued = self.schedule.take(now, done_ns, now + AHEAD_NS, port.room - len(self._queued))
         if queued:
-            port.submit([job.exchange for job, _ in queued], [due_ns for _, due_ns in queued])
+            port.submit([it.job.exchange for it in queued], [it.not_before_ns for it in queued])
             self._queued += queued
-            self._ahead_ns += sum(job.duration_ns for job, _ in queued)
+            self._ahead_ns += sum(it.job.duration_ns for it in queued)
 
     def _miss(self, slots: list[tuple[Asked, int]], why: Result) -> None:
         for job, due_ns in slots:
@@ -323,8 +343,9 @@ class PolledLine:
         if port:
             port.stop()
             self._forget_done(port)
-            slots = [*self._queued, *self.schedule.pass_slots(ended_ns)]
-            self._miss([(job, due_ns) for job, due_ns in slots if 0 < due_ns <= ended_ns], Result.POLL_ENDED)
+            queued = [(it.job, it.due_ns) for it in self._queued if it.due_ns is not None]
+            slots = [*queued, *self.schedule.pass_slots(ended_ns)]
+            self._miss([(job, due_ns) for job, due_ns in slots if due_ns <= ended_ns], Result.POLL_ENDED)
         else:
             self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
         self._over_ns = now_ns()

@@ -125,7 +125,8 @@ class Poller:
     def remove(self, line: str, drive: str) -> None:
         """Poll the drive of this name no more; its motor goes on as it is.
 
-        What is queued of it is still asked. Raises ValueError when there is none.
+        What is queued of it is still asked. What is known of it stays in memory until polling ends, for
+        when the same PolledDrive is added again. Raises ValueError when there is none.
         """
         with self._changing:
             found = self._line(line)
@@ -159,12 +160,13 @@ class Poller:
         """The oldest rows that wait, at once; None when there are none, or only just a few new ones."""
         now, chunks = now_ns(), self._inbox.chunks
         if chunks < 2:
-            self._wake.clear()
+            if self._is_watched:
+                self._wake.clear()
             if now - self._taken_ns < FILLING_NS and not self._closing:
                 return None
             self._taken_ns = now
         columns = self._inbox.take()
-        return Batch(columns, list(self._codes.drives), list(self._codes.registers)) if columns else None
+        return Batch(columns, self._codes.drives, self._codes.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Batches as they come, about one `every` s, for `seconds` s or until the caller leaves off."""

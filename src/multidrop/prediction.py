@@ -154,9 +154,9 @@ def _run(jobs: Sequence[_Asked], switching: float) -> None:
     at, before = 0, jobs[-1].planned.drive
     timed = any(job.period_ns is not None for job in jobs)
     for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
-        ((job, due_ns),) = schedule.take(at, at, FAR_NS, 1)
+        ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
         silent = gaps(before, job.planned.drive)
-        begin_ns = max(at + round(silent * 1e9), due_ns)
+        begin_ns = max(at + round(silent * 1e9), not_before_ns)
         job.first_ns = job.first_ns if job.count else begin_ns
         job.last_ns = begin_ns
         job.count += 1

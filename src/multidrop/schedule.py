@@ -16,11 +16,11 @@ from __future__ import annotations
 import heapq
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 SILENT_AFTER = 2  # failures in a row
 FIRST_REST_NS = 500_000_000
-LONGEST_REST_NS = 10_000_000_000
+LONGEST_REST_NS = 2_000_000_000
 SILENT_SHARE = 0.02  # of the line, for asking silent drives
 TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
 CREDIT_NS = 50_000_000  # of it, that they use up in advance
@@ -49,6 +49,14 @@ class Job:
 
 
 J = TypeVar("J", bound=Job)
+
+
+class Asking(NamedTuple, Generic[J]):
+    """A job's turn."""
+
+    job: J
+    not_before_ns: int
+    due_ns: int | None  # its slot; None: it has none
 
 
 @dataclass
@@ -119,13 +127,13 @@ class Schedule(Generic[J]):
         if job in self._turn:
             self._next = self._turn.index(job)
 
-    def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[tuple[J, int]]:
+    def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[Asking[J]]:
         """What keeps the line busy from `start_ns`, when it has done all it was given, to the horizon.
 
-        At most `most` jobs, in their order, each with the time before which it is not to be sent.
+        At most `most` jobs, in their order.
         """
         at = max(now_ns, start_ns)
-        taken: list[tuple[J, int]] = []
+        taken: list[Asking[J]] = []
         while len(taken) < most and at < horizon_ns:
             self._begin_slots(at)
             job = (self._in_turn(at) if self._owed_ns > 0 else None) or self._due(at) or self._in_turn(at)
@@ -134,9 +142,8 @@ class Schedule(Generic[J]):
                     break
                 at = max(at, self._waiting[0][0])
                 continue
-            due_ns = self._slot(job, at)
-            taken.append((job, due_ns))
-            at = max(at, due_ns) + self._duration_ns(job)
+            taken.append(self._ask(job, at))
+            at += self._duration_ns(job)
             self._kind = job.kind
         return taken
 
@@ -166,26 +173,25 @@ class Schedule(Generic[J]):
         if self._is_late:
             return min(self._begun, key=lambda job: (job.asked_ns, job.number))
         first = min(self._begun, key=lambda job: (job.end_ns, job.number))
-        if first.kind == self._kind:
-            return first
         if at_ns + sum(job.duration_ns for job in self._begun) > first.end_ns:
             return first
         return min(self._begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
-    def _slot(self, job: J, at_ns: int) -> int:
-        """The job is asked at this time: in which of its slots. Those that are over are left out."""
-        if job.period_ns is None or self._health[job.drive].rest_ns:  # or asked whether it answers
+    def _ask(self, job: J, at_ns: int) -> Asking[J]:
+        """The job is asked at this time; where it has slots, in one of them. Those over are left out."""
+        health = self._health[job.drive]
+        if job.period_ns is None or health.rest_ns:  # or asked whether it answers
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
-            return 0
+            return Asking(job, health.late_until_ns, None)
         self._begun.remove(job)
-        over = max(0, (at_ns - job.due_ns) // job.period_ns)
+        over = (at_ns - job.due_ns) // job.period_ns
         job.skipped += over
         self._is_late |= over > 0
         due_ns = job.due_ns + over * job.period_ns
         job.due_ns, job.asked_ns = due_ns + job.period_ns, at_ns
         self._await(job)
         self._owed_ns += round(job.duration_ns * TURN_SHARE / (1 - TURN_SHARE))
-        return due_ns
+        return Asking(job, max(due_ns, health.late_until_ns), due_ns)
 
     def _in_turn(self, at_ns: int) -> J | None:
         """A drive at rest whose turn it is to be asked, or the next of the jobs without a period."""
@@ -239,7 +245,7 @@ class Schedule(Generic[J]):
         elif has_answered_late:
             health.asleep_until_ns = now_ns
         self._ill = any(it.failures for it in self._health.values())
-        self._late_until_ns = max((it.late_until_ns for it in self._health.values()), default=0)
+        self._late_until_ns = max(it.late_until_ns for it in self._health.values())
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self._health[drive]

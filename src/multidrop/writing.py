@@ -16,6 +16,7 @@ from multidrop.errors import (
     BusError,
     DriveRefused,
     Expired,
+    LineError,
     NoReply,
     Unconfirmed,
 )
@@ -161,6 +162,8 @@ class Writer:
             raise
         except BaseException as failure:
             self.log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
+            if isinstance(failure, LineError) and failure.is_sent:
+                raise Unconfirmed(drive.name, what, failure.reason) from failure
             raise
 
     def close(self) -> None:

@@ -389,15 +389,15 @@ static void check_columns(void)
         .result = 7, .sent_ns = 100, .first_ns = 130, .reply = {.data_len = 2, .data = {0, 3}}};
     row = "columns";
     *valid = 0xFF;
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2, 0, 7}, &completion, 1000) == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion, 1000) == 2);
     CHECK(time[0] == 1100 && sent[0] == 100 && uncertainty[0] == 30 && drive[0] == 7 && reg[1] == 9);
     CHECK(status[0] == 0 && value[0] == 0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
     CHECK((*valid & 3) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 2, 0, 7}, &completion, 1000) == 0 && columns.rows == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion, 1000) == 0 && columns.rows == 2);
     completion = (struct md_completion){.result = MD_LINE_LOST, .begun_ns = 90};
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1, 0, 7}, &completion, 1000) == 1);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion, 1000) == 1);
     CHECK(sent[2] == 90 && status[2] == -MD_LINE_LOST && (*valid & 7) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){fields, 1, 0, 7}, &completion, 1000) == 0 && columns.rows == ROOM);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion, 1000) == 0 && columns.rows == ROOM);
 }
 
 static void check_spelling(void)

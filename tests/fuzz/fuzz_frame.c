@@ -69,9 +69,8 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
     if (framing != MD_DELIXI && found.exception && found.function == 8)
         return; /* 89H stands for 88H */
     must(memcmp(built, bytes, (size_t)used) == 0);
-    if (!found.exception && md_build_request(framing, other, asked, sizeof asked) > 0 &&
-        md_parse_reply(framing, bytes, len, other, &again) > 0)
-        must(md_is_mistakable(framing, request, other));
+    if (md_parse_reply(framing, bytes, len, other, &again) > 0) /* line.c waits before it asks that */
+        must(request->address == other->address && (framing == MD_DELIXI || request->function == other->function));
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
@@ -82,7 +81,6 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     struct md_message request = request_of(data), other = request_of(data + REQUEST_BYTES);
     if (data[0] % 3 != data[REQUEST_BYTES] % 3)
         other = request;
-    must(md_is_mistakable(framing, &request, &other) == md_is_mistakable(framing, &other, &request));
     check_request(framing, data + HEADER, size - HEADER);
     check_reply(framing, data + HEADER, size - HEADER, &request, &other);
     return 0;

@@ -8,7 +8,7 @@
 
 #include <errno.h>
 
-enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_WANTS = 6, NOISE = -1, ECHO = -2 };
+enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_WANTS = 6, NOISE = -1, ECHO = -2, FLOOD = 700 };
 
 enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, PORT_FAILS, STEPS };
 
@@ -22,7 +22,7 @@ struct answer {
 
 struct scene {
     struct md_line line;
-    struct md_completion done;
+    struct md_completion *done; /* there while the exchange is under way, and no longer */
     struct md_drive drives[DRIVES];
     struct md_exchange exchange;
     int is_under_way, has_asked, adapter_echoes, is_spoiled;
@@ -86,7 +86,7 @@ static int is_same(const struct md_message *one, const struct md_message *other)
 
 static void check_completion(void)
 {
-    const struct md_completion *done = &scene.done;
+    const struct md_completion *done = scene.done;
     const struct md_exchange *exchange = &scene.exchange;
     size_t used = done->result > 0 ? (size_t)done->result : 0;
     must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
@@ -160,14 +160,15 @@ static void end(void)
 {
     check_completion();
     scene.is_under_way = 0;
-    int64_t turnaround = scene.done.result == 0 ? scene.exchange.turnaround_ns : 0;
-    if (scene.done.sent_ns)
+    int64_t turnaround = scene.done->result == 0 ? scene.exchange.turnaround_ns : 0;
+    if (scene.done->sent_ns)
         scene.silence = turnaround > scene.exchange.silence_ns ? turnaround : scene.exchange.silence_ns;
     scene.exchanges[drive_of(&scene.exchange.request)]++;
     struct answer *late = answer_to(scene.number);
     if (late)
         late->until_ns = scene.exchange.drive->late_until_ns;
     scene.before = scene.after = 0;
+    free(scene.done);
     check_tallies();
     check_tap();
 }
@@ -239,7 +240,8 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
         scene.silence = silence;
     int64_t free_from = scene.last_heard + scene.silence > scene.now ? scene.last_heard + scene.silence : scene.now;
     scene.ends = free_from + longest();
-    md_line_begin(&scene.line, &scene.exchange, &scene.done, scene.now);
+    must((scene.done = malloc(sizeof *scene.done)) != NULL);
+    md_line_begin(&scene.line, &scene.exchange, scene.done, scene.now);
     want();
 }
 
@@ -337,6 +339,7 @@ static void fail(int error)
 /* One step; how many bytes of the input it took, 0 at the end. */
 static size_t act(const uint8_t *step, size_t left)
 {
+    static const uint8_t flood[FLOOD]; /* more than half of what a line keeps */
     size_t len;
     switch (step[0] % STEPS) {
     case BEGIN:
@@ -363,6 +366,8 @@ static size_t act(const uint8_t *step, size_t left)
         for (size_t i = 0; i < len; i++)
             scene.is_spoiled |= step[2 + i] < 0xF8; /* it may be a frame, or a part of one */
         hear(step + 2, len, NOISE);
+        if (len == 0 && scene.after + FLOOD < HEARD)
+            hear(flood, FLOOD, NOISE);
         want();
         return 2 + len;
     case ANSWER_COMES:

@@ -44,7 +44,7 @@ def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
             trees.put(tree)
 
     with ExitStack() as stack:
-        jobs = os.cpu_count() or 1
+        jobs = len(os.sched_getaffinity(0))
         for _ in range(jobs):
             trees.put(stack.enter_context(scratch()))
         if end(source) not in {None, "same code"}:

@@ -13,7 +13,7 @@ from multidrop import plant
 from multidrop.batch import Batch
 from multidrop.capture.meaning import Meaning, Meanings, line_of
 from multidrop.capture.reader import Capture
-from multidrop.core import Block, Columns, Decoded, Decoder, Field, Heard
+from multidrop.core import Block, Columns, Decoded, Decoder, Field, Heard, Names
 from multidrop.plant import Plant
 
 ROWS = 1 << 16  # of a batch, at most
@@ -52,14 +52,14 @@ class _Line:
 
     def _begin(self) -> None:
         self._columns = Columns(ROWS)
-        self._drives: dict[str, int] = {}
-        self._registers: dict[str, int] = {}
+        self._drives = Names()
+        self._registers = Names()
 
     def hear(self, heard: Heard) -> Iterator[Batch]:
         while (done := self.decoder.decode(heard, self._columns)) is not Decoded.ALL:
             if done is Decoded.UNKNOWN and self._learn():
                 continue
-            yield Batch(self._columns, list(self._drives), list(self._registers))
+            yield Batch(self._columns, self._drives, self._registers)
             self._columns = Columns(ROWS)
             if done is Decoded.UNKNOWN:  # it knows too much
                 self.decoder.forget()
@@ -67,18 +67,18 @@ class _Line:
 
     def rest(self) -> Iterator[Batch]:
         if len(self._columns):
-            yield Batch(self._columns, list(self._drives), list(self._registers))
+            yield Batch(self._columns, self._drives, self._registers)
 
     def _learn(self) -> bool:
         framing, request = self.decoder.asked
         if len(self._registers) > _MOST_NAMES:
             return False
         meaning = self._meanings.of(framing, request)
-        is_answered = bool(request.address and meaning.places)
-        return self.decoder.know(self._block(meaning) if is_answered else None)
+        block = self._block(meaning) if request.address else None  # nobody answers a broadcast
+        return self.decoder.know(block)
 
     def _block(self, meaning: Meaning) -> Block:
-        drive = self._drives.setdefault(meaning.drive, len(self._drives))
+        drive = self._drives.number(meaning.drive)
         fields = []
         for place in meaning.places:
             scale = place.register.scale if place.register else None
@@ -86,7 +86,7 @@ class _Line:
                 Field(
                     place.at,
                     place.wire,
-                    self._registers.setdefault(place.name, len(self._registers)),
+                    self._registers.number(place.name),
                     scale.numerator if scale else 1,
                     scale.denominator if scale else 1,
                 )

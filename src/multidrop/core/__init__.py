@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.core.columns import COLUMNS, Block, Columns, Field, Wire, raw_value, spell
+from multidrop.core.columns import COLUMNS, Block, Columns, Field, Names, Wire, raw_value, spell
 from multidrop.core.exchanges import Completion, Exchange, Respondent, completion, new_completion
 from multidrop.core.frames import (
     Framing,
@@ -55,6 +55,7 @@ __all__ = [
     "Inbox",
     "Kind",
     "Message",
+    "Names",
     "Port",
     "Respondent",
     "Result",

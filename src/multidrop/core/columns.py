@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from struct import calcsize
 from typing import Any, Literal, NamedTuple
@@ -59,8 +59,17 @@ class Block:
 
     @property
     def refusals(self) -> int:
-        """Exceptions in a row, among the replies that were made rows of."""
+        """Exceptions in a row."""
         return int(self.c.refusals)
+
+    @refusals.setter
+    def refusals(self, count: int) -> None:
+        self.c.refusals = count
+
+    @property
+    def refusal(self) -> int:
+        """The last exception's code."""
+        return int(self.c.refusal)
 
 
 COLUMNS: dict[str, Literal["q", "H", "d"]] = {
@@ -91,10 +100,6 @@ class Columns:
         if made == ffi.NULL:
             raise MemoryError("no memory for rows")
         self.c = ffi.gc(made, give_back)
-        first = ffi.cast("uint8_t *", made)
-        self._at = {name: ffi.cast("uint8_t *", getattr(made, name)) - first for name in (*COLUMNS, "valid")}
-        # One piece, which is there for as long as any view of it.
-        self._memory = memoryview(ffi.buffer(self.c, self._at["valid"] + (made.room + 7) // 8))
 
     def __len__(self) -> int:
         return int(self.c.rows)
@@ -107,13 +112,18 @@ class Columns:
         """Append rows for values that were due at `due_ns` but never asked for."""
         return bool(lib.md_columns_add(self.c, block.c, miss(result, due_ns), utc_minus_monotonic_ns))
 
-    def clear(self) -> None:
-        """Forget all rows."""
-        self.c.rows = 0
+    def _at(self, name: str) -> int:
+        """How far behind the struct a column begins."""
+        return int(ffi.cast("uint8_t *", getattr(self.c, name)) - ffi.cast("uint8_t *", self.c))
+
+    @cached_property
+    def _memory(self) -> memoryview[Any]:
+        """One piece, which is there for as long as any view of it."""
+        return memoryview(ffi.buffer(self.c, self._at("valid") + (self.c.room + 7) // 8))
 
     def array(self, name: str) -> memoryview[Any]:
         """A column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
-        rows, at = len(self), self._at[name]
+        rows, at = len(self), self._at(name)
         if name == "valid":
             return self._memory[at : at + (rows + 7) // 8]
         kind = COLUMNS[name]
@@ -125,22 +135,57 @@ def miss(result: Result, due_ns: int) -> Any:
     return ffi.new("struct md_completion *", {"result": result, "begun_ns": due_ns})
 
 
-@lru_cache(maxsize=64)
-def _spelling(names: tuple[str, ...]) -> tuple[bytes, Any, int]:
-    """All names as one text, where each begins and the last ends, and the longest one's length."""
-    encoded = [name.encode() for name in names]
-    ends = [0, *accumulate(map(len, encoded))]
-    return b"".join(encoded), ffi.new("int32_t[]", ends), max(map(len, encoded), default=0)
+class Spelling(NamedTuple):
+    """Names as one text."""
+
+    names: int
+    longest: int
+    text: bytes
+    ends: Any  # int32_t[]: where each begins, and the last ends
 
 
-def spell(codes: memoryview[Any], names: tuple[str, ...]) -> tuple[memoryview[Any], memoryview[Any]]:
-    """Offsets (int32) and text of an Arrow utf8 column that has names[code] for each of `codes`."""
-    known, ends, longest = _spelling(names)
+class Names:
+    """Names, of which columns hold the numbers. They only become more: a number's name never changes."""
+
+    def __init__(self, names: Iterable[str] = ()) -> None:
+        self._names = list(names)
+        self._numbers = {name: number for number, name in enumerate(self._names)}
+        self._spelling = self._spell()
+
+    def number(self, name: str) -> int:
+        """The name's own, or else the next one."""
+        found = self._numbers.setdefault(name, len(self._names))
+        if found == len(self._names):
+            self._names.append(name)
+        return found
+
+    def __getitem__(self, number: int) -> str:
+        return self._names[number]
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def _spell(self) -> Spelling:
+        encoded = [name.encode() for name in self._names]
+        ends = [0, *accumulate(map(len, encoded))]
+        longest = max(map(len, encoded), default=0)
+        return Spelling(len(encoded), longest, b"".join(encoded), ffi.new("int32_t[]", ends))
+
+    @property
+    def spelling(self) -> Spelling:
+        if self._spelling.names != len(self._names):
+            self._spelling = self._spell()
+        return self._spelling
+
+
+def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memoryview[Any]]:
+    """Offsets (int32) and text of an Arrow utf8 column that has the name of each of the codes."""
+    known = names.spelling
     rows = len(codes)
-    room = rows * longest
+    room = rows * known.longest
     offsets, text = ffi.new("int32_t[]", rows + 1), ffi.new("uint8_t[]", max(room, 1))
     used = lib.md_spell(
-        ffi.from_buffer("uint16_t[]", codes), rows, known, ends, len(names), offsets, text, room
+        ffi.from_buffer("uint16_t[]", codes), rows, known.text, known.ends, known.names, offsets, text, room
     )
     if used < 0:
         raise ValueError("a code without a name, or more than 2 GiB of names in one batch")

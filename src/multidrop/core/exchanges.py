@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop._core import ffi
+from multidrop._core import ffi, lib
 from multidrop.core.columns import Block
 from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
 from multidrop.core.results import EXCEPTION_STATUS, Result
@@ -43,10 +43,20 @@ class Respondent:
         """So long the answer to an earlier request may still come."""
         return int(self.c.late_until_ns)
 
+    def wait_until(self, late_until_ns: int) -> None:
+        """Ask it nothing until then: an answer to anything may still come from its address."""
+        self.c.late_functions = 0xFFFF_FFFF_FFFF_FFFF
+        self.c.late_until_ns = late_until_ns
+
     @property
     def response_delay(self) -> float:
         """In s, smoothed; 0 before the first reply."""
         return float(self.c.delay_ns) / 1e9
+
+    @property
+    def vain_ns(self) -> int:
+        """How long it is waited for while it stays silent, on average."""
+        return int(lib.md_vain_ns(self.c))
 
     def tally(self) -> Tally:
         """What became of its exchanges so far, and of values that were due and not asked for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -52,6 +53,7 @@ class Port:
         self._free = finalize(self, _let_go, self.c)  # before that at which the core still looks
         self._free.atexit = False  # others may still use it then
         self._kept: set[Exchange | Respondent] = set()  # at which the core may still look
+        self._submitted: deque[Exchange] = deque(maxlen=room)  # at most so many are pending
         self._inbox: Inbox | None = None
         self._round: object = None
 
@@ -103,7 +105,10 @@ class Port:
         """Queue exchanges, none to be sent before its time; how many there was room for."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        return int(lib.md_port_submit(self.c, todo, times, len(exchanges)))
+        taken = int(lib.md_port_submit(self.c, todo, times, len(exchanges)))
+        self._submitted.extend(exchanges[:taken])
+        self._kept.update(exchange.respondent for exchange in exchanges)  # for when a late answer comes
+        return taken
 
     @property
     def pending(self) -> int:
@@ -127,7 +132,7 @@ class Port:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
-        self._kept.add(exchange.respondent)  # the core still looks at it when a late answer comes
+        self._kept.add(exchange.respondent)  # for when a late answer comes
         found = ffi.new("struct md_completion *")
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
         return completion(found)

@@ -133,9 +133,7 @@ class SimulatedDrive:
         return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
     def hear(self, frame: Frame) -> Message | None:
-        """The reply to a frame of the line, whoever it is for."""
-        if frame.address not in (self.drive.address, 0):
-            return None
+        """The reply to a frame of the line that is for this drive, or for all."""
         if not frame.intact:
             self.counters.damaged += 1
             return self._answer_damaged(frame)

@@ -1,0 +1,76 @@
+/* What is learnt of a drive from the delays of its replies: when to look for one, and how long to wait. */
+#include "multidrop.h"
+#include "times.h"
+
+/* ---- when to look ---- */
+
+/* Early rather than late: that costs a wake-up, this would delay the next request. A look that was learnt to
+ * come just when replies are whole saved one sleep of three, and lost the line a 300th: sleeps end late. */
+int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns)
+{
+    return later(0, drive->delay_ns - drive->deviation_ns - character_ns / 2);
+}
+
+/* ---- how long to wait ---- */
+
+/* What the engine's thread learns, and others look at. */
+static int64_t learnt(const int64_t *ns)
+{
+    return __atomic_load_n(ns, __ATOMIC_RELAXED);
+}
+
+static void learn(int64_t *ns, int64_t value)
+{
+    __atomic_store_n(ns, value, __ATOMIC_RELAXED);
+}
+
+/* As TCP's retransmission time-out (RFC 6298). */
+static int64_t usual_timeout_ns(const struct md_drive *drive)
+{
+    int64_t usual_ns = 4 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);
+    int64_t margin_ns = later(4 * learnt(&drive->deviation_ns), drive->least_timeout_ns / 4);
+    if (delay_ns)
+        usual_ns = later(delay_ns + margin_ns, drive->least_timeout_ns);
+    return sooner(usual_ns, drive->most_timeout_ns);
+}
+
+/* After a failure a question has all the time that the document allows: the drive may have become slower.
+ * While it stays silent that is rare, because it is time that the other drives lose. What must not wait so
+ * long before it is repeated, a stop, has twice the time after each failure. */
+enum { RARELY = 16, MOST_DOUBLINGS = 8 };
+
+int64_t md_timeout_ns(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    int64_t usual_ns = usual_timeout_ns(drive);
+    if (exchange->insists)
+        return sooner(usual_ns << sooner(drive->failures, MOST_DOUBLINGS), drive->most_timeout_ns);
+    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_ns;
+}
+
+int64_t md_vain_ns(const struct md_drive *drive)
+{
+    int64_t usual_ns = usual_timeout_ns(drive);
+    return usual_ns + (drive->most_timeout_ns - usual_ns) / RARELY;
+}
+
+static void smooth(struct md_drive *drive, int64_t delay_ns)
+{
+    int64_t off_ns = delay_ns - drive->delay_ns;
+    if (drive->delay_ns == 0) {
+        learn(&drive->delay_ns, later(delay_ns, 1));
+        learn(&drive->deviation_ns, delay_ns / 2);
+        return;
+    }
+    int64_t deviation_ns = drive->deviation_ns;
+    learn(&drive->deviation_ns, deviation_ns + ((off_ns < 0 ? -off_ns : off_ns) - deviation_ns) / 4);
+    learn(&drive->delay_ns, later(drive->delay_ns + off_ns / 8, 1));
+}
+
+int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns)
+{
+    if (is_whole) /* it may have been so for long */
+        delay_ns = sooner(delay_ns, md_look_ns(drive, character_ns));
+    smooth(drive, delay_ns);
+    return delay_ns;
+}

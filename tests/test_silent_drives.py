@@ -1,0 +1,38 @@
+"""Drives that fall silent, on a world's clock: what they cost the others, and how soon they are back."""
+
+from __future__ import annotations
+
+import pytest
+from lines import polled
+from worlds import S, World, WorldWire
+
+from multidrop.drives import InvtCHE
+from multidrop.sim import Faults, simulated
+
+DRIVES = 31
+
+
+@pytest.mark.story
+@pytest.mark.parametrize(("dead", "back_s"), [(1, 5), (5, 25), (10, 45)])
+def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
+    drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
+    sims = [simulated(drive) for drive in drives]
+    world = World(WorldWire(sims, Faults()), [polled(it, it.readings()[:1]) for it in drives])
+    gone = {it.name for it in drives[:dead]}
+
+    def answered(seconds: float) -> int:
+        return sum(1 for row in world.run(seconds) if row.value is not None)
+
+    with world:
+        world.run(5)  # until delays are learnt
+        healthy = answered(10)
+        for it in sims[:dead]:
+            it.deaf_until = float("inf")
+        world.run(10)  # until it is known
+        assert answered(50) >= 0.97 * 5 * healthy
+        for it in sims[:dead]:
+            it.deaf_until = 0.0
+        revived, back = world.now, set()
+        while not gone <= back:
+            assert world.now <= revived + back_s * S
+            back |= {row.drive for row in world.run(0.5) if row.value is not None}
