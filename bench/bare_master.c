@@ -89,12 +89,14 @@ static int open_line(const char *path)
     return fd;
 }
 
-/* Whether a reply of so many bytes came within the time-out. */
-static int exchange(int fd, const uint8_t *request, size_t expected)
+/* Whether a reply of so many bytes came within the time-out; it is not looked for in the first `asleep_ns`. */
+static int exchange(int fd, const uint8_t *request, size_t expected, int64_t asleep_ns)
 {
     uint8_t reply[256];
     if (write(fd, request, REQUEST) != REQUEST)
         return 0;
+    if (asleep_ns)
+        wait_until(now_ns() + asleep_ns, 0);
     for (size_t have = 0; have < expected;) {
         struct pollfd ready = {.fd = fd, .events = POLLIN};
         struct timespec timeout = {.tv_nsec = TIMEOUT_NS};
@@ -112,8 +114,9 @@ int main(int argc, char **argv)
 {
     static const struct option known[] = {
         {"seconds", 1, NULL, 's'},    {"drives", 1, NULL, 'n'},  {"registers", 1, NULL, 'r'},
-        {"silence-us", 1, NULL, 'q'}, {"spin-us", 1, NULL, 'p'}, {NULL, 0, NULL, 0}};
-    double seconds = 3, silence_us = 0, spin_us = 60; /* silence 0: unpaced */
+        {"silence-us", 1, NULL, 'q'}, {"spin-us", 1, NULL, 'p'}, {"asleep-us", 1, NULL, 'a'},
+        {NULL, 0, NULL, 0}};
+    double seconds = 3, silence_us = 0, spin_us = 60, asleep_us = 0; /* silence 0: unpaced */
     int drives = 16, registers = 10, key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
         double number = optarg ? strtod(optarg, NULL) : 0;
@@ -123,12 +126,13 @@ int main(int argc, char **argv)
         case 'r': registers = (int)number; break;
         case 'q': silence_us = number; break;
         case 'p': spin_us = number; break;
+        case 'a': asleep_us = number; break;
         default: optind = argc;
         }
     }
     if (optind >= argc || drives < 1 || drives > MOST_DRIVES || registers < 1 || registers > 125) {
         fprintf(stderr, "usage: bare_master [--seconds S] [--drives N] [--registers N] [--silence-us N (0: unpaced)]"
-                        " [--spin-us N] PORT\n");
+                        " [--spin-us N] [--asleep-us N (after a request)] PORT\n");
         return 2;
     }
     int fd = open_line(argv[optind]);
@@ -142,11 +146,12 @@ int main(int argc, char **argv)
     for (int i = 0; i < drives; i++)
         make_request(requests[i], (uint8_t)(i + 1), (uint8_t)registers);
     int64_t silence_ns = (int64_t)(silence_us * 1e3), spin_ns = (int64_t)(spin_us * 1e3);
+    int64_t asleep_ns = (int64_t)(asleep_us * 1e3);
     int64_t begun = now_ns(), end = begun + (int64_t)(seconds * 1e9), now;
     double cpu = cpu_seconds();
     long good = 0, bad = 0;
     do {
-        int read_well = exchange(fd, requests[(good + bad) % drives], (size_t)(5 + 2 * registers));
+        int read_well = exchange(fd, requests[(good + bad) % drives], (size_t)(5 + 2 * registers), asleep_ns);
         good += read_well;
         bad += !read_well;
         now = now_ns();

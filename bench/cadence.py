@@ -17,11 +17,8 @@ from typing import Any
 import numpy
 import rivals
 import tables
-from jobs import REGISTERS, TIMEOUT_S, Job
+from jobs import TIMEOUT_S, Job
 from programs import paced_line
-
-BITS = 10
-DELAY_S = 2e-3
 
 
 def compute_without_pause() -> None:
@@ -38,9 +35,8 @@ def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
 
 def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
     """Good exchanges, and how much longer than on the wire each call took, in ms."""
-    characters = 8 + 5 + 2 * REGISTERS
-    wire = characters * BITS / job.baudrate + DELAY_S if job.baudrate else 0.0
-    took = []
+    wire = job.wire if job.baudrate else 0.0
+    took: list[float] = []
     with rivals.pymodbus(job) as read:
         end = time.monotonic() + job.seconds
         while (begun := time.monotonic()) < end:

@@ -1,8 +1,8 @@
 """What faults cost on a paced line: stray bytes, silent drives, requests that are refused.
 
-31 drives at 38400. A rate is held against that of the same plant without the fault: without the
-stray bytes, or without the silent drives. `python faults.py MASTER JOB` is the process of one
-master whose requests are refused.
+31 drives at 38400. A rate is held against that of the same plant without the fault, measured right
+before it: without the stray bytes, or without the silent drives. All figures are medians. `python
+faults.py MASTER JOB` is the process of one master whose requests are refused.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from statistics import median
@@ -37,6 +37,26 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
         own = rivals.measure(master, Job(line.path, BAUDRATE, arguments.settle + arguments.seconds, drives))
     asked = own["exchanges"] + own["failures"]
     return line.report["answered"] / max(line.report["seconds"], 1e-9), own["exchanges"] / max(asked, 1)
+
+
+def cases(silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    """Each fault's name, how many drives there are without it, and what the line is told."""
+    yield "00 before every reply", DRIVES, {"stray": True}
+    for dead in silent:
+        living = DRIVES - dead
+        yield f"{dead} silent", living, {"silent": ",".join(map(str, range(living + 1, DRIVES + 1)))}
+
+
+def cost(
+    master: str, case: str, arguments: argparse.Namespace, drives: int, fault: dict[str, Any]
+) -> tuple[str, ...]:
+    slices = []
+    for _ in range(arguments.slices):
+        without, _ = measured(master, drives, arguments)
+        rate, read = measured(master, DRIVES, arguments, **fault)
+        slices.append((without, rate, rate / without, read))
+    without, rate, kept, read = (median(column) for column in zip(*slices, strict=True))
+    return master, case, f"{without:.1f}", f"{rate:.1f}", f"{kept:.1%}", f"{read:.1%}"
 
 
 # ---- requests that are refused ----
@@ -80,25 +100,20 @@ def main() -> None:
     parser.add_argument("--silent", type=int, nargs="+", default=[0, 1, 5, 10], help="how many of 31")
     parser.add_argument("--settle", type=float, default=10.0, help="seconds before anything is counted")
     parser.add_argument("--seconds", type=float, default=20.0, help="that are counted; 0: only refusals")
+    parser.add_argument("--slices", type=int, default=3, help="pairs, without the fault and with it")
     arguments = parser.parse_args()
     rivals.insist_on([*arguments.masters, *READERS])
     tables.heading(f"A paced line of {DRIVES} drives at {BAUDRATE}, 10 registers each, with faults.")
 
-    rows = []
-    for master in arguments.masters if arguments.seconds else ():
-        whole, read = measured(master, DRIVES, arguments)
-        rows.append((master, "no fault", f"{whole:.1f}", "100.0%", f"{read:.1%}"))
-        rate, read = measured(master, DRIVES, arguments, stray=True)
-        rows.append((master, "00 before every reply", f"{rate:.1f}", f"{rate / whole:.1%}", f"{read:.1%}"))
-        for dead in filter(None, arguments.silent):
-            living = DRIVES - dead
-            alone, _ = measured(master, living, arguments)
-            silent = ",".join(str(address) for address in range(living + 1, DRIVES + 1))
-            rate, read = measured(master, DRIVES, arguments, silent=silent)
-            rows.append((master, f"{dead} silent", f"{rate:.1f}", f"{rate / alone:.1%}", f"{read:.1%}"))
+    rows = [
+        cost(master, case, arguments, drives, fault)
+        for master in (arguments.masters if arguments.seconds else ())
+        for case, drives, fault in cases(arguments.silent)
+    ]
     if rows:
-        tables.show(("master", "case", "answers/s", "kept", "read"), rows)
+        tables.show(("master", "case", "without", "answers/s", "kept", "read"), rows)
         print(
+            "\nwithout: answers a second without the fault; kept: the median of what each pair kept."
             "\nread: good exchanges of all that were asked, from the start on; silent drives' are failed.\n"
         )
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 REGISTERS = 10
 TIMEOUT_S = 0.3
+DELAY_S = 2e-3  # the drives' response delay
+CHARACTER_BITS = 10
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,15 @@ class Job:
     baudrate: int
     seconds: float
     drives: int = 16
+
+    @property
+    def wire(self) -> float:
+        """Seconds from the beginning of a request to the end of its reply on paced_line."""
+        return (8 + 5 + 2 * REGISTERS) * self.character + DELAY_S
+
+    @property
+    def character(self) -> float:
+        return CHARACTER_BITS / self.baudrate
 
     @property
     def port_baudrate(self) -> int:

@@ -28,7 +28,7 @@ def main() -> None:
         f"{arguments.lines} lines without waits, {arguments.drives} drives each, 4 blocks of 10 registers; "
         f"time-out {TIMEOUT_MS} ms."
     )
-    options = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
+    options: tuple[object, ...] = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
     options += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
     begun = time.monotonic()
     with far_ends("socketpair", arguments.lines, *options) as (ports, _):

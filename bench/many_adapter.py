@@ -151,7 +151,7 @@ def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
 class Judged:
     """What came of drives on which replies are late, lost or doubled."""
 
-    exchanges: int = 0
+    exchanges: int = 0  # whose requests left
     samples: int = 0
     wrong: int = 0  # values that are another register's
     beyond: int = 0  # of these, whose reply came when it was not to be expected any more
@@ -177,9 +177,9 @@ def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
         while judged.exchanges < exchanges:
             for batch in poller.batches(1.0):
                 _judge(batch, held, judged)
-            judged.exchanges = sum(line["exchanges"] for line in poller.summary()["lines"].values())
-    while batch := poller.take():
-        _judge(batch, held, judged)
+            judged.exchanges = sum(line.exchanges for line in poller.statistics().values())
+    while rest := poller.take():
+        _judge(rest, held, judged)
     summary = poller.summary()
     judged.late = sum(line["late_replies"] for line in summary["lines"].values())
     if summary["dropped"] or (judged.samples, judged.misses.total()) != (

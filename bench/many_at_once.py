@@ -33,7 +33,16 @@ from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated
 
 PATIENCE = 30.0  # s, until a thread that was asked to end must have ended
-HEAD = ("exchanges", "a second", "values", "missed", "misattributed", "lost", "came and went", "commands")
+HEAD: tuple[str, ...] = (
+    "exchanges",
+    "a second",
+    "values",
+    "missed",
+    "misattributed",
+    "lost",
+    "came and went",
+    "commands",
+)
 HEAD += ("failed", "memory kB", "descriptors", "threads")
 
 

@@ -22,6 +22,7 @@ from socket import socket, socketpair
 from statistics import median
 from typing import Any
 
+import jobs
 import tables
 from programs import CHECKSUM, compiled, on_processor, talking
 
@@ -57,18 +58,20 @@ def poll(job: Lines) -> dict[str, Any]:
         opened = time.monotonic() - begun
         for _ in poller.batches(SETTLE_S):
             pass
-        used, begun, before = _thread_seconds(), time.monotonic(), adapter.counts(poller)
-        counted = _thread_seconds()
-        for _ in poller.batches(job.seconds):
+        while poller.take():
             pass
-        left, seconds, after = _thread_seconds(), time.monotonic() - begun, adapter.counts(poller)
+        used, begun, good, bad, dropped = _thread_seconds(), time.monotonic(), 0, 0, adapter.dropped(poller)
+        for batch in poller.batches(job.seconds):
+            failed = adapter.missed(batch)
+            good, bad = good + len(batch) - failed, bad + failed
+        left, seconds = _thread_seconds(), time.monotonic() - begun
         in_python = {thread.native_id for thread in threading.enumerate()}
+        if lost := adapter.dropped(poller) - dropped:
+            raise AssertionError(f"{lost} rows were not taken, of {good + bad}")
     spent = {thread: left[thread] - used.get(thread, 0.0) for thread in left}
-    ours = threading.get_native_id()
-    spent[ours] -= counted[ours] - used[ours]  # to count what thousands of drives did is no part of it
     return {
-        "exchanges": after[0] - before[0],
-        "failures": after[1] - before[1],
+        "exchanges": good // jobs.REGISTERS,
+        "failures": bad // jobs.REGISTERS,
         "cpu_seconds": sum(spent.values()),
         "python_seconds": sum(spent[thread] for thread in spent if thread in in_python),
         "seconds": seconds,
@@ -162,8 +165,7 @@ def main() -> None:
     kinds = {"socketpair": arguments.socketpairs, "pty": arguments.ptys}
     asked = [(kind, count) for kind, counts in kinds.items() for count in counts]
     rows = [line for kind, count in asked for line in compared(kind, count, arguments)]
-    columns = ("lines", "number", "master", "exchanges/s", "/ bare")
-    columns += ("CPU us", "/ bare", "in Python", "failed")
+    columns = "lines", "number", "master", "exchanges/s", "/ bare", "CPU us", "/ bare", "in Python", "failed"
     tables.show(columns, rows)
     print(f"\nWith the pace of a wire: {BAUDRATE} baud, response delay {DELAY_US / 1000:g} ms.\n")
     tables.show(("lines", "exchanges/s", "CPU us", "of a core", "in Python", "failed"), [paced(arguments)])

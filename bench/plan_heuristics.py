@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import random
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from statistics import mean, median
 from typing import Any
 
@@ -123,7 +124,7 @@ def main() -> None:
         ]
 
     ours = all_cycles(blocks)
-    by_gap = {most: all_cycles(lambda drive, wanted, most=most: merged(drive, wanted, most)) for most in GAPS}
+    by_gap = {most: all_cycles(partial(merged, most_gap=most)) for most in GAPS}
     best = min(GAPS, key=lambda most: sum(by_gap[most]))
     rivals = {
         "one request per register": all_cycles(lambda drive, wanted: merged(drive, wanted, -1)),

@@ -11,6 +11,7 @@ import argparse
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ import tables
 from played import Played
 from programs import paced_line
 
-from multidrop.core import Framing
+from multidrop.core import Framing, Result
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.plan import Planned, planned
@@ -42,7 +43,7 @@ class Case:
     predicted: float  # s
     known: float  # the same with the response delays that were measured
     measured: float
-    missed: int  # values; each costs a time-out
+    missed: int  # values that were asked for in vain; each exchange of them costs a time-out
 
     def row(self) -> list[str]:
         seconds = (self.predicted, self.known, self.measured)
@@ -82,13 +83,9 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
             if (row.drive, row.register) == (watched.name, first)
         ]
     delays = {drive: poller.bus("line").respondent(drive).response_delay for drive, _ in wanted}
-    return Case(
-        name,
-        cycle(wanted, {}),
-        cycle(wanted, delays),
-        middle(times),
-        poller.summary()["misses"],
-    )
+    misses = Counter(poller.summary()["lines"]["line"]["misses"])
+    del misses[str(Result.POLL_ENDED)]
+    return Case(name, cycle(wanted, {}), cycle(wanted, delays), middle(times), misses.total())
 
 
 def middle(times: Sequence[int]) -> float:

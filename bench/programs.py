@@ -49,7 +49,7 @@ class Talker:
 def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
     """A program that runs until its standard input ends, and then prints its report as JSON."""
     words = [str(word) for word in command]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **pipes, **details) as process:
         assert process.stdout is not None
         talker = Talker(process.stdout.readline().strip())

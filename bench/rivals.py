@@ -165,10 +165,11 @@ INSTALL = {
 def _missing(wanted: Sequence[str]) -> set[str]:
     missing = set()
     for name in wanted:
+        package = INSTALL.get(name, name)
         try:
-            version(INSTALL.get(name, "multidrop").partition("==")[0])
+            version(package.partition("==")[0])
         except PackageNotFoundError:
-            missing.add(INSTALL[name])
+            missing.add(package)
     return missing
 
 
@@ -193,10 +194,11 @@ def measure(master: str, job: Job) -> dict[str, Any]:
     return result
 
 
-def measure_bare(job: Job, silence: float) -> dict[str, Any]:
-    """The same of bare_master.c, which keeps a silence of so many seconds."""
+def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
+    """The same of bare_master.c: seconds of silence before a request, and without a look after it."""
     command = [compiled("bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
-    command += ["--registers", REGISTERS, "--silence-us", silence * 1e6, job.port]
+    command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
+    command += ["--asleep-us", asleep * 1e6, job.port]
     result: dict[str, Any] = json.loads(subprocess.check_output([str(word) for word in command]))
     return result | {"version": ""}
 

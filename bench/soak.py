@@ -36,7 +36,7 @@ MOST_GROWTH_KB = 2048  # of resident memory, from the end of the first period on
 COMMAND_EVERY = 20.0  # s between a motor's start and its stop
 IN_FLIGHT = 2  # slots of a register that are not rows yet
 HELD_UP = 1.0  # s before a value came, in which the line was held up
-HEAD = (
+HEAD: tuple[str, ...] = (
     "hours",
     "exchanges",
     "a second",

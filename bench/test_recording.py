@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from multidrop.batch import Batch
-from multidrop.core import Block, Columns, Field, Wire, new_completion
+from multidrop.core import Block, Columns, Field, Names, Wire, new_completion
 from multidrop.recording import open_writer
 
 ROWS = 4096
@@ -25,7 +25,7 @@ def batch() -> Batch:
     columns = Columns(ROWS)
     while columns.add(block, found, 0):
         pass
-    return Batch(columns, ["pump-1"], REGISTERS)
+    return Batch(columns, Names(["pump-1"]), Names(REGISTERS))
 
 
 def test_4096_rows_as_arrow(benchmark: Any, batch: Batch) -> None:

@@ -16,6 +16,9 @@ import tables
 from jobs import Job
 from programs import paced_line
 
+BARE = "bare C"
+ASLEEP = "bare C, asleep"  # until a character and a half before a reply's end: that is when multidrop looks
+
 COLUMNS = (
     "baud",
     "master",
@@ -34,8 +37,9 @@ def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
     """One slice, as the drives and as the master see it."""
     with paced_line(baudrate=baudrate) as line:
         job = Job(line.path, baudrate, seconds)
-        if master == "bare C":
-            own = rivals.measure_bare(job, adapter.silence(baudrate))
+        if master in (BARE, ASLEEP):
+            asleep = job.wire - 1.5 * job.character if master == ASLEEP else 0.0
+            own = rivals.measure_bare(job, adapter.silence(baudrate), asleep)
         else:
             own = rivals.measure(master, job)
     report = line.report
@@ -53,7 +57,7 @@ def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
 
 def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
     def middle(key: str) -> float:
-        return median(it[key] for it in slices)
+        return float(median(it[key] for it in slices))
 
     pairs = list(zip(slices, bare, strict=True))
     return [
@@ -73,7 +77,9 @@ def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dic
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
-    parser.add_argument("--masters", nargs="+", choices=rivals.MASTERS, default=rivals.MASTERS)
+    parser.add_argument(
+        "--masters", nargs="+", choices=(*rivals.MASTERS, ASLEEP), default=(*rivals.MASTERS, ASLEEP)
+    )
     parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
     parser.add_argument("--slices", type=int, default=5)
     arguments = parser.parse_args()
@@ -83,7 +89,7 @@ def main() -> None:
         "A paced line: 16 drives, 10 registers each, 8N1, response delay 2 ms, delivered byte by byte."
     )
     for baudrate in arguments.baudrates:
-        pacing = measured("bare C", baudrate, arguments.seconds)["pacing"]
+        pacing = measured(BARE, baudrate, arguments.seconds)["pacing"]
         late = ", ".join(f"{name} {pacing[name]:.1f}" for name in ("p50", "p99", "max"))
         print(f"the line's own lateness per byte at {baudrate}: {late} us")
     print(flush=True)
@@ -94,17 +100,18 @@ def main() -> None:
         for master in arguments.masters:
             bare, slices = [], []
             for _ in range(arguments.slices):
-                bare.append(measured("bare C", baudrate, arguments.seconds))
+                bare.append(measured(BARE, baudrate, arguments.seconds))
                 slices.append(measured(master, baudrate, arguments.seconds))
             yards += bare
             rows.append(row(baudrate, master, slices, bare))
-        rows.append(row(baudrate, "bare C", yards, yards))
+        rows.append(row(baudrate, BARE, yards, yards))
     tables.show(COLUMNS, rows)
     print(
         "\nutilisation: ideal bus cycle / measured; over 1 where the silence is not kept."
         "\ntoo early: requests more than 20 us before the silence was over."
         "\nlate: median time from the end of the silence until a request is seen."
         "\nCPU: of the master's process, per exchange."
+        f"\n{ASLEEP}: until shortly before the reply's end, and not woken by each byte before that."
     )
 
 
