@@ -57,11 +57,9 @@ KINDS = {
     ),
 }
 
-# ASCII frames need no silence, so the second copy of a reply can come while the next request leaves, and
-# both answer alike. The echo of a Delixi query is what a reply with the value 0 is: an adapter that echoes
-# from the beginning is known for it, one that begins later is not at once. The client does not tell these.
+# The echo of a Delixi query is what a reply with the value 0 is: an adapter that echoes from the beginning is
+# known for it, one that begins later is not at once. The client does not tell these.
 NOT_TOLD = {
-    "twice": (Framing.ASCII,),
     "echo": (Framing.DELIXI,),
     "echo now and then": (Framing.DELIXI,),
 }

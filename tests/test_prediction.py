@@ -254,7 +254,7 @@ def test_a_duration_is_told_as_a_plant_file_has_it() -> None:
 
 def test_framing_counts() -> None:
     rtu, text = InnovertIBD(1), InnovertIBD(1, framing=Framing.ASCII)
-    ascii_own = (17 + 15) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n", no silence
+    ascii_own = (17 + 15 + 1.5) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n"
     assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
 

@@ -9,7 +9,7 @@ from multidrop.core import Completion, Exchange, Message, Respondent, Result, ra
 from multidrop.drive import Drive
 from multidrop.errors import BadReply, DriveRefused, NoReply
 from multidrop.line import Line, now_ns, sleep
-from multidrop.plan import Block, alone, blocks
+from multidrop.plan import Block, alone, blocks, silence
 from multidrop.register import Register
 
 READ_ATTEMPTS = 3
@@ -36,8 +36,7 @@ def exchange(
         baudrate=settings.baudrate,
         format=settings.format,
         character=settings.character,
-        # One bit more: the other side may still be sending its second stop bit.
-        silence=drive.needed_silence() + settings.bit,
+        silence=silence(drive),
         turnaround=drive.turnaround_delay,
         period=period,
         insists=insists,

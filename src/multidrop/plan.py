@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from multidrop.core import Message, build_request, reply_length
+from multidrop.core import Framing, Message, build_request, reply_length
 from multidrop.drive import Drive
 from multidrop.register import Carrier, Register, Table
 
@@ -44,8 +44,14 @@ class Planned:
 
 
 def silence(drive: Drive) -> float:
-    """Seconds that are kept around its exchanges: a bit more, for the other side's second stop bit."""
-    return drive.needed_silence() + drive.settings.bit
+    """Seconds that are kept around its exchanges: a bit more, for the other side's second stop bit.
+
+    ASCII frames need none; but after 1.5 characters it shows whether more is to come, such as a second
+    copy of the reply, which could else be taken for the next one.
+    """
+    settings = drive.settings
+    least = 0.0 if drive.framing is Framing.RTU else 1.5 * settings.character
+    return max(drive.needed_silence(), least) + settings.bit
 
 
 def sending(drive: Drive, block: Block) -> float:

@@ -12,7 +12,7 @@ from typing import Any
 from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
 from multidrop.drive import Drive
-from multidrop.plan import Block
+from multidrop.plan import Block, silence
 from multidrop.register import Access, Carrier, Register
 from multidrop.timing import Settings
 
@@ -189,6 +189,6 @@ def _sweep(
         families,
         Question(request.function, request.start, request.count, request.data),
         addresses,
-        silence=max(drive.needed_silence() for drive in drives) + settings.bit,
+        silence=max(map(silence, drives)),
         patience=LEAST_TIMEOUT + 2 * max(drive.response_delay for drive in drives),
     )
