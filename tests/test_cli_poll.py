@@ -140,8 +140,9 @@ def test_a_recording_says_what_its_registers_are(plant: Path, tmp_path: Path) ->
         1,
         "9600 8N1",
     )
-    assert drive["registers"]["output_current"] == {"unit": "A", "step": 0.01, "values": None}
-    assert drive["registers"]["mystery"] == {"unit": "", "step": None, "values": None}
+    place = {"function": 3, "address": 2, "words": 1}
+    assert drive["registers"]["output_current"] == {"unit": "A", "step": 0.01, "values": None, **place}
+    assert drive["registers"]["mystery"] == {"unit": "", "step": None, "values": None, **place, "address": 3}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

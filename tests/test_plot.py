@@ -37,11 +37,16 @@ ABOUT: dict[str, Any] = {
             "settings": "9600 8N1",
             "framing": "rtu",
             "registers": {
-                "output_frequency": {"unit": "Hz", "step": 0.01},
-                "fault": {"unit": "", "step": 1, "values": FAULTS},
+                "output_frequency": {"unit": "Hz", "step": 0.01, "function": 3, "address": 7, "words": 1},
+                "fault": {"unit": "", "step": 1, "values": FAULTS, "function": 3, "address": 8, "words": 1},
             },
         },
-        "fan": {"registers": {"output_current": {"unit": "A", "step": None}}},
+        "fan": {
+            "framing": "rtu",
+            "registers": {
+                "output_current": {"unit": "A", "step": None, "function": 3, "address": 4, "words": 1}
+            },
+        },
     },
 }
 REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
@@ -231,10 +236,24 @@ def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
     assert line.rate("pump") == pytest.approx(10, rel=0.01)
     assert line.rate("fan") == pytest.approx(5, rel=0.01)
-    assert line.cycle == pytest.approx(9.976 * 2 / 150, rel=0.01)
+    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # three registers, 250 values
     page = report_page(look)
     assert "fan, exchanges/s" in page
-    assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>133\.\d</td>", page)
+    assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
+
+
+def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
+    """In the first half the pump's two registers are read singly, each with a reply of 7 characters."""
+    rows = [
+        row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)
+        for tick in range(100)
+        for name in ("output_frequency", "fault")
+    ]
+    planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"pump": PLANNED["hall-1"]["drives"]["pump"]}}}
+    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    assert line.asked == {"pump": 150}
+    assert line.needed == pytest.approx(np.array([0.024] * 100 + [0.026] * 50))
+    assert line.cycle == pytest.approx(0.1, rel=0.01)
 
 
 @pytest.mark.parametrize("planned", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])

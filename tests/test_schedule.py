@@ -406,6 +406,20 @@ def test_a_job_that_is_removed_within_its_slot_is_not_taken() -> None:
     assert take(made, 5, 100) == []
 
 
+def test_who_replaces_others_has_their_place_in_the_round_and_their_next_slot() -> None:
+    jobs = [job(drive) for drive in range(4)]
+    made = schedule(*jobs)
+    assert [it for it, _ in take(made, 0, 10)] == jobs[:2]
+    made.replace([jobs[0], jobs[2]], [both := job(8)], 0)
+    made.replace([jobs[3]], [one := job(5), other := job(6)], 0)
+    assert [it for it, _ in take(made, 10, 25)] == [both, one, other, jobs[1], both]
+    made.add(timed := job(9, 100), 40 * MS)
+    assert take(made, 40, 1) == [(timed, 40)]
+    made.replace([timed], [slower := job(7, 100)], timed.due_ns)
+    assert [(it, due) for it, due in take(made, 140, 1)] == [(slower, 140)]
+    assert set(made.jobs) == {jobs[1], both, one, other, slower}
+
+
 def test_a_cycle_repeats_where_all_answer_and_nobody_has_slots() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]

@@ -61,9 +61,12 @@ def sending(drive: Drive, block: Block) -> float:
     return characters * drive.settings.character
 
 
-def duration(drive: Drive, block: Block) -> float:
-    """Seconds of the line that a block takes: silence, request, response delay, reply."""
-    return silence(drive) + sending(drive, block) + drive.response_delay
+def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
+    """Seconds of the line that a block takes: silence, request, response delay, reply.
+
+    `delay` is the response delay, where it was measured, in place of the document's.
+    """
+    return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
@@ -80,8 +83,10 @@ def kind(drive: Drive) -> tuple[float, str]:
     return silence(drive), str(drive.settings)
 
 
-def planned(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> list[Planned]:
-    """The blocks that read these registers, each as often as is wanted.
+def planned(
+    drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
+) -> list[Planned]:
+    """The blocks that read these registers, each as often as is wanted, with this response delay.
 
     Registers of different rates never share a block: what is asked for more seldom would be read
     more often than it is wanted.
@@ -92,7 +97,7 @@ def planned(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) 
     return [
         Planned(drive, block, every)
         for every, registers in rates.items()
-        for block in blocks(drive, registers)
+        for block in blocks(drive, registers, delay)
     ]
 
 
@@ -126,8 +131,8 @@ def alone(register: Register[Any]) -> Block:
     return _block(register.table, [register])
 
 
-def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:
-    """The requests that read these registers in the least time.
+def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None = None) -> tuple[Block, ...]:
+    """The requests that read these registers in the least time, with the drive's response delay.
 
     Registers of a table are read together up to the family's limit, where that is the quicker way
     also across others that can be read, and across reserved addresses where the family's document
@@ -140,10 +145,12 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...
                 f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}"
             )
         tables.setdefault(register.table, []).append(register)
-    return tuple(block for table, wanted in tables.items() for block in _cheapest(drive, table, wanted))
+    return tuple(
+        block for table, wanted in tables.items() for block in _cheapest(drive, table, wanted, delay)
+    )
 
 
-def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]]) -> list[Block]:
+def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]], delay: float | None) -> list[Block]:
     """Least total duration by dynamic programming over where the last block begins."""
     registers = sorted(registers, key=lambda register: (register.address, register.words))
     readable = _readable(drive, table, registers)
@@ -155,7 +162,7 @@ def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]]) -> lis
             if not _allowed(drive, block, readable):
                 break
             cost, before = best[begin]
-            choices.append((cost + duration(drive, block), [*before, block]))
+            choices.append((cost + duration(drive, block, delay), [*before, block]))
         best.append(min(choices, key=lambda choice: choice[0]))
     return best[-1][1]
 

@@ -38,6 +38,10 @@ class PolledDrive:
     drive: Drive
     polls: tuple[Polled, ...]
 
+    def planned(self, delay: float | None = None) -> list[Planned]:
+        """In blocks; `delay` is the drive's response delay in s, where it was measured."""
+        return planned(self.drive, [(it.register, it.every) for it in self.polls], delay)
+
 
 @dataclass(frozen=True)
 class Line:
@@ -50,13 +54,10 @@ class Line:
     drives: tuple[PolledDrive, ...]
     switching: float = 0.0  # s that the port needs to change them
 
-    def planned(self) -> list[Planned]:
-        """All that is polled on it, in blocks."""
-        return [
-            one
-            for polled in self.drives
-            for one in planned(polled.drive, [(it.register, it.every) for it in polled.polls])
-        ]
+    def planned(self, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
+        """All that is polled on it, in blocks; `delays` are response delays in s that were measured."""
+        known = delays or {}
+        return [one for polled in self.drives for one in polled.planned(known.get(polled.drive))]
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ def _described(line: Line, polled: PolledDrive) -> dict[str, Any]:
 
 def _meaning(register: Register[Any]) -> dict[str, Any]:
     values = {it.name: it.value for it in register.values} if register.values else None
-    return {"unit": register.unit, "step": register.step, "values": values}
+    place = {"function": register.table.read, "address": register.address, "words": register.words}
+    return {"unit": register.unit, "step": register.step, "values": values, **place}
 
 
 class PlantError(ValueError):

@@ -1,7 +1,8 @@
 """A line that is polled: its schedule, what is queued on it, and what to do when that fails.
 
 Where all its drives answer and are polled as fast as it allows, the core repeats the bus cycle by
-itself; else its queue is topped up, many exchanges at a time and some way ahead. A register that is
+itself; else its queue is topped up, many exchanges at a time and some way ahead. Blocks are chosen
+anew when a drive's response delay turns out to be another than its document's. A register that is
 refused is set aside, and a port that was lost is opened again.
 """
 
@@ -30,15 +31,16 @@ from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.exchanges import reading
 from multidrop.line import now_ns
-from multidrop.plan import Block, alone, blocks, in_order, kind, sending, silence
+from multidrop.plan import Block, alone, in_order, kind, sending, silence
 from multidrop.plant import PolledDrive
-from multidrop.register import Register
 from multidrop.rules import check_own
 from multidrop.schedule import Asking, Job, Schedule
 from multidrop.statistics import Statistics
 
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
+RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
+OTHER_DELAY = 0.25  # of the response delay that blocks were chosen for: they are chosen anew
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
@@ -81,6 +83,14 @@ class Asked(Job):
         return round((silence(self.owner) + sending(self.owner, self.block) + response_delay) * 1e9)
 
 
+@dataclass
+class Chosen:
+    """The jobs that read a drive in the least time, if its response delay, in s, is this."""
+
+    jobs: list[Asked]
+    delay: float
+
+
 class PolledLine:
     """A line's bus, its schedule, and what is queued on it. `number` is what the core calls it by."""
 
@@ -92,13 +102,14 @@ class PolledLine:
         self._ended_ns: int | None = None  # nothing is due any more
         self._over_ns: int | None = None  # nor under way
         self.set_aside: dict[Asked, Asked] = {}  # instead of a single register that is refused: rarely
+        self._rare: dict[Asked, Asked] = {}  # by what they have stood for
         self._number = number
         self._inbox = inbox
         self._codes = codes
         self._port: Port | None = None  # that was tended last
         self._done = 0  # exchanges on it, when it was tended last
-        self._jobs: list[Asked] = []  # all there ever were: the core may still look at them
-        self._declared: dict[PolledDrive, list[Asked]] = {}
+        self._jobs: dict[tuple[Drive, Block, int | None], Asked] = {}  # all there ever were
+        self._chosen: dict[PolledDrive, Chosen] = {}
         self._lock = threading.Lock()  # of all above and below: drives come and go on any thread
         self._is_started = False
         self._ahead_ns = 0  # what is queued will take
@@ -135,19 +146,17 @@ class PolledLine:
         """A drive that comes back has the jobs that it had."""
         drive = polled.drive
         self.bus.line.require((drive.settings.baudrate, drive.settings.format))
-        if polled in self._declared:
-            return self._declared[polled]
-        rates: dict[float | None, list[Register[Any]]] = {}
-        for poll in polled.polls:
-            check_own(drive, poll.register)
-            rates.setdefault(poll.every, []).append(poll.register)
-        jobs: list[Asked] = []
-        for every, registers in rates.items():
-            period_ns = None if every is None else round(every * 1e9)
-            jobs += [self._job(drive, block, period_ns) for block in blocks(drive, registers)]
-        self._jobs += jobs
-        self._declared[polled] = jobs
-        return jobs
+        if polled not in self._chosen:
+            for poll in polled.polls:
+                check_own(drive, poll.register)
+            self._chosen[polled] = Chosen(self._choose(polled, drive.response_delay), drive.response_delay)
+        return self._chosen[polled].jobs
+
+    def _choose(self, polled: PolledDrive, delay: float) -> list[Asked]:
+        return [
+            self._job(it.drive, it.block, None if it.every is None else round(it.every * 1e9))
+            for it in polled.planned(delay)
+        ]
 
     def remove(self, drive: Drive) -> None:
         with self._lock:
@@ -164,6 +173,12 @@ class PolledLine:
         self._inbox.call(self._number)
 
     def _job(self, drive: Drive, block: Block, period_ns: int | None) -> Asked:
+        key = drive, block, period_ns
+        if key not in self._jobs:
+            self._jobs[key] = self._made(drive, block, period_ns)
+        return self._jobs[key]
+
+    def _made(self, drive: Drive, block: Block, period_ns: int | None) -> Asked:
         fields = self._codes.fields(drive, block)
         respondent = self.bus.respondent(drive)
         job = Asked(
@@ -183,16 +198,15 @@ class PolledLine:
         with self._lock:
             self.started_ns = now_ns()
             self.bus.reset_statistics()
-            polled = {it.drive: jobs for it, jobs in self._declared.items()}
+            chosen = {polled.drive: it.jobs for polled, it in self._chosen.items()}
             for drive in in_order(self.bus.drives, self.switching):
-                for job in polled[drive]:
+                for job in chosen[drive]:
                     self.schedule.add(job, self.started_ns)
             self._is_started = True
 
-    @property
-    def is_steady(self) -> bool:
-        """Nothing is to be done for it until the core calls."""
-        return bool(self._cycle)
+    def is_steady(self, now: int) -> bool:
+        """Nothing is to be done for it now, unless the core calls."""
+        return bool(self._cycle) and now - self._learnt_ns < RELEARN_NS
 
     def tend(self, now: int) -> None:
         """See what became of what was queued, and queue what comes next."""
@@ -252,6 +266,22 @@ class PolledLine:
         for job in self.schedule.jobs:
             job.duration_ns = job.expected_ns(delays[job.owner] or job.owner.response_delay)
         self._ahead_ns = sum(it.job.duration_ns for it in self._queued)
+        for polled, chosen in self._chosen.items():
+            delay = delays.get(polled.drive) or chosen.delay
+            if abs(delay - chosen.delay) > OTHER_DELAY * chosen.delay:
+                self._choose_anew(polled, chosen, delay, now)
+
+    def _choose_anew(self, polled: PolledDrive, chosen: Chosen, delay: float, now: int) -> None:
+        """Unless some of its registers are refused, and are asked for in another way."""
+        if not set(chosen.jobs) <= set(self.schedule.jobs):
+            return
+        jobs = self._choose(polled, delay)
+        for period_ns in {it.period_ns for it in jobs}:
+            before = [it for it in chosen.jobs if it.period_ns == period_ns and it not in jobs]
+            others = [it for it in jobs if it.period_ns == period_ns and it not in chosen.jobs]
+            due_ns = min((it.due_ns for it in before if period_ns), default=now)
+            self.schedule.replace(before, others, due_ns)
+        chosen.jobs, chosen.delay = jobs, delay
 
     def _heed_refusals(self, now: int) -> None:
         """Registers that are refused together are asked for singly; a single one is set aside.
@@ -259,27 +289,22 @@ class PolledLine:
         So no register is lost because of its neighbours. When it is read after all, it is polled as before.
         """
         for job in [it for it in self.set_aside if not it.fields.refusals]:
-            self._replace(job, [self.set_aside.pop(job)], now)
+            self.schedule.replace([job], [self.set_aside.pop(job)], now)
         for job in [it for it in self.schedule.jobs if self._is_refused(it)]:
             if len(job.block.registers) > 1:
                 parts = [self._job(job.owner, alone(it), job.period_ns) for it in job.block.registers]
-                self._jobs += parts
-                self._replace(job, parts, now)
+                self.schedule.replace([job], parts, now)
             elif job not in self.set_aside:
-                rare = self._job(job.owner, job.block, SET_ASIDE_NS)
+                if job not in self._rare:
+                    self._rare[job] = self._made(job.owner, job.block, SET_ASIDE_NS)
+                rare = self._rare[job]
                 rare.fields.refusals, job.fields.refusals = job.fields.refusals, 0
-                self._jobs.append(rare)
                 self.set_aside[rare] = job
-                self._replace(job, [rare], now)
+                self.schedule.replace([job], [rare], now)
 
     @staticmethod
     def _is_refused(job: Asked) -> bool:
         return job.fields.refusals >= REFUSALS and not job.owner.is_passing(job.fields.refusal)
-
-    def _replace(self, job: Asked, others: list[Asked], now: int) -> None:
-        self.schedule.remove(job)
-        for other in others:
-            self.schedule.add(other, now)
 
     def _keep_busy(self, port: Port, now: int) -> None:
         cycle = self.schedule.cycle(now)
@@ -370,7 +395,7 @@ class PolledLine:
             "late_replies": sum(tally.late for tally in tallies),
             "stray_bytes": sum(tally.stray_bytes for tally in tallies),
             "utilisation": round(sum(tally.ideal_ns for tally in tallies) / 1e9 / seconds, 4),
-            "overrun_slots": sum(job.skipped for job in self._jobs),
+            "overrun_slots": sum(job.skipped for job in self._jobs.values()),
             "switching_ms": round(self.switching * 1e3, 3),
             "set_aside": [f"{job.owner.name}.{job.block.registers[0].name}" for job in self.set_aside],
             "drives": drives,

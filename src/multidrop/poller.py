@@ -101,7 +101,8 @@ class Poller:
                 line.tend(now_ns())
             if self._is_watched and self._inbox.chunks:
                 self._wake.set()
-            restless = [line for line in self._lines if not line.is_steady]
+            now = now_ns()
+            restless = [line for line in self._lines if not line.is_steady(now)]
             seconds = LOOK_S if restless or self._is_watched else REST_S
             numbers = self._inbox.await_calls(seconds)
             lines = [self._lines[it] for it in numbers if it < len(self._lines)]

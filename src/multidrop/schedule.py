@@ -14,7 +14,7 @@ the line. With its first answer it is back.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
@@ -106,6 +106,17 @@ class Schedule(Generic[J]):
             at = self._turn.index(job)
             self._next -= at < self._next
             self._turn.pop(at)
+
+    def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
+        """Others instead of jobs, in their place in the round; the first slot of each is due then."""
+        turn = self._turn[self._next :] + self._turn[: self._next]
+        at = next((at for at, job in enumerate(turn) if job in jobs), len(turn))
+        for job in others:
+            self.add(job, due_ns)
+        turn[at:at] = [job for job in others if job.period_ns is None]
+        self._turn, self._next = turn, 0
+        for job in jobs:
+            self.remove(job)
 
     def forget(self, drive: int) -> None:
         """A drive of which no job is left."""

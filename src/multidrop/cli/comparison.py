@@ -15,18 +15,19 @@ Figures = dict[str, Any]
 
 def compared(line: Line, summary: dict[str, Any]) -> dict[str, Figures]:
     """Predictions, with the documents' response delays and with what was measured, and the summary."""
-    wanted = line.planned()
     told = summary["drives"]
     known = {
         polled.drive: told[polled.drive.name]["response_delay_ms"] / 1e3
         for polled in line.drives
         if told[polled.drive.name]["exchanges_per_second"]  # only those that answer have one
     }
-    asked_for = any(it.every is not None for it in wanted)  # then no cycle follows the other
-    cycles = summary["exchanges"] / len(wanted)
+    polls = [poll for polled in line.drives for poll in polled.polls]
+    asked_for = any(poll.every is not None for poll in polls)  # then no cycle follows the other
+    cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
+    by_delays = predict(line.planned(known), known, summary["switching_ms"] / 1e3)
     return {
-        "predicted": _figures(predict(wanted, switching=line.switching)),
-        "predicted_with_measured_delays": _figures(predict(wanted, known, summary["switching_ms"] / 1e3)),
+        "predicted": _figures(predict(line.planned(), switching=line.switching)),
+        "predicted_with_measured_delays": _figures(by_delays),
         "measured": {
             "cycle_ms": None if asked_for or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
             "utilisation": summary["utilisation"],

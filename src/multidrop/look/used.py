@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from multidrop.core import Framing, Message, reply_length
 from multidrop.look.recorded import Array, Look
 from multidrop.look.style import days, line_style, new_figure, tell_time, time_edges
 
@@ -23,6 +24,7 @@ class Used:
     time: Array  # ns UTC
     needed: Array  # s: silence before it, request, response delay, reply
     asked: Mapping[str, int]  # exchanges that were answered, by drive
+    values: int  # in their replies
     seconds: float
 
     @property
@@ -31,11 +33,11 @@ class Used:
 
     @property
     def cycle(self) -> float | None:
-        """Seconds for one exchange of each block; None where some are asked for at a rate of their own."""
+        """Seconds to read everything once; None where some is asked for at a rate of its own."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
-        if any(block["every_ms"] is not None for block in blocks) or not len(self.time):
+        if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None
-        return self.seconds * len(blocks) / len(self.time)
+        return self.seconds * sum(len(block["registers"]) for block in blocks) / self.values
 
     def rate(self, drive: str) -> float:
         return self.asked.get(drive, 0) / self.seconds
@@ -51,10 +53,11 @@ def used(look: Look) -> list[Used]:
 
 def _used(look: Look, line: str, planned: Mapping[str, Any]) -> Used:
     parts: list[tuple[Array, Array, Array]] = []
-    asked = {}
+    asked, values = {}, 0
     for name, drive in planned["drives"].items():
-        time, needed = _exchanges(look, name, drive)
+        time, needed, read = _exchanges(look, name, drive)
         asked[name] = len(time)
+        values += read
         parts.append((time, needed, np.full(len(time), drive["silence_ms"] / 1e3)))
     if not parts:
         parts.append((np.zeros(0, np.int64), np.zeros(0), np.zeros(0)))
@@ -64,21 +67,37 @@ def _used(look: Look, line: str, planned: Mapping[str, Any]) -> Used:
     if len(time):  # the longer of two neighbours' silences is kept
         needed = needed + np.maximum(silence, np.concatenate([silence[:1], silence[:-1]]))
     end = float(needed[-1]) if len(time) else 0.0
-    return Used(line, planned, time, needed, asked, max(look.seconds + end, 1e-9))
+    return Used(line, planned, time, needed, asked, values, max(look.seconds + end, 1e-9))
 
 
-def _exchanges(look: Look, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array]:
-    """When each answered exchange with a drive was sent, and the seconds from then to its reply's end."""
-    found: dict[int, float] = {}
-    for block in drive["blocks"]:
-        # The stamps go from the request's begin to the first character of the reply.
-        rest = (block["reply_characters"] - 1) * drive["character_ms"] / 1e3
-        for register in block["registers"]:
-            for it in look.of(name, register):
-                there = ~it.missed
-                seconds = it.uncertainty[there] / 1e9 + rest
-                found.update(zip(it.time[there].tolist(), seconds.tolist(), strict=True))
-    return np.array(list(found), np.int64), np.array(list(found.values()))
+def _exchanges(look: Look, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
+    """When each answered exchange with a drive was sent, the seconds from then to its reply's end, and
+
+    how many values there are. What was read at one time was read together: blocks may be chosen anew.
+    """
+    of = [
+        it for block in drive["blocks"] for register in block["registers"] for it in look.of(name, register)
+    ]
+    read = [(it, ~it.missed) for it in of]
+    if not any(known.any() for _, known in read):
+        return np.zeros(0, np.int64), np.zeros(0), 0
+    times = np.concatenate([it.time[known] for it, known in read])
+    time, first, exchange = np.unique(times, return_index=True, return_inverse=True)
+    uncertainty = np.concatenate([it.uncertainty[known] for it, known in read])[first]
+    function, address, words = (
+        np.concatenate([np.full(known.sum(), it.meaning[key]) for it, known in read])
+        for key in ("function", "address", "words")
+    )
+    start, end = np.full(len(time), address.max()), np.zeros(len(time), np.int64)
+    np.minimum.at(start, exchange, address)
+    np.maximum.at(end, exchange, address + words)
+    blocks, which = np.unique(np.stack([function[first], start, end - start]), axis=1, return_inverse=True)
+    framing = Framing[look.about(name)["framing"].upper()]
+    requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
+    characters = np.array([reply_length(framing, it) for it in requests])[which]
+    # The stamps go from the request's begin to the first character of the reply.
+    rest = (characters - 1) * drive["character_ms"] / 1e3
+    return time, uncertainty / 1e9 + rest, len(times)
 
 
 def draw_used(found: Sequence[Used], look: Look) -> Figure:
