@@ -14,9 +14,10 @@ from lines import line, plant, polled, rows_of, until
 from serial import Serial, rfc2217
 from toy import PatientToy, Toy
 
+from multidrop import line as line_module
 from multidrop.bus import Bus
 from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
-from multidrop.core import set_settings
+from multidrop.core import Port, set_settings
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.line import Line
 from multidrop.poller import Poller
@@ -53,6 +54,22 @@ def test_a_socket() -> None:
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path) as bus:
         read_and_write(bus)
     assert sim.wires[0].drives[0]["frequency"] == 25.0
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
+def test_a_network_that_stalls_for_a_second_hands_on_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No loopback loses packets: what is looked at is what the kernel is told."""
+    told: list[int] = []
+
+    class Watched(Port):
+        def __init__(self, fd: int, must_take: int) -> None:
+            with socket.socket(fileno=os.dup(fd)) as connection:
+                told.append(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT))
+            super().__init__(fd, must_take)
+
+    monkeypatch.setattr(line_module, "Port", Watched)
+    with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path):
+        assert told == [1000]
 
 
 def test_a_pty_is_opened_again_and_again() -> None:

@@ -39,6 +39,7 @@ def now_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 
+_MOST_STALL_MS = 1000  # of a network
 _ALL_SETTINGS = sum(REFUSALS)
 _BAUDRATE = min(REFUSALS)
 _NO_SETTINGS = -1
@@ -152,20 +153,32 @@ class Line:
             os.set_blocking(fd, False)
             with socket.socket(fileno=os.dup(fd)) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if hasattr(
+                    socket, "TCP_USER_TIMEOUT"
+                ):  # what waits longer never leaves: it may start a motor
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _MOST_STALL_MS)
             return Port(fd, _NO_SETTINGS)
         if self._settings:
             set_up(port, self._settings)
         self._bridge = Bridge(port)
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
 
-    def close(self) -> None:
-        """Close the port; what is queued and not yet sent never will be."""
+    def drop(self) -> None:
+        """Carry out nothing more; what is queued and not yet sent never will be. The port itself, which
+
+        may take its time, is closed by `close` or `reopen`.
+        """
         with self._lock:
             core, self._core = self._core, None
             if core:
                 core.stop()
                 if self._left.wait_for(lambda: not self._waiting, timeout=1.0):
                     core.close()  # nobody looks at it any more
+
+    def close(self) -> None:
+        """Drop the port and close it."""
+        with self._lock:
+            self.drop()
             if self._bridge:
                 self._bridge.close()
                 self._bridge = None
