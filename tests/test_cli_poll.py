@@ -20,6 +20,7 @@ from toy import Toy
 from multidrop.batch import Row
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
+from multidrop.core import Result
 from multidrop.errors import NoReply
 from multidrop.recording import open_reader
 
@@ -103,6 +104,9 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
             bus.read(bus.attach(Toy, 1), Toy.output_current)
 
 
+LATE_OR_SILENT = {str(it) for it in (Result.NO_REPLY, Result.LATE_ANSWER_DUE, Result.NOT_ASKED)}
+
+
 def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     done = multidrop("poll", plant, "--seconds", 1.5, "--out", out, "--json")
@@ -113,17 +117,9 @@ def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> No
     assert {row.drive for row in samples} == {"pump-1"}
     assert len(samples) == summary["samples"] > 0
     misses = [row for row in rows if row.value is None]
-    assert {row.drive for row in misses} == {"pump-9"}
     assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
-    assert (
-        {"no reply"}
-        <= {row.status for row in misses}
-        <= {
-            "no reply",
-            "not asked: late reply due",
-            "not asked: drive is silent",
-        }
-    )
+    assert {"no reply"} <= {row.status for row in misses if row.drive == "pump-9"} <= LATE_OR_SILENT
+    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # by a busy machine
     assert len(misses) == summary["misses"]
     assert summary["lines"]["hall-1"]["exchanges"] > 0
     assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0

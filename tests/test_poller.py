@@ -16,7 +16,8 @@ from typing import Any
 
 import checksums
 import pytest
-from lines import Faulty, line, plant, polled, proofs, rows_of, until
+from lines import PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
+from serial import Serial
 from toy import Toy
 from worlds import World, WorldWire
 
@@ -401,6 +402,39 @@ def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Pa
         polling.until("ok", 100, "pump-1")
     assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
     polling.check_summary()
+
+
+@pytest.mark.parametrize("slow", ["close", "open"])
+def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
+    port: str, slow: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, is_held_up, may_go_on = tmp_path / "hall-2", threading.Event(), threading.Event()
+    act = getattr(Serial, slow)
+
+    def hold_up(it: Serial) -> None:
+        if it.port == str(link):
+            is_held_up.set()
+            assert may_go_on.wait(PATIENCE)
+        act(it)
+
+    with ExitStack() as stack:
+        lines = [
+            line(port, polled(drive(), ONE, 0.02), name="hall-1"),
+            line(str(link), polled(drive(1, "fan-1"), ONE), name="hall-2"),
+        ]
+        with Simulator([Wire([simulated(drive())], port=str(link), unpaced=True)]):
+            polling = stack.enter_context(Polling(*lines))
+            polling.until("ok", 1, "fan-1")
+            monkeypatch.setattr(Serial, slow, hold_up)
+        stack.callback(may_go_on.set)
+        assert is_held_up.wait(PATIENCE)
+        late = threading.Thread(target=polling.poller.add, args=("hall-2", polled(drive(2, "fan-2"), ONE)))
+        late.start()
+        polling.until("ok", 50, "pump-1")  # more than was queued ahead
+        may_go_on.set()
+        late.join(PATIENCE)
+        polling.until("port lost", 1, "fan-2")
+    assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
 
 
 def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:

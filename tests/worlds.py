@@ -235,8 +235,10 @@ class WorldLine:
     def overruns(self) -> None:
         pass
 
-    def close(self) -> None:
+    def drop(self) -> None:
         self.queue = self._world.port = None
+
+    close = drop
 
     def reopen(self) -> None:
         self.close()

@@ -129,6 +129,8 @@ class PolledLine:
             raise
 
     def add(self, polled: PolledDrive) -> None:
+        settings = polled.drive.settings  # a port that is being opened is waited for, but not by the polling
+        self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
             drive = self.bus.attach(polled.drive)
             try:
@@ -145,7 +147,6 @@ class PolledLine:
     def _jobs_of(self, polled: PolledDrive) -> list[Asked]:
         """A drive that comes back has the jobs that it had."""
         drive = polled.drive
-        self.bus.line.require((drive.settings.baudrate, drive.settings.format))
         if polled not in self._chosen:
             for poll in polled.polls:
                 check_own(drive, poll.register)
@@ -244,7 +245,7 @@ class PolledLine:
         self._queued.clear()
         self._cycle = []
         self._ahead_ns = 0
-        self.bus.line.close()
+        self.bus.line.drop()
         self._reopen_ns = now
 
     def _observe(self, now: int) -> None:
