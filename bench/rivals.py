@@ -53,34 +53,39 @@ def pymodbus(job: Job) -> Iterator[Read]:
 
 
 @contextmanager
+def pyserial(job: Job) -> Iterator[Any]:
+    """What the others call a serial port; over TCP the same frames go through pyserial's socket:// port."""
+    import serial
+
+    with serial.serial_for_url(job.port, job.port_baudrate, timeout=TIMEOUT_S) as port:
+        yield port
+
+
+@contextmanager
 def minimalmodbus(job: Job) -> Iterator[Read]:
     from minimalmodbus import Instrument
 
-    drives = {address: Instrument(job.port, address) for address in range(1, job.drives + 1)}
-    port = drives[1].serial
-    port.baudrate, port.timeout = job.port_baudrate, TIMEOUT_S
-    yield lambda address: drives[address].read_registers(0, REGISTERS)
-    port.close()
+    with pyserial(job) as port:
+        drives = {address: Instrument(port, address) for address in range(1, job.drives + 1)}
+        yield lambda address: drives[address].read_registers(0, REGISTERS)
 
 
 @contextmanager
 def modbus_tk(job: Job) -> Iterator[Read]:
-    import serial
     from modbus_tk.defines import READ_HOLDING_REGISTERS
     from modbus_tk.modbus_rtu import RtuMaster
 
-    master = RtuMaster(serial.Serial(job.port, job.port_baudrate))
-    master.set_timeout(TIMEOUT_S)
-    yield lambda address: master.execute(address, READ_HOLDING_REGISTERS, 0, REGISTERS)
-    master.close()
+    with pyserial(job) as port:
+        master = RtuMaster(port)
+        master.set_timeout(TIMEOUT_S)
+        yield lambda address: master.execute(address, READ_HOLDING_REGISTERS, 0, REGISTERS)
 
 
 @contextmanager
 def umodbus(job: Job) -> Iterator[Read]:
-    import serial
     from umodbus.client.serial import rtu
 
-    with serial.Serial(job.port, job.port_baudrate, timeout=TIMEOUT_S) as port:
+    with pyserial(job) as port:
         yield lambda address: rtu.send_message(rtu.read_holding_registers(address, 0, REGISTERS), port)
 
 
@@ -151,7 +156,6 @@ IN_PYTHON = {
     "pymodbus-async": pymodbus_async,
 }
 MASTERS = (*IN_PYTHON, "libmodbus")
-OVER_TCP = ("multidrop", "pymodbus", "pymodbus-async")  # RTU frames in a TCP connection
 
 INSTALL = {
     "pymodbus": "pymodbus==3.16.1",
