@@ -3,13 +3,15 @@
 A bare epoll loop in C over as many lines runs before every slice, and ratios are to that slice. The
 client is on one processor and the far ends are on another: on the same one the scheduler lets them
 interrupt a client that takes more time than they do, every few exchanges. `python many_lines.py JOB`
-is the process that polls.
+is the process that polls. More lines than the system has room for are left out, and the limit is told.
+A default run takes a quarter of an hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import threading
@@ -17,6 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from pathlib import Path
 from socket import socket, socketpair
 from statistics import median
@@ -29,6 +32,9 @@ from programs import CHECKSUM, compiled, on_processor, talking
 BAUDRATE = 115200
 DELAY_US = 2000
 SETTLE_S = 2.0  # some thousand drives' first exchanges
+DESCRIPTORS = 5  # that a poller holds for a line: its port and two pipes; the far ends need fewer
+OTHERS = 64  # descriptors that are no line's
+PTYS = Path("/proc/sys/kernel/pty")
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,24 @@ def poll(job: Lines) -> dict[str, Any]:
 
 
 # ---- the process that measures ----
+
+
+def room(kind: str) -> dict[str, int]:
+    """How many such lines there can be, by each limit of the system."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    limits = {f"{DESCRIPTORS} descriptors a line, {files} a process": (files - OTHERS) // DESCRIPTORS}
+    if kind == "pty":
+        most, used = (int((PTYS / name).read_text()) for name in ("max", "nr"))
+        limits[f"kernel.pty.max is {most}, {used} are in use"] = most - used
+    return limits
+
+
+def has_room(kind: str, count: int) -> bool:
+    """Whether there can be so many such lines; says why, if not."""
+    why, most = min(room(kind).items(), key=itemgetter(1))
+    if count > most:
+        print(f"{kind} {count} is left out: there is room for {most} ({why}).", flush=True)
+    return count <= most
 
 
 @contextmanager
@@ -162,8 +186,10 @@ def main() -> None:
     arguments = parser.parse_args()
     tables.heading("Many lines in one process: 16 drives on each, 10 registers each, decoded to columns.")
 
+    _, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most_files, most_files))
     kinds = {"socketpair": arguments.socketpairs, "pty": arguments.ptys}
-    asked = [(kind, count) for kind, counts in kinds.items() for count in counts]
+    asked = [(kind, count) for kind, counts in kinds.items() for count in counts if has_room(kind, count)]
     rows = [line for kind, count in asked for line in compared(kind, count, arguments)]
     columns = "lines", "number", "master", "exchanges/s", "/ bare", "CPU us", "/ bare", "in Python", "failed"
     tables.show(columns, rows)

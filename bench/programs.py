@@ -52,7 +52,10 @@ def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **pipes, **details) as process:
         assert process.stdout is not None
-        talker = Talker(process.stdout.readline().strip())
+        said = process.stdout.readline()
+        if not said.endswith("\n"):
+            raise RuntimeError(f"{Path(words[0]).name} ended before its lines were there")
+        talker = Talker(said.strip())
         yield talker
         told, _ = process.communicate()
     talker.report = json.loads(told)
