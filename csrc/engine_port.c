@@ -94,13 +94,13 @@ static int64_t apply_settings(struct md_port *port, const struct md_settings *se
     now_ns = md_now_ns();
     port->progress.switching_ns += now_ns - begun_ns;
     md_put(&port->progress.switches, port->progress.switches + 1);
-    port->settings = *settings;
+    port->settings = (struct md_settings){0}; /* of those that are refused some may be in force now */
     if (refused < 0)
         lose(port, -refused);
-    else if (refused & port->must_take) {
-        port->settings = (struct md_settings){0}; /* some of them may have been taken */
+    else if (refused & port->must_take)
         md_line_abandon(&port->line, MD_SETTINGS_REFUSED, refused);
-    }
+    else
+        port->settings = *settings;
     return now_ns;
 }
 
