@@ -53,10 +53,14 @@ class Bridge:
         with suppress(OSError):
             self._ours.shutdown(socket.SHUT_RDWR)
 
+    def forget(self) -> None:
+        """Close without hanging up: others still use it."""
+        self._ours.close()
+        self.theirs.close()
+
     def close(self) -> None:
         self._closing.set()
         self._hang_up()
         for thread in self._threads:
             thread.join()
-        self._ours.close()
-        self.theirs.close()
+        self.forget()

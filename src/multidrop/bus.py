@@ -15,6 +15,7 @@ from multidrop.core import Message, Respondent
 from multidrop.drive import Drive, Read, Script, State, Step, Wait, Write, carry_out
 from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
 from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
+from multidrop.forks import tell_of_forks
 from multidrop.ledger import Ledger
 from multidrop.line import Line, now_ns, sleep
 from multidrop.outcome import Outcome
@@ -72,6 +73,11 @@ class Bus:
         self._opened_ns = now_ns()
         self._reset_at = look(0.0, {}, self.line.overruns())
         self._at_last: LineStatistics | None = None  # when it was closed
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """In the child nobody stops drives: the line is closed there."""
+        self._stopping, self._stopped = 0, threading.Condition()
 
     def __enter__(self) -> Bus:
         return self

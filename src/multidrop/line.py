@@ -19,6 +19,7 @@ import serial
 from multidrop.bridge import PORT_FAILURES, Bridge, set_up
 from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError
+from multidrop.forks import tell_of_forks
 
 __all__ = [
     "PORT_FAILURES",
@@ -121,12 +122,31 @@ class Line:
         self._core: Port | None = None  # dropped before the descriptor that it looks at
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
+        self._make_locks()
+        tell_of_forks(self)
+        self._open()
+
+    def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one opens or closes at a time
         self._waiting = 0  # callers that wait for an exchange
         self._left = threading.Condition(self._lock)  # one of them has left
-        self._open()
+
+    def forked(self) -> None:
+        """In the child it is closed, at once: a descriptor left open there would keep the port in use."""
+        self._make_locks()
+        self._why_closed = "it was opened before this process was forked; open it again here"
+        self._core = None
+        if self._bridge:
+            self._bridge.forget()
+            self._bridge = None
+        # Of a network port the socket alone: pyserial would end the connection, which the parent has too.
+        port = getattr(self._serial, "_socket", self._serial)
+        if port:
+            with suppress(*PORT_FAILURES):
+                port.close()
 
     def _open(self) -> None:
+        self._why_closed = "it is closed"
         try:
             check_address(self.port)
             port = self._serial = serial.serial_for_url(self.port, do_not_open=True)
@@ -217,14 +237,14 @@ class Line:
 
     def _opened(self, settings: tuple[int, str]) -> Port:
         if self._core is None:
-            raise LineError(self.port, "it is closed")
+            raise LineError(self.port, self._why_closed)
         self.require(settings)
         return self._core
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
         if self._core is None:  # at once, also while it is being opened again
-            raise LineError(self.port, "it is closed")
+            raise LineError(self.port, self._why_closed)
         with self._lock:
             core = self._opened(exchange.settings)
             self._waiting += 1
@@ -243,7 +263,7 @@ class Line:
 
     def _failure(self, result: int, error: int) -> LineError | None:
         if result == Result.LINE_LOST and self._core is None:
-            return LineError(self.port, "it is closed")
+            return LineError(self.port, self._why_closed)
         if result == Result.LINE_LOST:
             return LineError(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
         if result == Result.SETTINGS_REFUSED:

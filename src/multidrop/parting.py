@@ -8,17 +8,20 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from multidrop.forks import only_here
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Parting:
     """Does `last` at `now()`, at exit, or on SIGINT or SIGTERM, whichever comes first.
 
-    A signal then has the effect that it had before. Made in the main thread, or ValueError.
+    A signal then has the effect that it had before. A child made by fork() does
+    nothing. Made in the main thread, or ValueError.
     """
 
     def __init__(self, last: Callable[[], object]) -> None:
-        self._last: Callable[[], object] | None = last
+        self._last: Callable[[], object] | None = only_here(last)
         self._before: dict[signal.Signals, Any] = {it: signal.signal(it, self._on_signal) for it in _SIGNALS}
         atexit.register(self.now)
 

@@ -30,6 +30,7 @@ from multidrop.core import (
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.exchanges import reading
+from multidrop.forks import tell_of_forks
 from multidrop.line import now_ns
 from multidrop.plan import Block, alone, in_order, kind, sending, silence
 from multidrop.plant import PolledDrive
@@ -121,12 +122,17 @@ class PolledLine:
         self._reopen_ns = 0
         self._cycle: list[Asked] = []  # what the core repeats
         self._queued: deque[Asking[Asked]] = deque()  # what the core has not carried out yet
+        tell_of_forks(self)
         try:
             for polled in declared.drives:
                 self.add(polled)
         except BaseException:
             self.bus.close()
             raise
+
+    def forked(self) -> None:
+        """In the child nobody tends it."""
+        self._lock = threading.Lock()
 
     def add(self, polled: PolledDrive) -> None:
         settings = polled.drive.settings  # a port that is being opened is waited for, but not by the polling

@@ -16,6 +16,7 @@ from typing import Any
 from multidrop.batch import Batch
 from multidrop.bus import Bus
 from multidrop.core import Inbox
+from multidrop.forks import tell_of_forks
 from multidrop.ledger import Ledger
 from multidrop.line import Wake, now_ns, sleep
 from multidrop.plant import Plant, PolledDrive
@@ -52,6 +53,7 @@ class Poller:
         self._closing = False
         self._changing = threading.Lock()  # one drive comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
+        tell_of_forks(self)
         try:
             for number, declared in enumerate(plant.lines):
                 bus = Bus(declared.port, ledger=ledger, audit=audit)
@@ -59,6 +61,12 @@ class Poller:
         except BaseException:
             self.close()
             raise
+
+    def forked(self) -> None:
+        """In the child it is closed, and has no rows."""
+        self._closing = True
+        self._changing = threading.Lock()
+        self._wake.close()
 
     def __enter__(self) -> Poller:
         for line in self._lines:

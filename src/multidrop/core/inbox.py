@@ -7,6 +7,7 @@ from functools import partial
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Block, Columns, miss
 from multidrop.core.results import Result
+from multidrop.forks import only_here, tell_of_forks
 
 CHUNK_ROWS = 1 << 12  # of columns that are taken
 MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
@@ -19,16 +20,26 @@ class Inbox:
     _MOST_AT_ONCE = 1024
 
     def __init__(self, chunk_rows: int = CHUNK_ROWS, most_chunks: int = MOST_CHUNKS) -> None:
-        made = lib.md_inbox_new(chunk_rows, most_chunks)
+        self._room = (chunk_rows, most_chunks)
+        self._called = ffi.new("uint32_t[]", self._MOST_AT_ONCE)
+        self._begin()
+        tell_of_forks(self)
+
+    def _begin(self) -> None:
+        made = lib.md_inbox_new(*self._room)
         if made == ffi.NULL:
             raise OSError(ffi.errno, "no room for what the core leaves")
-        self.c = ffi.gc(made, lib.md_inbox_free)
-        self._called = ffi.new("uint32_t[]", self._MOST_AT_ONCE)
+        self.c = ffi.gc(made, only_here(lib.md_inbox_free))
+        self._give_back = only_here(partial(lib.md_inbox_give_back, self.c))
+
+    def forked(self) -> None:
+        """In the child it is empty: what waits is the parent's to take."""
+        self._begin()
 
     def take(self) -> Columns | None:
         """The oldest rows that wait; None when there are none."""
         made = lib.md_inbox_take(self.c)
-        return None if made == ffi.NULL else Columns.lent(made, partial(lib.md_inbox_give_back, self.c))
+        return None if made == ffi.NULL else Columns.lent(made, self._give_back)
 
     def add_miss(self, block: Block, result: Result, due_ns: int) -> None:
         """Rows for values that were due at `due_ns` but never asked for."""

@@ -12,6 +12,7 @@ from multidrop._core import ffi, lib
 from multidrop.core.exchanges import Completion, Exchange, Respondent, completion
 from multidrop.core.inbox import Inbox
 from multidrop.core.taps import Tap
+from multidrop.forks import tell_of_forks
 
 now_ns = lib.md_now_ns
 utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
@@ -24,6 +25,11 @@ class _Engine:
         self.c = lib.md_engine_start()
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the core's thread cannot be started")
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """In the child the next port that is opened starts another."""
+        _engine.cache_clear()
 
 
 @cache
@@ -56,6 +62,12 @@ class Port:
         self._submitted: deque[Exchange] = deque(maxlen=room)  # at most so many are pending
         self._inbox: Inbox | None = None
         self._round: object = None
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """In the child it is closed, without a word to the engine, which is not there to answer."""
+        self._free.detach()
+        self.close()
 
     def tap(self, tap: Tap) -> None:
         """Tell this tap, and no other any more, of all that goes over the line."""
