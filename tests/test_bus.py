@@ -108,10 +108,9 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
         tally = bus.respondent(ours).tally()
     assert found == {register.name: proof(ours, register) for register in ours.readings()}
     tellers = 1 if ours.telling else 0  # on a line of which it is not known whether its adapter echoes
-    assert tally.answered == REQUESTS[family] + tellers  # a host that looks too late asks again
-    assert (
-        there.counters.requests == tally.exchanges
-    )  # a busy host may be too late for a reply, and asks again
+    # A busy host may be too late for a reply, and asks again; but not for a teller's.
+    assert REQUESTS[family] <= tally.answered <= REQUESTS[family] + tellers
+    assert there.counters.requests == tally.exchanges
     assert there.counters.refusals == 0
 
 
