@@ -232,6 +232,14 @@ void md_port_tap(struct md_port *port, struct md_tap *tap)
     leave(port->engine);
 }
 
+void md_port_tell_echo(struct md_port *port, int echo)
+{
+    enter(port->engine);
+    port->line.echo = echo;
+    port->line.echo_is_told = echo != MD_ECHO_UNKNOWN;
+    leave(port->engine);
+}
+
 void md_port_stop(struct md_port *port)
 {
     struct md_engine *engine = port->engine;

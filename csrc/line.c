@@ -228,6 +228,12 @@ static int is_damaged_answer(const struct md_line *line, size_t begin, int found
     return found == MD_BAD_CHECKSUM;
 }
 
+static void learn(struct md_line *line, int echo)
+{
+    if (!line->echo_is_told)
+        line->echo = echo;
+}
+
 static void time_out(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -236,7 +242,7 @@ static void time_out(struct md_line *line)
     int is_alone = begin > 0 && begin == line->rx_len;
     int is_doubtful = is_alone && line->echo == MD_ECHO_UNKNOWN && parse_at(line, 0, &reply) > 0;
     if (is_alone && !is_doubtful)
-        line->echo = MD_ECHO; /* nobody else says it again and no more */
+        learn(line, MD_ECHO); /* nobody else says it again and no more */
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
     if (!is_damaged_answer(line, begin, first))
         expect_late_answer(line);
@@ -250,10 +256,10 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 {
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
     if (line->completion->skipped <= most_stray && !is_copy(line, reply_at))
-        line->echo = line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO; /* one may have been lost */
+        learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* one may have been lost */
     for (size_t at = 0; at + line->tx_len <= reply_at; at++)
         if (is_copy(line, at))
-            line->echo = MD_ECHO;
+            learn(line, MD_ECHO);
 }
 
 /* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */

@@ -40,7 +40,7 @@ class Hall:
         self.queue_time = 0.0  # until an exchange's turn comes
         self.queue = object()  # the open port
         self.port = "hall"
-        monkeypatch.setattr(bus, "Line", lambda port: self)
+        monkeypatch.setattr(bus, "Line", lambda port, echo: self)
         for module in (bus, exchanges, writing, acquaintance):
             monkeypatch.setattr(module, "sleep", self.sleep)
         for module in (bus, exchanges, writing):

@@ -43,6 +43,10 @@ class LineDriver:
     def echo(self, known: int) -> None:
         self._line.echo = known
 
+    def tell_echo(self, known: int) -> None:
+        """As its user does: nothing is learnt then."""
+        self.echo, self._line.echo_is_told = known, 1
+
     @property
     def completion(self) -> Completion:
         return completion(self.found)

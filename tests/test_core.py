@@ -23,6 +23,7 @@ from multidrop.core import (
     REFUSALS,
     Block,
     Columns,
+    Echo,
     Exchange,
     Field,
     Framing,
@@ -375,6 +376,20 @@ def test_a_teller_that_learns_nothing_goes_first_again(drive: Drive) -> None:
         for _ in range(2):
             assert port.carry_out(asked).result == Result.NO_REPLY
         until(lambda: heard == [99, 7, 99, 7])  # which the far end may do later
+
+
+@pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
+def test_no_teller_goes_first_where_the_echo_was_told(drive: Drive, echo: Echo) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        port.tell_echo(echo)
+        assert port.carry_out(read(7, teller=read(99))).result == 7
+    assert heard == [7]
 
 
 def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:

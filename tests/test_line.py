@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import random
+from dataclasses import replace
 
 import pytest
 from frames import words
 from line_driver import MS, LineDriver
+from multidrop._core import lib
 
-from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply, crc16
+from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply, build_request, crc16
 
 CHARACTER = 1 * MS  # a round number: requests of 8 characters take 8 ms
 SILENCE = 4 * MS
@@ -546,6 +548,41 @@ def test_the_beginning_of_an_echo_is_no_reply(line: LineDriver, piece: int) -> N
     ask(line, Message(6, 3, 0x0211, 1))
     answer(line, echo + reply_of(7, address=6), piece)
     assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
+
+
+def test_where_no_adapter_echoes_the_first_confirmation_is_believed(line: LineDriver) -> None:
+    line.tell_echo(lib.MD_NO_ECHO)
+    for _ in range(2):
+        ask(line, WRITE)
+        answer(line, confirmation())
+        assert (line.completion.result, line.completion.skipped) == (8, 0)
+        ask(line, WRITE)
+        answer(line, confirmation() + confirmation())  # of which nothing is learnt
+        ask(line)
+        answer(line, rtu("01 03 00 00 00 01") + reply_of(1))
+        assert line.completion.result == 7
+        line.now += 10 * TIMEOUT
+
+
+def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -> None:
+    line.tell_echo(lib.MD_ECHO)
+    for _ in range(3):
+        ask(line)
+        answer(line, reply_of(1))  # its echo was lost
+        assert line.completion.result == 7
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line: LineDriver) -> None:
+    query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
+    line.tell_echo(lib.MD_ECHO)
+    line.begin(exchange(query, framing=Framing.DELIXI))
+    line.wait_until_write()
+    reply = build_reply(Framing.DELIXI, replace(query, data=value))
+    answer(line, build_request(Framing.DELIXI, query) + reply)
+    assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
 def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:

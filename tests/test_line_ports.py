@@ -17,7 +17,7 @@ from toy import PatientToy, Toy
 from multidrop import line as line_module
 from multidrop.bus import Bus
 from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
-from multidrop.core import Port, set_settings
+from multidrop.core import Echo, Port, set_settings
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.line import Line
 from multidrop.poller import Poller
@@ -70,6 +70,22 @@ def test_a_network_that_stalls_for_a_second_hands_on_nothing_later(monkeypatch: 
     monkeypatch.setattr(line_module, "Port", Watched)
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path):
         assert told == [1000]
+
+
+@pytest.mark.parametrize("echo", ["auto", "on", "off"])
+def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
+    echo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Echo] = []
+    monkeypatch.setattr(Port, "tell_echo", lambda port, it: told.append(it))
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
+        bus.line.reopen()
+        assert told == [Echo(echo)] * 2
+
+
+def test_an_echo_is_told_in_one_of_three_words() -> None:
+    with pytest.raises(ValueError, match='echo \'loud\' is none of "auto", "on" and "off"'):
+        Bus("/dev/null", echo="loud")
 
 
 def test_a_pty_is_opened_again_and_again() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.plant import Plant, PlantError, load_plant, parse_duration
 from multidrop.timing import Settings
@@ -168,6 +169,11 @@ def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(l
     assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
+def test_a_line_s_echo_is_learnt_unless_it_is_told(load: Load) -> None:
+    assert load(SILENT).lines[0].echo is Echo.AUTO
+    assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
+
+
 def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [
@@ -210,7 +216,8 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ("[line]", "line = {} is not right; write [[line]], in two brackets, with its name, port and drives"),
         (
             "line = [3]",
-            "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, drive",
+            "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
+            "drive",
         ),
         (
             HEAD,
@@ -231,6 +238,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
             "within a frame: it is to be 1563 us or more",
         ),
         (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
+        (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),
         (HEAD + "baudrate = 7\n" + TOY, 'line "L": baud rate 7 is outside 50 to 4000000'),
         (
             HEAD + 'format = "8X1"\n' + TOY,

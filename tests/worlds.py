@@ -260,7 +260,7 @@ class World:
         self._turn = threading.Condition()
         self._threads = {*threading.enumerate()}
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", lambda port: WorldLine(self))
+        patch.setattr(bus, "Line", lambda port, echo: WorldLine(self))
         for module in (bus, poller, polled_line):
             patch.setattr(module, "now_ns", lambda: self.now)
         patch.setattr(poller, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))

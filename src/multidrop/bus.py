@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, TypeVar, cast
 
 from multidrop.audit import AuditLog
-from multidrop.core import Message, Respondent
+from multidrop.core import Echo, Message, Respondent
 from multidrop.drive import Drive, Read, Script, State, Step, Wait, Write, carry_out
 from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
 from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
@@ -37,7 +37,8 @@ class Bus:
 
     `port` is a device such as /dev/ttyUSB0 or any pyserial URL; `baudrate` and `format` replace the
     families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
-    t3.5 between frames, if all of them bear it. Raises LineError when the port cannot be opened. Writes
+    t3.5 between frames, if all of them bear it. `echo` tells whether the adapter repeats what it sends: "on",
+    "off", or "auto", to find out. Raises LineError when the port cannot be opened. Writes
     that may wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are
     noted in the file `audit`. A write whose turn does not come within `expiry` seconds is not sent.
     Leaving the `with` block closes the port and sends nothing, unless `stop_on_exit` was called.
@@ -50,6 +51,7 @@ class Bus:
         baudrate: int | None = None,
         format: str | None = None,
         silence: float | None = None,
+        echo: str = "auto",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = 1.0,
@@ -58,7 +60,7 @@ class Bus:
         self.format = format
         self.silence = silence
         self.drives: list[Drive] = []
-        self.line = Line(port)
+        self.line = Line(port, Echo(echo))
         try:
             log = AuditLog(audit) if audit else None
         except OSError:

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import serial
 
 from multidrop.bridge import PORT_FAILURES, Bridge, set_up
-from multidrop.core import REFUSALS, Completion, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
+from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError
 from multidrop.forks import tell_of_forks
 
@@ -115,8 +115,9 @@ class Line:
     `port` is a device or any pyserial URL. Every failure of the port is a LineError.
     """
 
-    def __init__(self, port: str) -> None:
+    def __init__(self, port: str, echo: Echo = Echo.AUTO) -> None:
         self.port = port
+        self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
         self._core: Port | None = None  # dropped before the descriptor that it looks at
@@ -155,6 +156,7 @@ class Line:
                 port.exclusive = True
             port.open()
             self._core = self._drive(port)
+            self._core.tell_echo(self._echo)
             if self._tap:
                 self._core.tap(self._tap)
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):

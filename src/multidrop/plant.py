@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from multidrop.core import Echo
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.forecast import forecast
@@ -53,6 +54,7 @@ class Line:
     format: str | None
     drives: tuple[PolledDrive, ...]
     switching: float = 0.0  # s that the port needs to change them
+    echo: Echo = Echo.AUTO
 
     def planned(self, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
         """All that is polled on it, in blocks; `delays` are response delays in s that were measured."""
@@ -136,6 +138,7 @@ _LINE = {
     "format": Key(str, 'format = "8N1"'),
     "silence": Key(str, 'silence = "500 us"'),
     "switching": Key(str, 'switching = "2 ms"'),
+    "echo": Key(str, 'echo = "auto"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 _DRIVE = {
@@ -171,9 +174,11 @@ def _line(table: Any, place: Place) -> Line:
         place.attempt(parse_duration, given[key]) if key in given else None
         for key in ("silence", "switching")
     )
+    echo = place.attempt(Echo, given.get("echo", "auto"))
     inherited = {**settings, "silence": silence}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
-    return Line(name, port, **settings, drives=tuple(filter(None, drives)), switching=switching or 0.0)
+    polled = tuple(filter(None, drives))
+    return Line(name, port, **settings, drives=polled, switching=switching or 0.0, echo=echo or Echo.AUTO)
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: Place) -> PolledDrive | None:

@@ -56,7 +56,7 @@ class Poller:
         tell_of_forks(self)
         try:
             for number, declared in enumerate(plant.lines):
-                bus = Bus(declared.port, ledger=ledger, audit=audit)
+                bus = Bus(declared.port, echo=declared.echo, ledger=ledger, audit=audit)
                 self._lines.append(PolledLine(declared, number, bus, self._inbox, self._codes))
         except BaseException:
             self.close()

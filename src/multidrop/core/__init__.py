@@ -29,7 +29,7 @@ from multidrop.core.overheard import (
     Unpacked,
     Unpacker,
 )
-from multidrop.core.ports import Port, now_ns, utc_minus_monotonic_ns
+from multidrop.core.ports import Echo, Port, now_ns, utc_minus_monotonic_ns
 from multidrop.core.results import EXCEPTION_STATUS, STATUSES, UNASKED, Result, status_text
 from multidrop.core.settings import REFUSALS, get_settings, set_settings
 from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
@@ -48,6 +48,7 @@ __all__ = [
     "Completion",
     "Decoded",
     "Decoder",
+    "Echo",
     "Exchange",
     "Field",
     "Framing",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from enum import StrEnum
 from functools import cache
 from typing import Any
 from weakref import finalize
@@ -16,6 +17,21 @@ from multidrop.forks import tell_of_forks
 
 now_ns = lib.md_now_ns
 utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
+
+
+class Echo(StrEnum):
+    """Whether an adapter repeats to the client what it sends; `AUTO`: that is learnt."""
+
+    AUTO = "auto"
+    ON = "on"
+    OFF = "off"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Echo:
+        raise ValueError(f'echo {value!r} is none of "auto", "on" and "off"')
+
+
+_ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
 
 
 class _Engine:
@@ -73,6 +89,10 @@ class Port:
         """Tell this tap, and no other any more, of all that goes over the line."""
         lib.md_port_tap(self.c, tap.c)
         self._tap = tap
+
+    def tell_echo(self, echo: Echo) -> None:
+        """Whether its adapter echoes."""
+        lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
     def end(self) -> bool:
         """Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are."""
