@@ -163,6 +163,7 @@ class Soak:
 
     def run_period(self, seconds: float) -> Period:
         period = Period()
+        self.out.unlink(missing_ok=True)
         with open_writer(self.out, self.plant.metadata()) as writer:
             for batch in self.poller.batches(seconds):
                 self.judge(batch, period)

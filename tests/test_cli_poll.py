@@ -20,9 +20,10 @@ from toy import Toy
 from multidrop.batch import Row
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
+from multidrop.cli.demo import DRIVES
 from multidrop.core import Result
 from multidrop.errors import NoReply
-from multidrop.recording import open_reader
+from multidrop.recording import open_reader, open_writer
 
 __all__ = ["run"]  # a fixture
 
@@ -268,6 +269,21 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     rows = recorded(out)
     assert {row.drive for row in rows if row.value is not None} == set(drives)
     assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
+
+
+def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "demo.arrows"
+    with open_writer(out, {"drives": {"pump-1": {}}}):
+        pass
+    mine = out.read_bytes()
+    sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
+    assert run("demo", "--seconds", 1, "--out", out) == (2, "", sentence)
+    assert out.read_bytes() == mine
+    out.unlink()
+    with open_writer(out, {"drives": dict.fromkeys(name for name, *_ in DRIVES)}):
+        pass
+    assert multidrop("demo", "--seconds", 1, "--out", out, "--json").returncode == 0
+    assert recorded(out)
 
 
 def test_a_demo_can_be_captured(tmp_path: Path) -> None:

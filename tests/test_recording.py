@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import sys
+from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_batch import SCHEMA, rows_of
 
-from multidrop.batch import Row
+from multidrop.batch import Row, Rows
 from multidrop.recording import (
     FORMATS,
     Metadata,
@@ -65,6 +66,7 @@ def test_empty_recording(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     open_writer(path, {}).close()
     assert rows(open_reader(path)) == []
+    path = tmp_path / f"b{suffix}"
     with open_writer(path, {}) as writer:
         writer.write(counting(0))
     assert rows(open_reader(path)) == []
@@ -80,12 +82,16 @@ def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> Non
 
 
 @every_format
-def test_a_new_recording_takes_the_place_of_the_old(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
-    with open_writer(path, {"second": True}) as writer:
-        writer.write(example())
+    sentence = rf"a{suffix} is there already: name another file, or remove it first$"
+    with pytest.raises(ValueError, match=sentence):
+        open_writer(path, {"second": True})
+    other = record(tmp_path / "b.csv")
+    with pytest.raises(ValueError, match=sentence):
+        convert(other, path)
     reader = open_reader(path)
-    assert (rows(reader), reader.metadata) == (EXAMPLE, {"second": True})
+    assert (rows(reader), reader.metadata) == (RECORDED, METADATA)
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
@@ -292,6 +298,43 @@ def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) 
     with pytest.raises(FileNotFoundError):
         convert(tmp_path / "c.csv", target)
     assert rows(open_reader(target)) == RECORDED
+
+
+DAMAGED_AT = {".arrows": b"okok", ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
+
+
+@every_format
+@pytest.mark.parametrize("target", FORMATS)
+def test_half_a_conversion_is_left_nowhere(tmp_path: Path, suffix: str, target: str) -> None:
+    """The error is about the recording, in words of ours."""
+    path = record(tmp_path / f"a{suffix}")
+    content = path.read_bytes()
+    at = content.index(DAMAGED_AT[suffix], 0 if suffix == ".parquet" else len(content) // 2) + 4
+    path.write_bytes(content[:at] + b"\xff" * 64 + content[at + 64 :])
+    before = set(tmp_path.iterdir())
+    damage = rf"a{suffix}(, line \d+: not a row of a recording| is damaged after row \d+)"
+    with pytest.raises(ValueError, match=damage) as failure:
+        convert(path, tmp_path / f"b{target}")
+    assert set(tmp_path.iterdir()) == before
+    for foreign in ("codec", "Arrow", "thrift", "ZSTD", "isoformat", "literal", "\n"):
+        assert foreign not in str(failure.value)
+
+
+@every_format
+def test_a_conversion_that_is_broken_off_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    path = record(tmp_path / "a.csv")
+    before = set(tmp_path.iterdir())
+
+    def interrupted(reader: object) -> Iterator[Rows]:
+        yield counting(10)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("multidrop.recording.csv.Reader.__iter__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        convert(path, tmp_path / f"b{suffix}")
+    assert set(tmp_path.iterdir()) == before
 
 
 # ---- mistakes ----

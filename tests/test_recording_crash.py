@@ -142,8 +142,8 @@ for at in count():
 @growing
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
-    path = tmp_path / f"a{suffix}"
     for until in (1, 40, 150):
+        path = tmp_path / f"{until}{suffix}"
         command = [sys.executable, "-c", RECORD_FOR_EVER, str(path), str(Path(__file__).parent)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writing:
             assert writing.stdout is not None
@@ -316,8 +316,7 @@ def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> 
         with full_at(room), open_writer(path, whole):
             pass
     except RecordingError:
-        with pytest.raises(ValueError, match=r"a\.csv is not a recording"):
-            open_reader(path)
+        assert list(tmp_path.iterdir()) == []
     else:
         assert open_reader(path).metadata == whole
     assert not list(tmp_path.glob("*.part"))

@@ -132,6 +132,7 @@ def _comparable(batches: Iterable[Rows]) -> list[Row]:
 
 def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Rows]) -> list[Row]:
     copy = path.with_name("again" + suffix)
+    copy.unlink(missing_ok=True)
     with open_writer(copy, metadata) as writer:
         for batch in batches:
             writer.write(batch)

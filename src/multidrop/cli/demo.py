@@ -13,10 +13,12 @@ from tempfile import TemporaryDirectory
 
 from multidrop.bus import Bus
 from multidrop.cli.monitor import is_possible, watch
+from multidrop.cli.overwriting import refuse_overwriting
 from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.drives import MODELS
 from multidrop.errors import Unconfirmed
 from multidrop.plant import Line, load_plant
+from multidrop.recording import open_reader
 
 DRIVES = (  # name, model, framing
     ("erman", "erman-er-g-220", "rtu"),
@@ -37,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
         path = Path(directory) / "demo.toml"
         path.write_text(_plant_file(Path(directory) / "mixed"))
@@ -46,6 +49,14 @@ def run(arguments: argparse.Namespace) -> int:
             if _can_be_watched(arguments):
                 return conclude(plant, watch(plant, out=arguments.out, seconds=arguments.seconds), arguments)
             return follow(plant, arguments)
+
+
+def _make_room(out: Path) -> None:
+    """Only what an earlier demo recorded gives way to the next one."""
+    with suppress(ValueError, TypeError, OSError):  # there is none, or what is there is not ours
+        if set(open_reader(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
+            out.unlink()
+    refuse_overwriting(out)
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:

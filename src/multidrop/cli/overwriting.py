@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from multidrop.recording.whole import already_there
+
 
 def refuse_overwriting(path: Path) -> None:
     """Raise ValueError when there is a file at this path."""
     if path.is_file():
-        raise ValueError(f"{path} is there already: name another file, or remove it first")
+        raise already_there(path)
 
 
 def check_capture(path: Path) -> None:

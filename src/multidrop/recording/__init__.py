@@ -48,10 +48,10 @@ FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix:
 
 
 def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> Writer:
-    """Begin a recording. One that is at `path` already is overwritten.
+    """Begin a recording in a new file; what is in another one is never lost.
 
-    Raises ValueError for another suffix, TypeError for metadata that JSON cannot hold, and
-    RecordingError when the file cannot be written.
+    Raises ValueError for another suffix or when there is a file at `path`, TypeError for metadata that
+    JSON cannot hold, and RecordingError when the file cannot be written.
     """
     writer: Writer = _format(Path(path)).Writer(Path(path), metadata)
     return writer
@@ -66,15 +66,21 @@ def open_reader(path: str | os.PathLike[str]) -> Reader:
 def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> int:
     """Write the recording `source` anew as `target`, with all rows and metadata; the number of rows.
 
-    Needs memory for a few batches only. Raises as open_reader and open_writer do.
+    Needs memory for a few batches only. Raises as open_reader and open_writer do, and leaves no target
+    then.
     """
     _format(Path(target))
     reader = open_reader(source)
     if Path(target).exists() and Path(source).samefile(target):
         raise ValueError(f"{source} cannot be converted into itself: name another file")
-    with open_writer(target, reader.metadata) as writer:
-        for batch in reader:
-            writer.write(batch)
+    writer = open_writer(target, reader.metadata)
+    try:
+        with writer:
+            for batch in reader:
+                writer.write(batch)
+    except BaseException:  # Ctrl-C as well: half a recording would pass for the whole one
+        writer.discard()
+        raise
     return writer.rows
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from multidrop.batch import Rows, assemble, schema
 from multidrop.recording import interface
-from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
+from multidrop.recording.interface import Metadata, RecordingError, damaged, not_a_recording
 from multidrop.recording.messages import RECORD_BATCH, SCHEMA, Message, Table, messages
 from multidrop.recording.recorded import Recorded
 from multidrop.recording.whole import WholeFile
@@ -54,7 +54,7 @@ class Writer(interface.Writer):
         try:
             self._append(CArrayStream.from_c_arrays([], described))
         except RecordingError:
-            self.close()
+            self.discard()
             raise
 
     def write(self, batch: Rows) -> None:
@@ -104,7 +104,7 @@ class Reader(interface.Reader):
                 try:
                     batch = _decode(message, message.header, body)
                 except (struct.error, RuntimeError, ValueError) as mistake:
-                    raise ValueError(f"{self.path} is damaged after row {rows}: {mistake}") from mistake
+                    raise damaged(self.path, rows, mistake) from mistake
                 yield batch
                 rows += len(batch)
 

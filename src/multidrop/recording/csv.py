@@ -19,6 +19,7 @@ from multidrop.recording.recorded import from_rows
 from multidrop.recording.whole import WholeFile
 
 HEADER = ",".join(Row._fields) + "\n"
+EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
 BATCH_ROWS = 1 << 14
 SECOND = 1_000_000_000
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -43,7 +44,7 @@ class Writer(interface.Writer):
             _put(beside(path), described + "\n")
             self._append(HEADER)  # last: what begins with it is a recording, and has its metadata
         except OSError as failure:
-            self.close()
+            self.discard()
             raise RecordingError.of(failure, path) from failure
 
     def write(self, batch: Rows) -> None:
@@ -61,6 +62,10 @@ class Writer(interface.Writer):
             self._file.close()
         except OSError as failure:
             raise RecordingError.of(failure, self.path, self.rows) from failure
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return self.path, beside(self.path)
 
 
 def _put(path: Path, text: str) -> None:
@@ -101,7 +106,7 @@ class Reader(interface.Reader):
                     yield from_rows(some)
             except (csv.Error, ValueError, OverflowError) as mistake:
                 place = f"{self.path}, line {lines.line_num}"
-                raise ValueError(f"{place}: not a row of a recording: {mistake}") from mistake
+                raise ValueError(f"{place}: not a row of a recording: one is like {EXAMPLE}") from mistake
 
 
 def _whole_lines(file: BinaryIO, size: int) -> int:
@@ -123,7 +128,7 @@ def _lines(file: BinaryIO, size: int) -> Iterator[str]:
 
 def _parse(cells: list[str]) -> Row:
     if len(cells) != len(Row._fields):
-        raise ValueError(f"{len(cells)} columns instead of {len(Row._fields)}")
+        raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells
     return Row(
         _read(time),
@@ -158,7 +163,7 @@ def _spell(time_ns: int) -> str:
 def _read(time: str) -> int:
     second, dot, rest = time.partition(".")
     if not dot or len(rest) != 10 or rest[-1] != "Z":
-        raise ValueError(f"{time!r} is not a time like {_spell(0)}")
+        raise ValueError(time)
     return _read_second(second) * SECOND + int(rest[:-1])
 
 

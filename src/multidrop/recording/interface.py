@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -46,6 +48,19 @@ class Writer(ABC):
     @abstractmethod
     def close(self) -> None:
         """Nothing can be written any more. Raises RecordingError."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All that the recording lies in."""
+        return (self.path,)
+
+    def discard(self) -> None:
+        """Close it, and leave nothing of it."""
+        with suppress(OSError):
+            self.close()
+        for path in filter(Path.is_file, self.files):  # a device is not ours to remove
+            with suppress(OSError):
+                path.unlink()
 
     def __enter__(self) -> Writer:
         return self
@@ -89,6 +104,19 @@ def load(text: str | bytes, path: Path) -> Metadata:
     if not isinstance(metadata, dict):
         raise not_a_recording(path, "its metadata is not a JSON object")
     return metadata
+
+
+_IN_OUR_WORDS = {  # a library's are about its own insides
+    UnicodeDecodeError: "its text is not UTF-8",
+    struct.error: "its lengths do not fit together",
+    RuntimeError: "its lengths do not fit together",  # nanoarrow's
+}
+
+
+def damaged(path: Path, rows: int, mistake: Exception) -> ValueError:
+    """What says that so many rows can be read, and why no more."""
+    why = next((words for kind, words in _IN_OUR_WORDS.items() if isinstance(mistake, kind)), mistake)
+    return ValueError(f"{path} is damaged after row {rows}: {why}")
 
 
 def not_a_recording(path: Path, why: str) -> ValueError:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
 from multidrop.batch import Rows, schema
 from multidrop.recording import interface
-from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
+from multidrop.recording.interface import Metadata, RecordingError, damaged, not_a_recording
 from multidrop.recording.recorded import Recorded
+from multidrop.recording.whole import new_file
 
 KEY = b"multidrop"  # of the schema's metadata
 GROUP_ROWS = 1 << 17  # rows wait in memory until there are so many
@@ -44,7 +46,7 @@ class Writer(interface.Writer):
         described = self._arrow.schema(schema()).with_metadata({KEY: interface.dump(metadata)})
         self._waiting: list[Any] = []
         try:
-            self._file = path.open("wb")
+            self._file = BufferedWriter(new_file(path))
         except OSError as failure:
             raise RecordingError.of(failure, path) from failure
         self._encoder = self._arrow.parquet.ParquetWriter(self._file, described, **ENCODING)
@@ -99,10 +101,12 @@ class Reader(interface.Reader):
     def __iter__(self) -> Iterator[Rows]:
         from nanoarrow import c_array
 
+        rows = 0
         with self._open() as file:
             for group in range(file.num_row_groups):
-                for batch in self._read_group(file, group):
+                for batch in self._read_group(file, group, rows):
                     yield Recorded(c_array(batch))
+                    rows += len(batch)
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
@@ -113,11 +117,11 @@ class Reader(interface.Reader):
                 raise not_a_recording(self.path, f"it is no whole Parquet file; {UNREADABLE}") from failure
             yield opened
 
-    def _read_group(self, file: Any, group: int) -> Any:
+    def _read_group(self, file: Any, group: int, rows: int) -> Any:
         try:
             table = file.read_row_group(group).combine_chunks()
             table.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
-            why = str(failure).splitlines()[0]
-            raise ValueError(f"{self.path} is damaged in its group of rows {group}: {why}") from failure
+            why = ValueError("what follows cannot be unpacked")
+            raise damaged(self.path, rows, why) from failure
         return table.replace_schema_metadata().to_batches()

@@ -1,16 +1,33 @@
-"""A file that grows by whole pieces: each in one write, and none by half."""
+"""A file that grows by whole pieces: each in one write, and none by half. It is never another's."""
 
 from __future__ import annotations
 
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 
 
+def already_there(path: Path) -> ValueError:
+    return ValueError(f"{path} is there already: name another file, or remove it first")
+
+
+def new_file(path: Path) -> FileIO:
+    """Open a file that is not there yet: what is in another one may be months of data.
+
+    A device or a pipe is there, and has none to lose. Raises ValueError and OSError.
+    """
+    mode = "wb" if path.exists() and not path.is_file() else "xb"
+    try:
+        return FileIO(path, mode)
+    except FileExistsError:
+        raise already_there(path) from None
+
+
 class WholeFile:
-    """A new file, in the place of any other at this path. Raises OSError, as do its methods."""
+    """A new file. Raises ValueError when there is one at this path, and OSError, as do its methods."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("wb", buffering=0)
+        self._file = new_file(path)
         self._length = 0
         self._is_torn = False  # a piece was begun and not finished
 
