@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+from batches import METADATA, counting
 from terminals import MULTIDROP, on_terminal
 from test_cli import TOY, Run, run
 from toy import Toy
@@ -240,6 +241,27 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
     status, out, _ = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (0, f"{len(rows)} rows in {tmp_path}/b.csv\n")
     assert recorded(tmp_path / "b.csv") == rows
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        for at in range(3):
+            writer.write(counting(100, 100 * at))
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size - 7)
+    whole = sum(map(len, open_reader(path)))
+    torn = open_reader(path).torn
+    assert 0 < torn < path.stat().st_size
+    sentence = (
+        f"multidrop: the end of {path} is missing: {whole} rows were read, and its last {torn} bytes, "
+        "which are no whole rows, were left out\n"
+    )
+    out = tmp_path / "b.parquet"
+    assert run("convert", path, out) == (0, f"{whole} rows in {out}\n", sentence)
+    assert run("plot", path) == (0, f"{tmp_path}/a.png\n", sentence)
+    assert run("report", path) == (0, f"{tmp_path}/a.html\n", sentence)
 
 
 def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:

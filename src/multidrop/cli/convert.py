@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.recording import FORMATS, convert
+from multidrop.cli.torn import tell_torn
+from multidrop.recording import FORMATS, convert, open_reader
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,5 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     rows = convert(arguments.source, arguments.target)
+    tell_torn(arguments.source, rows, open_reader(arguments.source).torn)
     print(f"{rows} rows in {arguments.target}")
     return 0

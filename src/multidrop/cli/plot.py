@@ -7,6 +7,7 @@ from pathlib import Path
 
 from multidrop.cli.extra import need
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.torn import tell_torn
 
 SUFFIXES = (".png", ".html")
 
@@ -29,6 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     from multidrop.look import load, plot, plot_page, png
 
     look = load(arguments.recording)
+    tell_torn(look.path, look.rows, look.torn)
     figure, left = plot(look, arguments.drive, arguments.register)
     if out.suffix.lower() == ".png":
         out.write_bytes(png(figure))

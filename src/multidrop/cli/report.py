@@ -7,6 +7,7 @@ from pathlib import Path
 
 from multidrop.cli.extra import need
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.torn import tell_torn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +25,8 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(out)
     from multidrop.look import load, report_page
 
-    out.write_text(report_page(load(arguments.recording)), "utf-8")
+    look = load(arguments.recording)
+    tell_torn(look.path, look.rows, look.torn)
+    out.write_text(report_page(look), "utf-8")
     print(out)
     return 0

@@ -104,6 +104,11 @@ class Look:
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
+    torn: int  # bytes at the recording's end that were left out
+
+    @property
+    def rows(self) -> int:
+        return sum(len(it.time) for it in self.series)
 
     @property
     def drives(self) -> tuple[str, ...]:
@@ -178,7 +183,7 @@ def load(path: str | Path) -> Look:
                 meaning,
             )
         )
-    return Look(Path(path), reader.metadata, tuple(series))
+    return Look(Path(path), reader.metadata, tuple(series), reader.torn)
 
 
 def _numbers(column: Any) -> Array:
