@@ -14,6 +14,8 @@ from lines import Faulty
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import Cell
 from multidrop.sim.simulator import Simulator
@@ -177,6 +179,37 @@ def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
         "",
         "toy@2: acceleration_time = 30.0 s: taken as 20.0 s\n",
     )
+
+
+def test_a_value_between_two_steps_is_told_as_it_is_taken(run: Run, port: str, toy: SimulatedDrive) -> None:
+    """Before it is sent, and in what is said to be done."""
+    note = "multidrop: frequency has steps of 0.01 Hz: 12.345 is taken as 12.34 Hz\n"
+    assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
+        0,
+        "toy@1: frequency = 12.34 Hz: done (cannot be read back)\n",
+        note,
+    )
+    assert run("set-frequency", port, TOY, 1, "12.345", "--yes") == (
+        0,
+        "toy@1: set-frequency done at frequency = 12.34 Hz; state: running\n",
+        note,
+    )
+    status, out, err = run("start", port, TOY, 1, "--frequency", "12.345", "--yes", "--json")
+    assert (status, err) == (0, note)
+    assert json.loads(out)["setpoint"] == {"register": "frequency", "value": 12.34, "unit": "Hz"}
+    assert {it.raw for it in toy.counters.writes if it.name == "frequency"} == {1234}
+    status, out, err = run("write", port, TOY, 1, "frequency", "12.345")
+    assert (status, out) == (1, "")
+    assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
+
+
+def test_a_percentage_that_stands_for_a_frequency_is_told(run: Run) -> None:
+    che = InvtCHE(1, maximum_frequency=50)
+    with Simulator([Wire([simulated(che)], unpaced=True)]) as simulator:
+        words = ("invt-che", 1, "12.3456", "--option", "maximum_frequency=50", "--yes")
+        status, out, _ = run("set-frequency", simulator.wires[0].path, *words)
+    assert status == 0
+    assert "set-frequency done at setpoint = 24.69 %;" in out
 
 
 def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None:

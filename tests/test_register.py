@@ -34,6 +34,7 @@ class Example(Drive):
     word = command(0x2002, Bits)
     coil = command(1, table=COIL)
     coarse = setting(9, "V", step=5)
+    choice = setting(10, span=(0, 2))
 
 
 @pytest.mark.parametrize(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
@@ -66,6 +67,8 @@ def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> 
         (Example.temperature, 40000, ValueError),
         (Example.coil, 2, ValueError),
         (Example.coarse, 5 * 65536, ValueError),
+        (Example.unknown, 2.5, ValueError),  # a raw count
+        (Example.choice, 1.5, ValueError),
     ],
 )
 def test_what_a_register_does_not_take(

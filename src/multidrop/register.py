@@ -209,7 +209,10 @@ class Register(Generic[T]):
         if self.span is not None and not self.span[0] <= value <= self.span[1]:
             low, high = self.span
             raise ValueError(f"{self.name} = {value:g} is outside {low:g} to {high:g} {self.unit}".rstrip())
-        raw = round(Fraction(str(value)) / self.scale)
+        count = Fraction(str(value)) / self.scale
+        if count.denominator != 1 and self._counts:
+            raise ValueError(f"{self.name} takes a whole number, not {value:g}")
+        raw = round(count)
         bottom, top = self._raw_span()
         if not bottom <= raw <= top:
             least, most = float(bottom * self.scale), float(top * self.scale)
@@ -217,6 +220,11 @@ class Register(Generic[T]):
                 f"{self.name} = {value:g} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
             )
         return raw
+
+    @property
+    def _counts(self) -> bool:
+        """Its numbers are choices or raw counts, of which the nearest one may mean something else."""
+        return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
         values = cast(Any, self.values)

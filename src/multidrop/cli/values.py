@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Sequence
 from enum import Flag, IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop.register import Register
 
 Row = Sequence[str]
+T = TypeVar("T", bound=float)
 
 
 def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
@@ -22,6 +24,18 @@ def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
         ).rstrip()
         for row in rows
     ]
+
+
+def taken(register: Register[T], value: T) -> T:
+    """What the register can take of a value, said on stderr where that is another one.
+
+    Raises ValueError for what it cannot take at all.
+    """
+    nearest = register.decode(register.encode(value))
+    if nearest != value:
+        steps = f"{register.name} has steps of {register.step:g} {register.unit}".rstrip()
+        print(f"multidrop: {steps}: {value!r} is taken as {register.format(nearest)}", file=sys.stderr)
+    return nearest
 
 
 def as_row(register: Register[Any], value: Any) -> Row:

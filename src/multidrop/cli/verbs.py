@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop.bus import Bus
 from multidrop.cli.consent import ask
 from multidrop.cli.target import add_json_argument, add_target_arguments, add_writing_arguments, drive_of
-from multidrop.drive import Direction, Script, State, Write
+from multidrop.cli.values import as_json, taken
+from multidrop.drive import Direction, Drive, Script, State, Write
 from multidrop.errors import Unsupported
+from multidrop.register import Register
 
 _DIRECTED = ("start", "jog")
 _WATCHED = ("state", *_DIRECTED)  # it is told what becomes of the motor when the client dies
@@ -30,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--direction", choices=[it.value for it in Direction], help="the one in force if not given"
         )
     if command == "set-frequency":
-        parser.add_argument("hz", metavar="HZ", type=float, help="the setpoint in Hz")
+        parser.add_argument("frequency", metavar="HZ", type=float, help="the setpoint in Hz")
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
     if command != "state":
@@ -43,12 +45,14 @@ def run(arguments: argparse.Namespace) -> int:
     verb = getattr(drive, arguments.command.replace("-", "_"))
     given = _given(arguments)
     _rehearse(verb.script(*given))
+    hz = getattr(arguments, "frequency", None)
+    setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _ASKED:
         ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
     with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus:
         bus.attach(drive)
-        if getattr(arguments, "frequency", None) is not None:
-            drive.set_frequency(arguments.frequency)
+        if hz is not None and arguments.command != "set-frequency":
+            drive.set_frequency(hz)
         state = verb(*given)
         watchdog = bus.watchdog(drive) if arguments.command in _WATCHED else ""
         if not isinstance(state, State):
@@ -58,14 +62,35 @@ def run(arguments: argparse.Namespace) -> int:
                 state = None
     if arguments.json:
         record = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
+        if setpoint:
+            record["setpoint"] = {"register": setpoint.register.name} | as_json(*setpoint)
         print(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
         print(state)
         print(f"watchdog: {watchdog}")
     else:
-        told = f"{drive.name}: {arguments.command} done; state: {state or 'the family cannot say'}"
+        at = f" at {setpoint}" if setpoint else ""
+        told = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
         print(told + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
+
+
+class _Setpoint(NamedTuple):
+    """What set_frequency writes."""
+
+    register: Register[float]
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.register.name} = {self.register.format(self.value)}"
+
+
+def _setpoint(drive: Drive, hz: float) -> _Setpoint | None:
+    """What the drive can take of this frequency; None where its family looks at the drive before it says."""
+    step = next(drive.set_frequency.script(hz))
+    if not isinstance(step, Write):
+        return None
+    return _Setpoint(step.register, taken(step.register, step.value))
 
 
 def _rehearse(script: Script[Any]) -> None:
@@ -79,7 +104,7 @@ def _given(arguments: argparse.Namespace) -> list[Any]:
     """What the verb takes."""
     if arguments.command in _DIRECTED:
         return [Direction(arguments.direction) if arguments.direction else None]
-    return [arguments.hz] if arguments.command == "set-frequency" else []
+    return [arguments.frequency] if arguments.command == "set-frequency" else []
 
 
 def _json(state: State | None) -> dict[str, Any] | None:

@@ -14,7 +14,7 @@ from multidrop.cli.target import (
     add_writing_arguments,
     drive_of,
 )
-from multidrop.cli.values import as_json
+from multidrop.cli.values import as_json, taken
 from multidrop.outcome import Effect
 from multidrop.rules import check_plain, raw_count, refused
 
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     register = drive.register(arguments.register)
     if register.never:
         raise refused(drive, register, register.never)
-    value = register.parse(arguments.value)
+    value = taken(register, register.parse(arguments.value))
     check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
     ask(f"Write {register.name} = {register.format(value)} to {drive.name} on {arguments.port}?", arguments)
     with Bus(arguments.port, audit=arguments.audit) as bus:
