@@ -120,6 +120,11 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
             ["write", "/dev/ttyX", "yd1000", "1", "command_mode", "0.5"],
             "command_mode takes a whole number, not 0.5",
         ),
+        (
+            ["read", "sockt://10.0.0.7:4001", TOY, "1"],
+            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as socket://10.0.0.7:4001 or "
+            "rfc2217://10.0.0.7:4001",
+        ),
         (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
         (
@@ -159,6 +164,26 @@ def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_p
         2,
         "multidrop: line 'hall/1' has a / in its name, which the link to its port cannot have\n",
     )
+
+
+def test_a_file_is_no_directory_of_ports(run: Run, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        '[[line]]\nname = "a"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
+    )
+    assert run("simulate", plant, "--ports", plant) == (
+        2,
+        "",
+        f"multidrop: {plant} is a file: name a directory with --ports, which is made if need be\n",
+    )
+
+
+def test_a_ledger_that_is_named_must_be_there(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    sentence = f"there is no ledger {tmp_path}/none; without --ledger it is /state/multidrop/wear.sqlite"
+    assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 
 def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_path: Path) -> None:

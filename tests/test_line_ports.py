@@ -218,7 +218,10 @@ def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServ
         ("socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"),
         ("rfc2217://:4001", "it needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
         ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
-        ("sokcet://127.0.0.1:4001", "invalid URL, protocol 'sokcet' not known"),
+        (
+            "sokcet://127.0.0.1:4001",
+            "there is no sokcet://; a URL is such as socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
+        ),
         ("socket://[fe80::1%nowhere]:4001", "Name or service not known"),
         ("spy://{tmp}/absent", "there is no such port"),
     ],
@@ -233,6 +236,8 @@ def test_what_cannot_be_opened_is_a_sentence(tmp_path: Path, port: str, reason: 
     assert str(caught.value) == f"{port}: {reason}"
     assert (caught.value.port, caught.value.reason) == (port, reason)
     assert isinstance(caught.value, OSError)
+    is_mistaken = any(word in reason for word in ("needs a host", "out of range", "there is no sokcet"))
+    assert isinstance(caught.value, ValueError) == is_mistaken
 
 
 def test_a_port_is_opened_by_one_at_a_time() -> None:

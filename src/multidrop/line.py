@@ -18,17 +18,17 @@ import serial
 
 from multidrop.bridge import PORT_FAILURES, Bridge, set_up
 from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
-from multidrop.errors import LineError
+from multidrop.errors import LineError, NoSuchPort
 from multidrop.forks import tell_of_forks
 
 __all__ = [
     "PORT_FAILURES",
     "Line",
     "Wake",
-    "check_address",
     "now_ns",
     "reason_of",
     "sleep",
+    "unopened",
     "utc_minus_monotonic_ns",
 ]
 
@@ -72,11 +72,22 @@ def reason_of(failure: BaseException) -> str:
     return str(failure)
 
 
-def check_address(port: str) -> None:
-    """ValueError for a URL of a network port that does not say where it is."""
-    url = urlsplit(port)
-    if url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port):
-        raise ValueError(f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+def unopened(port: str) -> serial.Serial:
+    """The port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
+    if not isinstance(port, str):
+        raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
+    try:
+        url = urlsplit(port)
+        needs_place = url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
+    except ValueError as mistake:
+        raise NoSuchPort(port, str(mistake)) from mistake
+    if needs_place:
+        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+    try:
+        return serial.serial_for_url(port, do_not_open=True)
+    except ValueError as mistake:
+        right = "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {right}") from mistake
 
 
 class Wake:
@@ -149,8 +160,7 @@ class Line:
     def _open(self) -> None:
         self._why_closed = "it is closed"
         try:
-            check_address(self.port)
-            port = self._serial = serial.serial_for_url(self.port, do_not_open=True)
+            port = self._serial = unopened(self.port)
             port.timeout = 0
             if isinstance(port, serial.Serial):
                 port.exclusive = True
@@ -161,6 +171,8 @@ class Line:
                 self._core.tap(self._tap)
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
+        except NoSuchPort:
+            raise
         except PORT_FAILURES as failure:
             self.close()
             raise LineError(self.port, reason_of(failure)) from failure

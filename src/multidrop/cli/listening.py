@@ -13,11 +13,9 @@ import time
 from types import TracebackType
 from typing import NoReturn
 
-import serial
-
 from multidrop.core import REFUSALS, Heard, set_settings
 from multidrop.errors import LineError
-from multidrop.line import PORT_FAILURES, check_address, reason_of
+from multidrop.line import PORT_FAILURES, reason_of, unopened
 from multidrop.timing import Settings
 
 LOOK_S = 0.05  # the longest that bytes are waited for at a time
@@ -57,8 +55,7 @@ class _Remote:
     """A port behind a pyserial URL, without its `write`."""
 
     def __init__(self, url: str, settings: Settings) -> None:
-        check_address(url)
-        self._port = serial.serial_for_url(url, do_not_open=True)
+        self._port = unopened(url)
         vars(self._port)["write"] = _refuse
         self._port.baudrate = settings.baudrate
         self._port.bytesize = int(settings.format[0])

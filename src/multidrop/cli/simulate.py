@@ -24,6 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
     faults = load_faults(arguments.faults) if arguments.faults else Faults()
+    if arguments.ports.exists() and not arguments.ports.is_dir():
+        raise ValueError(
+            f"{arguments.ports} is a file: name a directory with --ports, which is made if need be"
+        )
     arguments.ports.mkdir(parents=True, exist_ok=True)
     serve([_wire(line, arguments.ports, faults, arguments.unpaced) for line in plant.lines], _announce)
     return 0

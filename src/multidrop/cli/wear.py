@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import aligned
-from multidrop.ledger import BUDGET, CYCLES, Ledger, Wear
+from multidrop.ledger import BUDGET, CYCLES, Ledger, Wear, default_path
 from multidrop.line import now_ns, utc_minus_monotonic_ns
 
 HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEFT", "LAST")
@@ -20,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if arguments.ledger and not Path(arguments.ledger).is_file():
+        raise ValueError(f"there is no ledger {arguments.ledger}; without --ledger it is {default_path()}")
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:
