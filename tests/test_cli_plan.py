@@ -155,7 +155,8 @@ def test_mistakes_in_the_file_are_status_2_and_all_told(run: Run, fitting: Path)
     assert (status, out) == (2, "")
     assert [line.removeprefix(f'multidrop: {fitting}: line "hall-1"') for line in err.splitlines()] == [
         ": unknown key 'prot'; did you mean 'port'?",
-        ', drive "pump-1": \'soon\' is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"',
+        ", drive \"pump-1\": every = 'soon' is not a duration from 100 us to 24 h, "
+        'such as "50 ms", "2 s" or "1 min"',
     ]
 
 

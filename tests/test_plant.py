@@ -182,6 +182,10 @@ def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: L
     ]
 
 
+def test_a_byte_order_mark_is_no_part_of_the_file(load: Load) -> None:
+    assert load("\ufeff" + SILENT).metadata() == load(SILENT).metadata()
+
+
 def test_framing_and_options_reach_the_drive(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert pump.drive.framing is Framing.ASCII
@@ -199,7 +203,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
     )
     assert mistakes(text) == [
         "line \"hall-1\": unknown key 'prot'; did you mean 'port'?",
-        'line "hall-1", drive "pump-1": \'50\' is not a duration from 100 us to 24 h, '
+        'line "hall-1", drive "pump-1": every = \'50\' is not a duration from 100 us to 24 h, '
         'such as "50 ms", "2 s" or "1 min"',
         'line "hall-1", drive "pump-1", poll number 1: '
         "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
@@ -226,7 +230,8 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + 'silence = "0 us"\n' + TOY,
-            'line "L": \'0 us\' is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"',
+            "line \"L\": silence = '0 us' is not a duration from 100 us to 24 h, "
+            'such as "50 ms", "2 s" or "1 min"',
         ),
         (
             HEAD + "silence = 0.0005\n" + TOY,
@@ -314,8 +319,22 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         ),
         (
             HEAD + TOY + 'every = "0 ms"',
-            'line "L", drive "D": \'0 ms\' is not a duration from 100 us to 24 h, '
+            'line "L", drive "D": every = \'0 ms\' is not a duration from 100 us to 24 h, '
             'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + 'switching = "now"\n' + TOY,
+            "line \"L\": switching = 'now' is not a duration from 100 us to 24 h, "
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + TOY + 'poll = [{ register = "output_current", every = "often" }]',
+            'line "L", drive "D", poll number 1: every = \'often\' is not a duration from 100 us to 24 h, '
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + '[[line.drive]]\nname = "I"\nmodel = "innovert-ibd"\naddress = 1\nforward_bit = 2.5',
+            'line "L", drive "I": forward_bit = 2.5 is no whole number from 2 to 3',
         ),
         (
             HEAD + TOY + "rated_frequency = true",

@@ -208,7 +208,7 @@ def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
             "seed = 'x' is not right; write seed = 7",
             "delay = True is not right; write delay = 0.01",
             'away = 3 is not right; write away = "1 s"',
-            f"{soon.value}, for late",
+            f"late = {soon.value}",
             "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01",
             "burst = 0 is not from 1 to 4096 characters",
         )

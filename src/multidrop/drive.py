@@ -71,7 +71,10 @@ P = ParamSpec("P")
 
 @dataclass(frozen=True)
 class Option:
-    """A fact about one drive that only its owner knows, such as its maximum frequency."""
+    """A fact about one drive that only its owner knows, such as its maximum frequency.
+
+    One without a unit is a choice or a number of something: a whole number.
+    """
 
     unit: str
     span: tuple[float, float]
@@ -253,8 +256,10 @@ class Drive:
             low, high = cls.options[name].span
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
                 raise ValueError(
-                    f"{name} = {value!r} is outside {low:g} to {high:g} {cls.options[name].unit}"
+                    f"{name} = {value!r} is outside {low:g} to {high:g} {cls.options[name].unit}".rstrip()
                 )
+            if not cls.options[name].unit and value != int(value):
+                raise ValueError(f"{name} = {value!r} is no whole number from {low:g} to {high:g}")
         return given
 
     @classmethod

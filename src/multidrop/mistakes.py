@@ -13,9 +13,12 @@ T = TypeVar("T")
 
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
-    """A TOML file's tables; ValueError, without the path, when there are none to be had."""
+    """A TOML file's tables; ValueError, without the path, when there are none to be had.
+
+    Some editors put a byte order mark before the text.
+    """
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
     except UnicodeDecodeError as failure:

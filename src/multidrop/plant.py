@@ -129,6 +129,18 @@ def parse_duration(text: str) -> float:
     return seconds
 
 
+def duration_of(given: Mapping[str, Any], key: str, place: Place) -> float | None:
+    """The duration under this key; None if it is not given, or a mistake."""
+    return place.attempt(_duration_under, key, given[key]) if key in given else None
+
+
+def _duration_under(key: str, text: str) -> float:
+    try:
+        return parse_duration(text)
+    except ValueError as mistake:
+        raise ValueError(f"{key} = {mistake}") from mistake
+
+
 _SHORTEST, _LONGEST = 100e-6, 86400.0  # s
 _PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
 _LINE = {
@@ -170,10 +182,7 @@ def _line(table: Any, place: Place) -> Line:
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
         "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
     }
-    silence, switching = (
-        place.attempt(parse_duration, given[key]) if key in given else None
-        for key in ("silence", "switching")
-    )
+    silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
     echo = place.attempt(Echo, given.get("echo", "auto"))
     inherited = {**settings, "silence": silence}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
@@ -190,7 +199,7 @@ def _drive(table: Any, line: Mapping[str, Any], place: Place) -> PolledDrive | N
     if "address" in given:
         sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
         place.once("address", place.labels[0], given["address"], sentence=sentence)
-    every = place.attempt(parse_duration, given["every"]) if "every" in given else None
+    every = duration_of(given, "every", place)
     if model is None:
         return None
     arguments = {key: value for key, value in given.items() if key not in _NOT_ARGUMENTS}
@@ -257,7 +266,7 @@ def _polled(entry: Any, model: type[Drive], every: float | None, place: Place) -
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None
     given = place.check({"register": entry} if isinstance(entry, str) else entry, _POLL)
-    own = place.attempt(parse_duration, given["every"]) if "every" in given else every
+    own = duration_of(given, "every", place) if "every" in given else every
     register = place.attempt(model.register, given["register"]) if "register" in given else None
     if register is None:
         return None

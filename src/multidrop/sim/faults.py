@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.mistakes import Key, Place, read_document
-from multidrop.plant import parse_duration
+from multidrop.plant import duration_of
 
 
 def _rate(means: str) -> Any:
@@ -78,7 +78,7 @@ def load_faults(path: Path | str) -> Faults:
     document = place.attempt(read_document, path, "faults' file")
     given = place.check({} if document is None else document, _KEYS)
     for name in [name for name in given if name in _DURATIONS]:
-        given[name] = place.attempt(parse_duration, given[name], hint=f", for {name}")
+        given[name] = duration_of(given, name, place)
     faults = {name: place.attempt(partial(Faults, **{name: value})) for name, value in given.items()}
     if place.mistakes:
         raise ValueError("\n".join(place.mistakes))
