@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import checksums
 import pytest
@@ -18,6 +18,7 @@ from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, In
 from multidrop.drives.innovert_ibd import Control
 from multidrop.drives.invt_che import parameter
 from multidrop.errors import BadReply, BusError, DriveRefused, LineError, NoReply, Refused, Unconfirmed
+from multidrop.poller import Poller
 from multidrop.register import HOLDING, Kept, command, reading, setting
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 
@@ -281,6 +282,31 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         lambda bus, rig: bus.write(rig, "target", 5.0),
         TypeError,
         "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "a name of a drive is read": (
+        lambda bus, rig: bus.read("pump", rig.target),
+        TypeError,
+        "'pump' is no drive: it is what attach returns",
+    ),
+    "a name is attached": (
+        lambda bus, rig: bus.attach("innovert-ibd", 2),
+        TypeError,
+        "attach takes a family such as InnovertIBD, or a drive of one, not 'innovert-ibd'",
+    ),
+    "a class is attached that is no family": (
+        lambda bus, rig: bus.attach(dict, 2),
+        TypeError,
+        "attach takes a family such as InnovertIBD, or a drive of one, not <class 'dict'>",
+    ),
+    "no port": (
+        lambda bus, rig: Bus(cast(Any, None)),
+        TypeError,
+        "a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not None",
+    ),
+    "a file instead of its plant": (
+        lambda bus, rig: Poller(cast(Any, "plant.toml")),
+        TypeError,
+        "Poller takes a Plant, such as load_plant('plant.toml') gives, not 'plant.toml'",
     ),
     "a broadcast that the document does not have": (
         lambda bus, rig: bus.broadcast(rig.target, 0),

@@ -18,6 +18,7 @@ import multidrop.drives
 from multidrop.core import Message, build_reply, build_request, parse_reply, parse_request, raw_value
 from multidrop.drive import VERBS, Condition, Direction, Drive, State, Unsupported
 from multidrop.drives import MODELS
+from multidrop.drives.invt_che import Status
 from multidrop.plan import blocks, write_request
 from multidrop.register import Carrier, Register, Wire, reading
 
@@ -54,6 +55,30 @@ def test_a_family_says_what_it_is(family: type[Drive]) -> None:
     assert family.title
     assert family.watchdog
     assert family(family.addresses[0]).name == f"{family.model}@{family.addresses[0]}"
+
+
+@family
+@pytest.mark.parametrize("name", ["start", "jog"])
+@pytest.mark.parametrize("given", ["reverse", "forward", True, 25.0, Status.REVERSE])
+def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
+    """A word that is no Direction must not turn the motor the other way; nothing is sent."""
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = drive.introduce = pytest.fail
+    sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
+    for words, named in (((given,), {}), ((), {"direction": given})):
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name)(*words, **named)
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name).script(*words, **named)
+
+
+@family
+@pytest.mark.parametrize("given", ["25", None, True, Direction.FORWARD])
+def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = drive.introduce = pytest.fail
+    with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
+        drive.set_frequency(given)  # type: ignore[arg-type]
 
 
 @family

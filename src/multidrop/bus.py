@@ -110,6 +110,9 @@ class Bus:
         Nothing is sent: its watchdog is read and logged at the first look. Raises ValueError for
         what the family does not allow, or an address taken.
         """
+        family = drive if isinstance(drive, type) else type(drive)
+        if not issubclass(family, Drive):
+            raise TypeError(f"attach takes a family such as InnovertIBD, or a drive of one, not {drive!r}")
         if isinstance(drive, type):
             if address is None:
                 raise TypeError(f"attach({drive.__name__}, address=...): which address does it have?")

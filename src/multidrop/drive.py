@@ -83,6 +83,12 @@ class Option:
 
 # Verbs before which the drive must be known to be of its family; a stop goes to a silent one too.
 _LOOKS_FIRST = ("start", "jog", "reset_fault", "set_frequency")
+# What a verb is given, its types, and in words: "reverse" is not Direction.REVERSE, and would go forward.
+_TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
+    "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
+    "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
+    "set_frequency": ("hz", (int, float), "a number in Hz"),
+}
 
 
 class _BoundVerb(Generic[P, R]):
@@ -94,12 +100,18 @@ class _BoundVerb(Generic[P, R]):
         self._script = script
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        script = self.script(*args, **kwargs)
         if self.name in _LOOKS_FIRST:
             self.drive.introduce()
-        return cast(R, self.drive.perform(self._script(self.drive, *args, **kwargs)))
+        return cast(R, self.drive.perform(script))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
         """The steps, to be carried out by someone else: another verb or a test."""
+        if self.name in _TAKES:
+            keyword, types, right = _TAKES[self.name]
+            for given in (*args[:1], *(it for key, it in kwargs.items() if key == keyword)):
+                if isinstance(given, bool) or not isinstance(given, types):
+                    raise TypeError(f"{self.name} of {self.drive.name} takes {right}, not {given!r}")
         return self._script(self.drive, *args, **kwargs)
 
 

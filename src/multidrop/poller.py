@@ -44,6 +44,8 @@ class Poller:
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
     ) -> None:
+        if not isinstance(plant, Plant):
+            raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
         self._codes = Codes()
         self._inbox = Inbox()
         self._wake = Wake()

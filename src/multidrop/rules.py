@@ -43,6 +43,8 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
 
     TypeError for what is none, such as a name.
     """
+    if not isinstance(drive, Drive):
+        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
     if not isinstance(register, Register):
         hint = "use its attribute, or drive.register(NAME)"
         raise TypeError(f"{register!r} is no register of {drive.name}: {hint}")
