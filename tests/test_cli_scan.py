@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from disks import read_only_directory
 from terminals import on_terminal
 from test_cli import TOY, Run, run
 from toy import Toy
@@ -115,6 +116,25 @@ def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], sentence: s
     assert (status, out) == (2, "")
     assert sentence in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_plant_file_that_cannot_be_written_is_told_before_the_port_is_opened(
+    run: Run, tmp_path: Path
+) -> None:
+    for out, status, reason in (
+        (tmp_path / "none" / "found.toml", 2, "No such file or directory"),
+        (tmp_path, 2, "Is a directory"),
+    ):
+        assert run("scan", "/dev/nowhere", "--out", out) == (status, "", f"multidrop: {out}: {reason}\n")
+    with read_only_directory() as directory:
+        status, _, err = run("scan", "/dev/nowhere", "--out", directory / "found.toml")
+    assert (status, err) == (1, f"multidrop: {directory}/found.toml: Permission denied\n")
+
+
+def test_a_scan_that_fails_leaves_no_plant_file(run: Run, tmp_path: Path) -> None:
+    sentence = "multidrop: /dev/nowhere: there is no such port\n"
+    assert run("scan", "/dev/nowhere", "--out", tmp_path / "found.toml") == (1, "", sentence)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_port_that_is_not_there_is_one_sentence(run: Run) -> None:

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from multidrop.recording.whole import already_there
+from multidrop.recording.whole import already_there, new_file
 
 
 def refuse_overwriting(path: Path) -> None:
     """Raise ValueError when there is a file at this path."""
     if path.is_file():
         raise already_there(path)
+
+
+def check_writable(path: Path) -> None:
+    """Raise ValueError or OSError when no new file can be written there, which only trying tells."""
+    refuse_overwriting(path)
+    if path.exists() and not path.is_dir():  # a device or a pipe
+        return
+    new_file(path).close()
+    path.unlink()
 
 
 def check_capture(path: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.overwriting import check_writable
 from multidrop.cli.target import add_json_argument
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.out:
-        refuse_overwriting(arguments.out)
+        check_writable(arguments.out)
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
     found: list[Finding] = []
