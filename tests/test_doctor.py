@@ -243,6 +243,12 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
 
 
+def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> None:
+    status, out, _ = run("doctor", port, "--baudrate", "19200", "--format", "8E1")
+    assert status == 0
+    assert "none at 19200 8E1: nothing came back" in out
+
+
 def test_a_drive_that_is_not_there_is_told(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
     assert status == 1
@@ -257,6 +263,9 @@ def test_a_drive_that_is_not_there_is_told(run: Run, port: str) -> None:
         (("/dev/null",), 1, "/dev/null: it is not a serial port"),
         (("/dev/nowhere", "--model", "invt-che"), 2, "--model and --address belong together"),
         (("/dev/nowhere", "--model", "invt", "--address", "1"), 2, "did you mean invt-che"),
+        (("/dev/nowhere", "--baudrate", "0"), 2, "baud rate 0 is outside 50 to 4000000"),
+        (("/dev/nowhere", "--format", "9N1"), 2, "format '9N1' is not data bits, parity and stop bits"),
+        (("/dev/nowhere", "--framing", "rtu"), 2, "name the drive with --model and --address"),
     ],
 )
 def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:

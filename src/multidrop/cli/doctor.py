@@ -43,15 +43,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("port", metavar="PORT", help="device such as /dev/ttyUSB0, or pyserial URL")
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
     parser.add_argument("--address", type=int, metavar="N", help="its address")
-    parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
-    parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits")
-    parser.add_argument("--framing", metavar="rtu", help="where the family has several")
+    parser.add_argument(
+        "--baudrate", type=int, metavar="N", help="of the line; the family's default, or 9600, without it"
+    )
+    parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits; the same, or 8N1")
+    parser.add_argument("--framing", metavar="rtu", help="of the drive, where the family has several")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     drive = _drive(arguments)
-    findings = list(_findings(arguments.port, drive))
+    settings = drive.settings if drive else _line_settings(arguments)
+    findings = list(_findings(arguments.port, drive, settings))
     if arguments.json:
         print(json.dumps({"port": arguments.port, "findings": [asdict(it) for it in findings]}, indent=2))
     else:
@@ -63,18 +66,27 @@ def _drive(arguments: argparse.Namespace) -> Drive | None:
     if (arguments.model is None) != (arguments.address is None):
         raise ValueError("--model and --address belong together: both name the drive to measure with")
     if arguments.model is None:
+        if arguments.framing is not None:
+            raise ValueError("--framing is how a drive is asked: name the drive with --model and --address")
         return None
     return find_model(arguments.model)(
         arguments.address, framing=arguments.framing, baudrate=arguments.baudrate, format=arguments.format
     )
 
 
-def _findings(port: str, drive: Drive | None) -> Iterator[Finding]:
+def _line_settings(arguments: argparse.Namespace) -> Settings:
+    """What an echo is looked for with where no drive is named."""
+    return Settings(
+        9600 if arguments.baudrate is None else arguments.baudrate,
+        "8N1" if arguments.format is None else arguments.format,
+    )
+
+
+def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Finding]:
     if "://" in port:
         yield from _remote(port)
     else:
         yield from _local(port)
-    settings = drive.settings if drive else Settings(9600, "8N1")
     yield _echo(port, settings)
     yield _round_trip(port, drive)
 
