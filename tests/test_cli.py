@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from multidrop.cli import COMMANDS, main
+from multidrop.cli.advice import typed
 from multidrop.cli.interruption import Interruption
 from multidrop.drives import MODELS
 
@@ -221,6 +222,45 @@ def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_pat
 )
 def test_what_a_rule_forbids_is_a_sentence_and_status_1(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (["set-frequency", "/dev/ttyX", "invt-che", "1", "20"], "P0.04: add --option maximum_frequency=HZ"),
+        (
+            ["start", "/dev/ttyX", "innovert-ibd", "1", "--direction", "forward"],
+            "which of bits 2 and 3 turns it forward, and add --option forward_bit=N",
+        ),
+        (
+            ["write", "/dev/ttyX", "yd1000", "1", "control", "run"],
+            "use `multidrop start`, `multidrop stop`, `multidrop jog`, `multidrop reset-fault` (manual",
+        ),
+    ],
+)
+def test_what_a_rule_forbids_comes_with_what_is_to_be_typed(run: Run, words: list[str], advice: str) -> None:
+    status, out, err = run(*words)
+    assert (status, out) == (1, "")
+    assert advice in err
+
+
+@pytest.mark.parametrize(
+    ("sentence", "command"),
+    [
+        ("see to it, then call reset_fault()", "see to it, then run `multidrop reset-fault`"),
+        (
+            "then call reset_fault(), or declare acknowledged_fault = 64",
+            "then run `multidrop reset-fault` and add --option acknowledged_fault=64",
+        ),
+        ('declare ram = ["frequency"]', "add --ram frequency"),
+        ("and declare confirmed = 1 if it is an IBD", "and add --option confirmed=1 if it is an IBD"),
+        ("its setpoint is 0: call set_frequency before start", "its setpoint is 0: add --frequency HZ"),
+        ("use emergency_stop()", "use `multidrop emergency-stop`"),
+        ("it is a reading", "it is a reading"),
+    ],
+)
+def test_advice_for_a_program_becomes_a_command_s(sentence: str, command: str) -> None:
+    assert typed(sentence) == command
 
 
 @pytest.mark.parametrize(

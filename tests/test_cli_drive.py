@@ -14,6 +14,7 @@ from lines import Faulty
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
+from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
@@ -223,6 +224,15 @@ def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None
     assert toy["frequency"] == 33.5
     assert run("stop", port, TOY, 1)[0] == 0  # is never asked for
     assert toy["control"] == 0
+
+
+def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> None:
+    """What another command wrote is not known to this one."""
+    with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
+        words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
+        sentence = "multidrop: innovert-ibd@1 cannot say its setpoint: add --frequency HZ\n"
+        assert run("start", *words) == (1, "", sentence)
+        assert run("start", *words, "--frequency", 20)[0] == 0
 
 
 def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:

@@ -104,7 +104,7 @@ def test_there_is_no_reverse() -> None:
 
 def test_start_is_refused_while_a_fault_may_stand() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": Fault.OVERHEAT}, turns=TURNS)
-    with pytest.raises(Refused, match=r"OVERHEAT.*reset_fault.*acknowledged_fault=64"):
+    with pytest.raises(Refused, match=r"OVERHEAT.*reset_fault.*acknowledged_fault = 64"):
         wire.drive.start()
     assert wire.sent == []
     wire.drive.reset_fault()

@@ -86,7 +86,9 @@ def _guarded(command: str, words: list[str]) -> int:
         _abandon_output()
         return DONE
     except Refused as refusal:
-        return _say(str(refusal), FAILED)
+        from multidrop.cli.advice import typed
+
+        return _say(typed(str(refusal)), FAILED)
     except (ValueError, TypeError, Unsupported) as mistake:
         return _say(str(mistake), MISTAKE)
     except OSError as failure:

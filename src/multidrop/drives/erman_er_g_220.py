@@ -212,7 +212,7 @@ class ErmanERG220(Drive):
         if fault and fault not in (self._reset_fault, dealt_with):
             raise Refused(
                 f"{self.name} may have a fault, {self.last_fault.format(fault)}: see to it, then call "
-                f"reset_fault(), or declare acknowledged_fault={int(fault)}"
+                f"reset_fault(), or declare acknowledged_fault = {int(fault)}"
             )
         yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)

@@ -268,8 +268,8 @@ class InnovertIBD(Drive):
         if forward not in (2, 3):
             raise Refused(
                 f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
-                "start without a direction, or try which of bits 2 and 3 turns it forward, and declare that "
-                "as forward_bit"
+                "start without a direction, or try which of bits 2 and 3 turns it forward, and "
+                "declare forward_bit = N"
             )
         return 1 << int(forward if direction is Direction.FORWARD else 5 - forward)
 

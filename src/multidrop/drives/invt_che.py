@@ -300,7 +300,7 @@ class InvtCHE(Drive):
         most = self.option.get("maximum_frequency")
         if most is None:
             raise Refused(
-                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency=..., in Hz"
+                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency = HZ"
             )
         if not 0 <= hz <= most:
             raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
