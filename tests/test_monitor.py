@@ -371,6 +371,18 @@ def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
         assert terminal.process.wait(timeout=20) == 2
 
 
+def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
+    plant, out = tmp_path / "hall.toml", tmp_path / "seen.arrows"
+    plant.write_text(
+        '[[line]]\nname = "hall"\nport = "/dev/not-there"\n'
+        '[[line.drive]]\nname = "pump"\nmodel = "invt-che"\naddress = 1\n'
+    )
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("there is no such port")
+        assert terminal.process.wait(timeout=20) == 1
+    assert not out.exists()
+
+
 def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
     environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from os import get_terminal_size
 from pathlib import Path
@@ -56,10 +56,11 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
     console = _console()
     with ExitStack() as stack:
         interruption = stack.enter_context(Interruption())
+        poller = stack.enter_context(closing(Poller(plant)))  # first: without ports there is no recording
         takers: list[Callable[[Rows], None]] = []
         if out:
             takers.append(stack.enter_context(open_writer(out, plant.metadata())).write)
-        with Poller(plant) as poller:
+        with poller:
             _Monitor(plant, poller, takers, console).show(interruption, seconds)
         while batch := poller.take():  # what came while it closed
             for take in takers:
