@@ -293,6 +293,11 @@ MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
         TypeError,
         "attach takes a family such as InnovertIBD, or a drive of one, not 'innovert-ibd'",
     ),
+    "a drive that is made is attached at another address": (
+        lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
+        TypeError,
+        "pump is made already: what it is to be goes into Toy(…)",
+    ),
     "a class is attached that is no family": (
         lambda bus, rig: bus.attach(dict, 2),
         TypeError,

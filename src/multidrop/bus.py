@@ -119,6 +119,8 @@ class Bus:
             line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
             details = {**line, **details}
             drive = drive(address, **details)
+        elif address is not None or details:
+            raise TypeError(f"{drive.name} is made already: what it is to be goes into {family.__name__}(…)")
         for other in self.drives:
             if other.address == drive.address:
                 raise ValueError(f"address {drive.address} is taken by {other.name}")
