@@ -103,8 +103,12 @@ def told(directory: Path, life: str) -> list[str]:
 
 
 def check_rows(rows: Sequence[Row]) -> None:
-    """The count grew by one from sample to sample, but for exchanges that are rows without a value."""
-    assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(rows))
+    """The count grew by one from sample to sample, but for exchanges that are rows without a value.
+
+    On a busy machine a drive is thought silent: that it was not asked is told when it would have been.
+    """
+    samples = [row for row in rows if row.value is not None]
+    assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
     last, missed = None, 0
     for row in rows:
         if row.value is None:
