@@ -66,6 +66,7 @@ class SharedPair:
             tty.setraw(fd)
         for fd in self._sides:
             os.set_blocking(fd, False)
+        self._spoke = self._our_side  # which client did last
         self.sent = b""
         self.collisions = 0
         self.holds: Callable[[bytes], bool] = lambda said: False
@@ -100,7 +101,10 @@ class SharedPair:
                 del said[self._our_side]
                 said[self._their_side] = self.says
         self.collisions += len(said) > 1
-        for listener in self._sides:
+        self._spoke = next((side for side in self._sides[:2] if side in said), self._spoke)
+        for listener in sorted(self._sides, key=lambda side: side == self._spoke):
+            if listener == self._spoke and self._drives in said:
+                sleep(SLOT)  # a pty is slow: who is answered may act before the other has heard the answer
             others = [it for speaker, it in said.items() if speaker != listener]
             heard = self._mixed(others)
             if heard:
