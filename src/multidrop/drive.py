@@ -10,6 +10,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from multidrop.core import Framing
@@ -87,7 +88,7 @@ _LOOKS_FIRST = ("start", "jog", "reset_fault", "set_frequency")
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
-    "set_frequency": ("hz", (int, float), "a number in Hz"),
+    "set_frequency": ("hz", (Real,), "a number in Hz"),
 }
 
 
