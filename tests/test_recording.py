@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import struct
 import sys
 from collections.abc import Iterator
 from datetime import datetime
@@ -158,6 +159,17 @@ def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
     assert [Row(*row) for row in parquet] == RECORDED
     text = duckdb.sql(f"select * exclude (time) from '{record(tmp_path / 'a.csv')}'").fetchall()
     assert text == [row[1:] for row in RECORDED]
+
+
+def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(from_rows([Row(0, 0, None, "h\u00e9", "r", None, "no reply")] * 2))
+    content, whole, cut = path.read_bytes(), struct.pack("<3i", 0, 3, 6), struct.pack("<3i", 0, 2, 6)
+    assert content.count(whole) == 1
+    path.write_bytes(content.replace(whole, cut))
+    with pytest.raises(ValueError, match="is damaged after row 0: its text is not UTF-8"):
+        list(open_reader(path))
 
 
 def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path) -> None:

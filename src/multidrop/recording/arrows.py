@@ -124,6 +124,15 @@ def _column(field: Table) -> tuple[bytes, int, int]:
     return field.text(0), field.number(2, "<B"), detail.number(0, "<h") if detail else 0
 
 
+def _check_text(offsets: memoryview, text: memoryview) -> None:
+    """Raises ValueError unless each row's text is UTF-8, on which libraries that take the batch rely."""
+    if str(text, "utf-8").isascii():
+        return
+    for at in offsets[: len(offsets) // 4 * 4].cast("i"):
+        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # within a character
+            raise ValueError("its text is not UTF-8")
+
+
 def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
     if message.kind != RECORD_BATCH:
         raise ValueError("there is a message that is not a batch of rows")
@@ -139,6 +148,6 @@ def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
     for _, kind, _ in COLUMNS:
         valid, *data = islice(buffers, BUFFERS[kind])
         if kind == UTF8:
-            str(data[-1], "utf-8")  # raises: libraries that take the batch rely on it
+            _check_text(*data)
         columns.append((valid or None, *data))
     return Recorded(assemble(rows, *columns))
