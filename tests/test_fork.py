@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
@@ -65,6 +65,28 @@ def in_child(act: Callable[[], object]) -> Any:
         if isinstance(told, Exception):
             raise told
         return told
+
+
+@contextmanager
+def held(*locks: Any) -> Iterator[None]:
+    """Another thread has them meanwhile."""
+    are_held, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with ExitStack() as stack:
+            for lock in locks:
+                stack.enter_context(lock)
+            are_held.set()
+            done.wait(PATIENCE)
+
+    holding = threading.Thread(target=hold)
+    holding.start()
+    assert are_held.wait(PATIENCE)
+    try:
+        yield
+    finally:
+        done.set()
+        holding.join()
 
 
 def wire(port: str = "pty") -> Wire:
@@ -174,13 +196,6 @@ def test_a_port_is_free_when_its_parent_closed_it_while_the_child_lives(port: st
 
 
 def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
-    held, done = threading.Event(), threading.Event()
-
-    def hold() -> None:
-        with bus.line._lock, bus._stopped:
-            held.set()
-            done.wait(PATIENCE)
-
     def use() -> None:
         bus.detach(bus.drives[0])
         bus.line.require((9600, "8N1"))
@@ -188,14 +203,8 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        holding = threading.Thread(target=hold)
-        holding.start()
-        held.wait(PATIENCE)
-        try:
+        with held(bus.line._lock, bus._stopped):
             assert in_child(use) is None
-        finally:
-            done.set()
-            holding.join()
         assert current(bus) == 3.25
 
 
@@ -219,13 +228,7 @@ def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
 
 
 def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
-    held, done = threading.Event(), threading.Event()
     toy = polled(Toy(1), [Toy.output_current])
-
-    def hold() -> None:
-        with poller._changing, poller._lines[0]._lock:
-            held.set()
-            done.wait(PATIENCE)
 
     def use() -> None:
         poller.summary()
@@ -233,14 +236,8 @@ def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
         poller.close()
 
     with Poller(plant(declared(port, toy))) as poller:
-        holding = threading.Thread(target=hold)
-        holding.start()
-        held.wait(PATIENCE)
-        try:
+        with held(poller._changing, poller._lines[0]._lock):
             assert in_child(use) is None
-        finally:
-            done.set()
-            holding.join()
         until(lambda: is_polled(poller))
 
 
