@@ -16,7 +16,7 @@ import pyarrow
 from played import Played, Unpaced, Unreliable
 
 from multidrop.batch import Batch
-from multidrop.core import Port
+from multidrop.core import Echo, Port
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.line import Line
@@ -41,8 +41,8 @@ class Inherited(Line):
             self._core = None
 
 
-def _opened(port: str) -> Line:
-    return Inherited(port) if port.isdigit() else Line(port)
+def _opened(port: str, echo: Echo) -> Line:
+    return Inherited(port, echo) if port.isdigit() else Line(port, echo)
 
 
 @contextmanager
