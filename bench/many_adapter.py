@@ -21,7 +21,6 @@ from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.line import Line
 from multidrop.plan import planned
-from multidrop.plan import silence as silence_of
 from multidrop.plant import Line as Declared
 from multidrop.plant import Plant, Polled, PolledDrive
 from multidrop.poller import Poller
@@ -124,13 +123,11 @@ def mixed() -> Mixed:
                 drive.address,
                 int(drive.framing),
                 drive.settings.baudrate,
-                *(
-                    round(1e9 * it)
-                    for it in (drive.settings.character, drive.response_delay, silence_of(drive))
-                ),
+                *(round(1e9 * it) for it in (drive.settings.character, drive.response_delay, demanded)),
             )
         )
         for drive in drives
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # we keep more around ASCII frames
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
