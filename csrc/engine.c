@@ -236,7 +236,7 @@ void md_port_tell_echo(struct md_port *port, int echo)
 {
     enter(port->engine);
     port->line.echo = echo;
-    port->line.echo_is_told = echo != MD_ECHO_UNKNOWN;
+    port->line.echo_is_told = echo == MD_ECHO; /* an echo that shows is believed: it confirms no write */
     leave(port->engine);
 }
 

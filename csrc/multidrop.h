@@ -204,7 +204,7 @@ struct md_line {
     uint16_t tx_len, tx_at;
     uint16_t rx_len, rx_from; /* no reply begins before rx_from */
     int echo;                 /* of what the adapter sends (enum md_echo): learnt, never forgotten by failures */
-    int echo_is_told;         /* and not learnt */
+    int echo_is_told;         /* to be there, and is not unlearnt */
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
     int waited, looks;        /* since the request left: whether it was left alone, how often it was looked at */
     struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */
@@ -263,7 +263,7 @@ int md_port_end(struct md_port *port);
 void md_port_stop(struct md_port *port);
 void md_port_free(struct md_port *port); /* a port that was stopped */
 /* Who has the rows of what is carried out, and is called, by this number, when the port is to be looked at. */
-/* Whether its adapter echoes (enum md_echo), which is not learnt then; MD_ECHO_UNKNOWN: it is. */
+/* Whether its adapter echoes (enum md_echo): MD_ECHO is never unlearnt, MD_NO_ECHO holds until one shows. */
 void md_port_tell_echo(struct md_port *port, int echo);
 void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t number);
 /* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time.

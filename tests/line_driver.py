@@ -44,8 +44,8 @@ class LineDriver:
         self._line.echo = known
 
     def tell_echo(self, known: int) -> None:
-        """As its user does: nothing is learnt then."""
-        self.echo, self._line.echo_is_told = known, 1
+        """As its user does."""
+        self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
 
     @property
     def completion(self) -> Completion:

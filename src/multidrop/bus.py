@@ -38,7 +38,7 @@ class Bus:
     `port` is a device such as /dev/ttyUSB0 or any pyserial URL; `baudrate` and `format` replace the
     families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
     t3.5 between frames, if all of them bear it. `echo` tells whether the adapter repeats what it sends: "on",
-    "off", or "auto", to find out. Raises LineError when the port cannot be opened. Writes
+    "off", until it does, or "auto", to find out. Raises LineError when the port cannot be opened. Writes
     that may wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are
     noted in the file `audit`. A write whose turn does not come within `expiry` seconds is not sent.
     Leaving the `with` block closes the port and sends nothing, unless `stop_on_exit` was called.
