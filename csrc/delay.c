@@ -38,14 +38,29 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
  * While it stays silent that is rare, because it is time that the other drives lose. What must not wait so
  * long before it is repeated, a stop, has twice the time after each failure. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
+static const int64_t MOST_PATIENCE = INT64_C(20000000000);
+
+static int64_t hurried_timeout_ns(const struct md_drive *drive)
+{
+    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
+}
 
 int64_t md_timeout_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    int64_t usual_ns = usual_timeout_ns(drive);
     if (exchange->insists)
-        return sooner(usual_ns << sooner(drive->failures, MOST_DOUBLINGS), drive->most_timeout_ns);
-    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_ns;
+        return sooner(usual_timeout_ns(drive) << sooner(drive->failures, MOST_DOUBLINGS), drive->most_timeout_ns);
+    return later(hurried_timeout_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
+}
+
+int64_t md_window_ns(const struct md_exchange *exchange)
+{
+    return later(3 * hurried_timeout_ns(exchange->drive), exchange->drive->most_timeout_ns);
+}
+
+int64_t md_present_timeout_ns(const struct md_drive *drive)
+{
+    return later(usual_timeout_ns(drive), learnt(&drive->patience_ns));
 }
 
 int64_t md_vain_ns(const struct md_drive *drive)
@@ -67,10 +82,33 @@ static void smooth(struct md_drive *drive, int64_t delay_ns)
     learn(&drive->delay_ns, later(drive->delay_ns + off_ns / 8, 1));
 }
 
+/* ---- answers that came late ---- */
+
+/* No more than the usual time is no patience. */
+static void be_patient(struct md_drive *drive, int64_t patience_ns)
+{
+    learn(&drive->patience_ns, patience_ns > usual_timeout_ns(drive) ? patience_ns : 0);
+}
+
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns)
 {
     if (is_whole) /* it may have been so for long */
         delay_ns = sooner(delay_ns, md_look_ns(drive, character_ns));
     smooth(drive, delay_ns);
+    if (drive->patience_ns > 2 * delay_ns)
+        be_patient(drive, drive->patience_ns - drive->patience_ns / 8);
     return delay_ns;
+}
+
+/* Half as long again: delays vary. Of a question that was asked several times nobody knows which is answered. */
+void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
+{
+    int64_t patience_ns = sooner(delay_ns + delay_ns / 2, MOST_PATIENCE);
+    be_patient(drive, is_exact ? patience_ns : later(patience_ns, drive->patience_ns));
+}
+
+void md_learn_silence(struct md_drive *drive)
+{
+    if (drive->patience_ns)
+        be_patient(drive, drive->patience_ns / 2);
 }

@@ -29,7 +29,7 @@ struct wish {
 };
 
 /* Whose exchange is under way. */
-enum turn { NOBODYS, TELLERS, WISHED, QUEUED, REPEATED };
+enum turn { NOBODYS, BEFORE, WISHED, QUEUED, REPEATED }; /* BEFORE: what is asked before somebody's */
 
 struct md_port {
     struct md_engine *engine;
@@ -48,8 +48,7 @@ struct md_port {
     uint32_t number; /* there */
 
     enum turn turn;
-    const struct md_exchange *told; /* before this one its teller has had its turn */
-    uint32_t failures; /* of the drive, before its exchange */
+    struct md_before before;
     int blind;         /* nothing is worth reading before the port's waking time */
     int watched;       /* the waiter tells when it can be read */
     int emptied;       /* it was read empty a moment ago: nothing is there yet */

@@ -64,15 +64,15 @@ int64_t md_port_hear(struct md_port *port)
     return now_ns;
 }
 
-/* Whether the port took anything. The request leaves when it is written; where the thread was held up
- * just then, afterwards: since too early a time its reply, and a late one, would be waited for too short. */
+/* The port took something. The request leaves when it is written; where the thread was held up just then,
+ * perhaps afterwards: since too early a time its reply, and a late one, would be waited for too short. */
 static int pump_out(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->line;
     ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
     if (written > 0)
-        md_line_sent(line, (size_t)written, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
+        md_line_sent(line, (size_t)written, begun_ns, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
     else if (written < 0 && !is_transient(errno))
         lose(port, errno);
     return written != 0 && (written > 0 || port->progress.lost);
@@ -104,24 +104,16 @@ static int64_t apply_settings(struct md_port *port, const struct md_settings *se
     return now_ns;
 }
 
-/* Whether it was begun, and not its teller. */
+/* Take it up, or what is to be asked before: then 0. */
 static int begin(struct md_port *port, enum turn turn, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
-    if (exchange->teller && port->line.echo == MD_ECHO_UNKNOWN && port->told != exchange) {
-        port->told = exchange;
-        turn = TELLERS;
-        exchange = exchange->teller;
-        completion = &port->completion;
-    } else {
-        port->told = NULL;
-    }
-    port->turn = turn;
-    port->failures = exchange->drive->failures;
-    md_line_begin(&port->line, exchange, completion, now_ns);
+    const struct md_exchange *first = md_before(&port->before, exchange, port->line.echo, now_ns);
+    port->turn = first ? BEFORE : turn;
+    md_line_begin(&port->line, first ? first : exchange, first ? &port->completion : completion, now_ns);
     if (port->progress.lost)
         md_line_abandon(&port->line, MD_LINE_LOST, port->lost_error);
-    return turn != TELLERS;
+    return !first;
 }
 
 static unsigned pending(struct md_port *port)
@@ -214,7 +206,7 @@ static void report(struct md_port *port)
     if (port->inbox)
         md_inbox_add(port->inbox, exchange->block, completion);
     int is_refusal = completion->result > 0 && completion->reply.exception;
-    if (is_refusal || exchange->drive->failures != port->failures)
+    if (is_refusal || exchange->drive->failures != port->before.failures)
         call(port);
 }
 
@@ -222,8 +214,14 @@ void md_port_finish(struct md_port *port)
 {
     enum turn turn = port->turn;
     port->turn = NOBODYS;
-    if (turn == TELLERS)
+    if (turn == BEFORE)
         return;
+    int goes_on = !port->progress.lost && (turn == WISHED || !port->ending);
+    if (md_is_asked_again(&port->before, port->line.completion) && goes_on) {
+        if (turn == REPEATED && port->round_len)
+            port->round_at = (port->round_at ? port->round_at : port->round_len) - 1;
+        return;
+    }
     if (turn == WISHED) {
         struct wish *wish = port->wishes;
         port->wishes = wish->next;

@@ -6,7 +6,7 @@
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
  * echoes what it sends shows in the replies that are no copies of their requests, and where a copy
  * is all that comes before a time-out; until it does, no copy is taken for the reply. */
-#include "multidrop.h"
+#include "late.h"
 #include "times.h"
 
 #include <errno.h>
@@ -128,7 +128,7 @@ static void measure(struct md_line *line, int reply_len)
     const struct md_exchange *exchange = line->exchange;
     struct md_completion *completion = line->completion;
     int64_t request_ns = line->tx_len * exchange->character_ns, reply_ns = reply_len * exchange->character_ns;
-    int64_t left_ns = completion->sent_ns + request_ns, begun_ns = completion->last_ns - reply_ns;
+    int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
     /* Characters that follow each other tell better when the first came than a late look at them. */
     int64_t first_ns = later(begun_ns + exchange->character_ns, left_ns);
     if (first_ns < completion->first_ns)
@@ -143,74 +143,16 @@ static void measure(struct md_line *line, int reply_len)
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
 {
-    return md_parse_reply(line->exchange->framing, line->rx + at, line->rx_len - at, &line->exchange->request, reply);
-}
-
-static uint64_t function_bit(const struct md_message *request)
-{
-    return UINT64_C(1) << (request->function & 63);
-}
-
-static void expect_late_answer(struct md_line *line)
-{
     const struct md_exchange *exchange = line->exchange;
-    struct md_drive *drive = exchange->drive;
-    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
-    int64_t until_ns = line->quiet_ns + later(3 * md_timeout_ns(exchange), drive->most_timeout_ns) + reply_ns;
-    drive->late_others = line->quiet_ns < drive->late_until_ns;
-    drive->late_functions = (drive->late_others ? drive->late_functions : 0) | function_bit(&exchange->request);
-    drive->late = exchange->request;
-    drive->late_framing = exchange->framing;
-    drive->late_until_ns = later(until_ns, drive->late_until_ns);
-    for (const struct md_drive *owes = line->late; owes; owes = owes->next_late)
-        if (owes == drive)
-            return;
-    drive->next_late = line->late;
-    line->late = drive;
+    int used = md_parse_reply(exchange->framing, line->rx + at, line->rx_len - at, &exchange->request, reply);
+    return used > 0 && !md_is_in_range(reply, exchange->least, exchange->most) ? MD_BAD_ECHO : used;
 }
 
-/* Whether an answer that is still to come could pass for the reply to this request. An exception says no
- * more of what was asked than the function, in Delixi's own protocol not even that. */
-static int is_ambiguous(const struct md_exchange *exchange, int64_t now_ns)
+/* Among bytes that came unasked, or behind a late answer. */
+static void recognise_late_answers(struct md_line *line, size_t from, int64_t now_ns)
 {
-    const struct md_drive *drive = exchange->drive;
-    if (exchange->insists || now_ns >= drive->late_until_ns)
-        return 0;
-    return exchange->framing == MD_DELIXI || (drive->late_functions & function_bit(&exchange->request)) != 0;
-}
-
-/* Whether the answer to an earlier request begins there: its length, MD_INCOMPLETE or a reason. That
- * drive need not be waited for then, and what has come for it is no reply to anything else. */
-static int parse_late_at(struct md_line *line, size_t at, int64_t now_ns)
-{
-    struct md_message reply;
-    int found = MD_NO_START;
-    for (struct md_drive **link = &line->late; *link;) {
-        struct md_drive *drive = *link;
-        if (now_ns >= drive->late_until_ns) { /* not to be expected any more */
-            *link = drive->next_late;
-            continue;
-        }
-        int used = md_parse_reply(drive->late_framing, line->rx + at, line->rx_len - at, &drive->late, &reply);
-        if (used > 0) {
-            *link = drive->next_late;
-            drive->tally.late++;
-            if (!drive->late_others)
-                drive->late_until_ns = 0;
-            return used;
-        }
-        if (used == MD_INCOMPLETE)
-            found = used;
-        link = &drive->next_late;
-    }
-    return found;
-}
-
-/* Among bytes that came unasked. */
-static void recognise_late_answers(struct md_line *line, int64_t now_ns)
-{
-    for (size_t at = 0; line->late && at < line->rx_len; at++) {
-        int used = parse_late_at(line, at, now_ns);
+    for (size_t at = from; line->late && at < line->rx_len; at++) {
+        int used = md_late_take(line, at, now_ns, 1);
         if (used > 0)
             at += (size_t)used - 1;
     }
@@ -244,8 +186,9 @@ static void time_out(struct md_line *line)
     if (is_alone && !is_doubtful)
         learn(line, MD_ECHO); /* nobody else says it again and no more */
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
-    if (!is_damaged_answer(line, begin, first))
-        expect_late_answer(line);
+    if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first)) /* it may be an earlier one's */
+        md_late_expect(line, md_window_ns(exchange));
+    md_learn_silence(exchange->drive);
     int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
     finish(line, is_doubtful ? MD_MAYBE_ECHO : reason, line->rx, line->rx_len);
 }
@@ -284,10 +227,21 @@ static void cut_out(struct md_line *line, size_t at, size_t len)
     memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
 }
 
+/* A late answer came meanwhile: the reply may be as late. */
+static void extend(struct md_line *line)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    line->give_up_ns = later(line->give_up_ns, line->quiet_ns + md_timeout_ns(exchange) + reply_ns);
+    line->begun_by_ns = line->give_up_ns;
+}
+
 /* Look for the reply at every place where it may still begin. A late answer is looked for only where
  * what precedes it cannot be the reply's beginning: it may be the inside of the reply. */
 static void search(struct md_line *line, int64_t now_ns)
 {
+    const struct md_exchange *exchange = line->exchange;
+    struct md_drive *drive = exchange->drive;
     struct md_message reply;
     size_t at = line->rx_from, first_open = SIZE_MAX;
     while (at < line->rx_len) {
@@ -300,7 +254,20 @@ static void search(struct md_line *line, int64_t now_ns)
             at += line->tx_len;
             continue;
         }
+        if (used > 0 && !exchange->insists && drive->owed_count && md_late_take(line, at, now_ns, 0) > 0) {
+            extend(line);
+            if (md_is_read(exchange->framing, exchange->request.function)) { /* it says nothing; another question may */
+                md_late_expect(line, 0);
+                recognise_late_answers(line, at + (size_t)used, now_ns);
+                finish(line, MD_LATE_ANSWER_DUE, line->rx, line->rx_len);
+                return;
+            }
+            cut_out(line, at, (size_t)used);
+            continue;
+        }
         if (used > 0) {
+            if (!exchange->insists)
+                drive->answered_ns = line->quiet_ns;
             md_copy_message(&line->completion->reply, &reply);
             line->completion->skipped -= (uint32_t)used;
             learn_echo(line, at);
@@ -310,8 +277,9 @@ static void search(struct md_line *line, int64_t now_ns)
             return;
         }
         if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
-            used = parse_late_at(line, at, now_ns);
+            used = md_late_take(line, at, now_ns, 1);
         if (used > 0) {
+            extend(line);
             cut_out(line, at, (size_t)used);
             continue;
         }
@@ -370,7 +338,8 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
     line->silence_ns = later(line->silence_ns, exchange->silence_ns);
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     line->state = SILENT;
-    if (is_ambiguous(exchange, now_ns)) {
+    md_late_resume(line, exchange->drive);
+    if (md_late_bars(exchange, now_ns)) {
         finish(line, MD_LATE_ANSWER_DUE, line->rx, 0);
         return;
     }
@@ -432,16 +401,16 @@ static void keep_echo(struct md_line *line)
     line->completion->skipped = line->rx_len;
 }
 
-void md_line_sent(struct md_line *line, size_t len, int64_t now_ns)
+void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;
     if (line->state != SENDING || len == 0)
         return;
     if (line->tx_at == 0) {
-        line->completion->sent_ns = now_ns;
+        line->completion->sent_ns = begun_ns;
         line->rx_len = 0;
     }
-    md_tap_put(line->tap, MD_ASKING, now_ns, line->tx + line->tx_at, len);
+    md_tap_put(line->tap, MD_ASKING, begun_ns, line->tx + line->tx_at, len);
     line->quiet_ns = later(line->quiet_ns, now_ns) + (int64_t)len * exchange->character_ns;
     line->tx_at = (uint16_t)(line->tx_at + len);
     if (line->tx_at < line->tx_len)
@@ -495,7 +464,7 @@ static void take_stale(struct md_line *line, const uint8_t *bytes, size_t len, i
         line->state = SILENT;
     for (size_t at = 0; at < len;)
         at += keep(line, bytes + at, len - at);
-    recognise_late_answers(line, now_ns);
+    recognise_late_answers(line, 0, now_ns);
 }
 
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
@@ -529,7 +498,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == IDLE)
         return;
     if (line->state > SENDING)
-        expect_late_answer(line); /* the port may be back before it comes */
+        md_late_expect(line, md_window_ns(line->exchange)); /* the port may be back before it comes */
     line->completion->error = error;
     finish(line, result, line->rx, line->rx_len);
 }

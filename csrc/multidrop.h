@@ -132,19 +132,32 @@ struct md_tally {
     uint32_t refused[256]; /* values, by exception code */
 };
 
+enum { MD_MOST_OWED = 12, MD_MOST_PROOFS = 4, MD_TIMES_KEPT = 6 };
+
+/* A question whose answers may still come. */
+struct md_owed {
+    int64_t sent_ns[6]; /* when it left, the earliest time first; later ones that have no room count as that */
+    uint32_t times;
+    uint16_t start, count, reply_len;
+    uint16_t least, most; /* of the answer, as in md_exchange */
+    uint8_t framing, address, function, data_len;
+    uint8_t data[4];
+};
+
 /* What is known of a drive: the bounds of its time-out are given, the rest is learnt from its
  * exchanges and starts as 0. A time-out runs from the request's last bit to the reply's first. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
     int64_t delay_ns, deviation_ns; /* the response delay, smoothed, and its mean deviation */
-    int64_t late_until_ns;          /* so long the answer to `late` may still come */
+    int64_t patience_ns;            /* a longer time-out, learnt from answers that came late */
+    int64_t late_until_ns;          /* until then an answer may come late, in any order */
+    int64_t answered_ns;            /* what left before that has been answered, or never will be */
     uint32_t failures;              /* in a row */
-    int late_framing;
-    int late_others;                /* and answers to requests before that one, too */
-    uint64_t late_functions;        /* of all those requests: a bit each */
-    struct md_drive *next_late;     /* on the same line, whose answer may still come */
+    uint32_t owed_count, proof_count;
+    const struct md_exchange *const *proofs; /* questions whose replies differ from each other's, and most others' */
+    struct md_drive *next_late;     /* on the same line, whose answers may still come */
     struct md_tally tally;
-    struct md_message late;
+    struct md_owed owed[12];
 };
 
 /* One request and all that is needed to carry it out; constant while it is in use. What every
@@ -162,6 +175,8 @@ struct md_exchange {
      * copy of its request. NULL: none does. */
     const struct md_exchange *teller;
     int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
+    int64_t timeout_ns;   /* at least so long its reply is waited for: a write's; 0: as learnt */
+    uint16_t least, most; /* the one register of its reply lies between these; most 0: it may hold anything */
     struct md_message request;
 };
 
@@ -214,11 +229,12 @@ struct md_line {
 };
 
 void md_line_init(struct md_line *line, int64_t now_ns);
-/* Take up an exchange; nothing of it happens before the line's silence is over. */
+/* Take up an exchange; one that is barred by late answers ends at once. Nothing of it happens before the line's silence is over. */
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange,
                    struct md_completion *completion, int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
-void md_line_sent(struct md_line *line, size_t len, int64_t now_ns);
+/* The port took bytes, some time between these two. */
+void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
@@ -228,10 +244,39 @@ void md_line_abandon(struct md_line *line, int result, int error);
 /* How long after a request, beside its reply's own time, it is worth looking for that. */
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
 int64_t md_timeout_ns(const struct md_exchange *exchange); /* how long its reply is waited for */
+int64_t md_present_timeout_ns(const struct md_drive *drive); /* the same, of a read, and not of the next only */
 int64_t md_vain_ns(const struct md_drive *drive); /* the same of a drive that stays silent, on average */
 /* It was answered after so long, at most so long where the reply was whole when first looked at; what to
  * take for its delay. */
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
+/* An answer came so long after its request, or after the last of several; it gets more time from now on. */
+void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
+/* It was not answered, which takes back half of that. */
+void md_learn_silence(struct md_drive *drive);
+int64_t md_window_ns(const struct md_exchange *exchange); /* in which a late answer may come in any order */
+
+/* ---- late.c: answers that come after their time-out ---- */
+
+/* The question whose reply is to prove first that no earlier answer can be taken for this exchange's; NULL:
+ * none is needed, or none would help. */
+const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns);
+/* The drive takes the place of another, whose answers may still come. */
+void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
+
+/* ---- before.c: what is asked before an exchange ---- */
+
+/* Zeroed, nothing was. */
+struct md_before {
+    const struct md_exchange *then; /* the exchange */
+    uint64_t heard;                 /* from its drive, before the last proof */
+    uint32_t proofs, is_told;       /* that were asked; its teller was */
+    uint32_t failures;              /* of its drive, before all of that */
+};
+
+/* What to ask next before the exchange; NULL: it is its turn. */
+const struct md_exchange *md_before(struct md_before *before, const struct md_exchange *exchange, int echo, int64_t now_ns);
+/* Its turn is over; 1: its reply may have been an earlier answer, and it is to be asked again. */
+int md_is_asked_again(struct md_before *before, const struct md_completion *completion);
 
 /* ---- tally.c: what became of a drive's exchanges, counted ---- */
 

@@ -29,6 +29,8 @@ int64_t md_delay_edge(int bucket)
 void md_tally_end(struct md_tally *tally, const struct md_exchange *exchange, const struct md_completion *completion)
 {
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
+    if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
+        values = 0; /* it is asked again */
     uint8_t exception = completion->reply.exception;
     tally->exchanges++;
     tally->sent += completion->sent_ns != 0;

@@ -63,7 +63,7 @@ class LineDriver:
     def take(self, most: int = 513) -> bytes:
         """The port takes up to `most` bytes of what the line wants written."""
         tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
-        lib.md_line_sent(self._line, len(tx), self.now)
+        lib.md_line_sent(self._line, len(tx), self.now, self.now)
         return tx
 
     def receive(self, data: bytes, piece: int = 4096) -> None:

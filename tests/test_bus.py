@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from itertools import chain, repeat
 from typing import Any, cast
 
 import checksums
@@ -388,7 +389,7 @@ def test_a_damaged_reply_is_shown() -> None:
 
 
 def test_a_read_is_repeated_after_noise() -> None:
-    fates = iter([lambda reply: b"", lambda reply: reply[:-1], lambda reply: reply])
+    fates = chain([lambda reply: b"", lambda reply: reply[:-1]], repeat(lambda reply: reply))
     rig = simulated(Rig(1))
     rig["speed"] = 1480
     with faulty(rig, lambda reply: next(fates)(reply)) as sim, Bus(path(sim)) as bus:

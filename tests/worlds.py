@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from line_driver import LineDriver
 from lines import PATIENCE, line, plant, rows_of
-from multidrop._core import lib
+from multidrop._core import ffi, lib
 
 from multidrop import bus, polled_line, poller
 from multidrop.batch import Row
@@ -58,7 +58,7 @@ class Turn(Enum):
     """Whose exchange is under way."""
 
     NOBODYS = 0
-    TELLERS = 1
+    BEFORE = 1
     WISHED = 2
     QUEUED = 3
     REPEATED = 4
@@ -84,8 +84,8 @@ class WorldPort:
         self._round: deque[Exchange] = deque()  # the next one first
         self._turn = Turn.NOBODYS
         self._under_way: Exchange | None = None
-        self._put_off: tuple[Turn, Exchange] | None = None  # until its teller has had its turn
-        self._failures = 0
+        self._put_off: tuple[Turn, Exchange] | None = None  # until what is asked before it was asked
+        self._before = ffi.new("struct md_before *")
         self._heard = b""
         self._has_ended = False
 
@@ -160,7 +160,7 @@ class WorldPort:
         now = self._world.now
         if self._put_off:
             (turn, exchange), self._put_off = self._put_off, None
-            self._begin(turn, exchange)
+            self._ask(turn, exchange)
         elif self.urgent:
             self._ask(Turn.WISHED, self.urgent.popleft())
         elif self._has_ended:
@@ -180,14 +180,20 @@ class WorldPort:
         return True
 
     def _ask(self, turn: Turn, exchange: Exchange) -> None:
-        if exchange.teller and self._driver.echo == lib.MD_ECHO_UNKNOWN:
+        first = lib.md_before(self._before, exchange.c, self._driver.echo, self._world.now)
+        if first:
             self._put_off = turn, exchange
-            turn, exchange = Turn.TELLERS, exchange.teller
+            turn, exchange = Turn.BEFORE, self._of(exchange, first)
         self._begin(turn, exchange)
+
+    @staticmethod
+    def _of(exchange: Exchange, c: Any) -> Exchange:
+        """The one that the core means."""
+        known = [*exchange.respondent.proofs, *([exchange.teller] if exchange.teller else [])]
+        return next(it for it in known if it.c == c)
 
     def _begin(self, turn: Turn, exchange: Exchange) -> None:
         self._turn, self._under_way = turn, exchange
-        self._failures = exchange.respondent.failures
         self._driver.found = new_completion()
         self._driver.begin(exchange)
 
@@ -195,7 +201,12 @@ class WorldPort:
         assert self._under_way
         turn, exchange, found = self._turn, self._under_way, self._driver.found
         self._turn, self._under_way = Turn.NOBODYS, None
-        if turn in (Turn.WISHED, Turn.TELLERS):
+        if turn is Turn.BEFORE:
+            return
+        if lib.md_is_asked_again(self._before, found) and not self.lost and not self._has_ended:
+            self._put_off = turn, exchange
+            return
+        if turn is Turn.WISHED:
             return
         self._report(exchange, found)
         if turn is Turn.QUEUED:
@@ -211,7 +222,7 @@ class WorldPort:
         assert exchange.block
         lib.md_inbox_add(self._inbox.c, exchange.block.c, found)
         is_refusal = found.result > 0 and found.reply.exception
-        if is_refusal or exchange.respondent.failures != self._failures:
+        if is_refusal or exchange.respondent.failures != self._before.failures:
             self._call()
 
     def _call(self) -> None:

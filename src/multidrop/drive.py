@@ -174,6 +174,7 @@ class Drive:
     response_delay: float = 0.005  # s, typical, from the request's end to the reply's begin
     response_delay_characters: ClassVar[float] = 0.0  # the same, in characters, where that is more
     response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
+    answering_time: ClassVar[float] = 0.0  # s, that the document gives the drive for a reply; 0: it is silent
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
     most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; 1 where a table is not named
@@ -303,6 +304,14 @@ class Drive:
     def telling(self) -> Register[Any] | None:
         """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
         return None
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        """Return registers that are known to hold raw counts from the least to the most given here.
+
+        Where a family reads one register at a time its replies differ in nothing else: an answer that
+        comes late is told from another's by its value, so no two of the ranges may overlap.
+        """
+        return {}
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:

@@ -10,10 +10,12 @@ from multidrop.drive import Drive
 from multidrop.errors import BadReply, DriveRefused, NoReply
 from multidrop.line import Line, now_ns, sleep
 from multidrop.plan import Block, alone, blocks, silence
+from multidrop.proofs import proofs
 from multidrop.register import Register
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
+WRITE_TIMEOUT = 1.0  # s: a write that is wrongly told to be unconfirmed costs more than the wait
 NO_ROWS = core.Block(0, [])  # of a command: a poll's summary counts the values of its rows alone
 
 
@@ -25,6 +27,8 @@ def exchange(
     *,
     period: float = 0.0,
     insists: bool = False,
+    timeout: float = 0.0,
+    answer: tuple[int, int] | None = None,
     teller: Exchange | None = None,
 ) -> Exchange:
     """What the core needs to carry out a request to this drive."""
@@ -40,6 +44,8 @@ def exchange(
         turnaround=drive.turnaround_delay,
         period=period,
         insists=insists,
+        timeout=timeout,
+        answer=answer,
         block=block,
         teller=teller,
     )
@@ -71,15 +77,22 @@ class Exchanges:
         self._heard: dict[Drive, object] = {}  # the open port on which it answered last
 
     def add(self, drive: Drive) -> None:
-        least = min(drive.response_timeout, max(LEAST_TIMEOUT, 4 * drive.response_delay))
+        documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
+        least = min(drive.response_timeout, documented)
         key = drive.address, least, drive.response_timeout
         made = Respondent(least_timeout=least, most_timeout=drive.response_timeout)
         # One that comes back may still owe the answer to what it was asked before it left, and one of
         # another family at its address would get that.
         respondent = self._respondents[drive] = self._known.setdefault(key, made)
         for other, known in self._known.items():
-            if other[0] == drive.address and known.late_until_ns > respondent.late_until_ns:
-                respondent.wait_until(known.late_until_ns)
+            if other[0] == drive.address:
+                respondent.inherit(known)
+        respondent.prove_by(
+            [
+                exchange(drive, block.request(drive.address), respondent, NO_ROWS, answer=answer)
+                for block, answer in proofs(drive)
+            ]
+        )
 
     def remove(self, drive: Drive) -> None:
         del self._respondents[drive]
@@ -126,25 +139,31 @@ class Exchanges:
     def carry_out(
         self, drive: Drive, request: Message, expiry: float = 0.0, *, insists: bool = False
     ) -> Completion:
-        """One exchange, ahead of any polling; first an answer that may still come late is waited for.
+        """Write once, ahead of any polling; first an answer that may still come late is waited for.
 
         After `expiry` seconds it is not sent; 0: never too late. One that insists waits for no answer.
+        Raises NoReply, and nothing was sent, where answers may still come late and the drive is silent.
         """
-        made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists)
-        return self._carry_out(made, expiry)
+        timeout = 0.0 if insists else WRITE_TIMEOUT
+        made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists, timeout=timeout)
+        completion = self._carry_out(made, expiry)
+        if completion.result == Result.LATE_ANSWER_DUE:
+            raise NoReply(drive.name)
+        return completion
 
     def _carry_out(self, made: Exchange, expiry: float = 0.0) -> Completion:
+        """Wait once until no late answer comes in any order; then the core asks what proves that none will."""
         expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
-        while True:
-            late_until_ns = made.respondent.late_until_ns
-            completion = self.line.carry_out(made, expires_ns=expires_ns)
-            if completion.result != Result.LATE_ANSWER_DUE:
-                return completion
-            sleep(max(0, late_until_ns - now_ns()) / 1e9)
+        late_until_ns = made.respondent.late_until_ns
+        completion = self.line.carry_out(made, expires_ns=expires_ns)
+        if completion.result != Result.LATE_ANSWER_DUE:
+            return completion
+        sleep(max(0, late_until_ns - now_ns()) / 1e9)
+        return self.line.carry_out(made, expires_ns=expires_ns)
 
     def reply(self, drive: Drive, completion: Completion) -> Message:
         """The good reply; raises NoReply, BadReply or DriveRefused."""
-        if completion.result == Result.NO_REPLY:
+        if completion.result in (Result.NO_REPLY, Result.LATE_ANSWER_DUE):
             raise NoReply(drive.name)
         if completion.result <= 0:
             raise BadReply(drive.name, str(Result(completion.result)), completion.raw)

@@ -150,6 +150,24 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
     )
 
 
+def runs(drive: Drive, registers: Iterable[Register[Any]]) -> list[Block]:
+    """Return every request that may read neighbours among these registers, as far as the limits allow."""
+    tables: dict[Table, list[Register[Any]]] = {}
+    for register in registers:
+        tables.setdefault(register.table, []).append(register)
+    found = []
+    for table, own in tables.items():
+        own = sorted(own, key=lambda register: (register.address, register.words))
+        readable = _readable(drive, table, own)
+        for begin in range(len(own)):
+            for end in range(begin + 1, len(own) + 1):
+                block = _block(table, own[begin:end])
+                if not _allowed(drive, block, readable):
+                    break
+                found.append(block)
+    return found
+
+
 def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]], delay: float | None) -> list[Block]:
     """Least total duration by dynamic programming over where the last block begins."""
     registers = sorted(registers, key=lambda register: (register.address, register.words))

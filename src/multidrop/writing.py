@@ -158,7 +158,7 @@ class Writer:
         """Note the write too when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
         try:
             yield
-        except Expired:  # it was not sent
+        except (Expired, NoReply):  # it was not sent
             raise
         except BaseException as failure:
             self.log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)

@@ -87,7 +87,7 @@ static void send(struct md_line *line, const struct md_exchange *exchange, struc
     CHECK(md_line_want(line, exchange->silence_ns - 1) == MD_WAIT);
     CHECK(md_line_want(line, exchange->silence_ns) == MD_READ);
     CHECK(md_line_want(line, exchange->silence_ns) == MD_WRITE);
-    md_line_sent(line, line->tx_len, exchange->silence_ns);
+    md_line_sent(line, line->tx_len, exchange->silence_ns, exchange->silence_ns);
 }
 
 /* Through the line, in pieces of `step` bytes, behind junk: found, and the junk counted. */

@@ -286,7 +286,7 @@ static void take(size_t most)
         ask();
     for (size_t i = 0; i < len; i++)
         scene.passed[echo[i]]++;
-    md_line_sent(line, len, scene.now);
+    md_line_sent(line, len, scene.now, scene.now);
     check_line();
     if (len && scene.last_heard < scene.now)
         scene.last_heard = scene.now;

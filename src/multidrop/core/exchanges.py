@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,8 @@ from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
 from multidrop.core.results import EXCEPTION_STATUS, Result
 from multidrop.core.settings import settings_to_c
 from multidrop.core.tally import Tally, read_tally
+
+MOST_PROOFS: int = lib.MD_MOST_PROOFS
 
 
 class Respondent:
@@ -26,6 +29,7 @@ class Respondent:
             "struct md_drive *",
             {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
         )
+        self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Result] = Counter()  # values that its client did not ask for, by reason
 
     @property
@@ -43,10 +47,23 @@ class Respondent:
         """So long the answer to an earlier request may still come."""
         return int(self.c.late_until_ns)
 
-    def wait_until(self, late_until_ns: int) -> None:
-        """Ask it nothing until then: an answer to anything may still come from its address."""
-        self.c.late_functions = 0xFFFF_FFFF_FFFF_FFFF
-        self.c.late_until_ns = late_until_ns
+    def inherit(self, before: Respondent) -> None:
+        """Take the place of another at its address, whose answers may still come."""
+        lib.md_late_inherit(self.c, before.c)
+
+    def prove_by(self, proofs: Sequence[Exchange]) -> None:
+        """Ask one of these, at most MOST_PROOFS, first where a late answer could be taken for a reply.
+
+        No reply to one of them may pass for the reply to another.
+        """
+        self.proofs = tuple(proofs[:MOST_PROOFS])
+        self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
+        self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
+
+    @property
+    def timeout(self) -> float:
+        """In s, how long a reply is waited for at present."""
+        return float(lib.md_present_timeout_ns(self.c)) / 1e9
 
     @property
     def response_delay(self) -> float:
@@ -68,8 +85,9 @@ class Exchange:
 
     Times are in seconds: `character` of one character, `silence` before the request and after
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
-    `insists`: not to wait for an earlier answer, which may then pass for its own. `block` is what rows are
-    made of. `teller` goes first where nobody knows yet whether the adapter echoes: unlike this one's, its
+    `insists`: not to wait for an earlier answer, which may then pass for its own. `timeout`: at least so
+    long its reply is waited for; 0 as learnt. `answer`: the one register of its reply lies between these.
+    `block` is what rows are made of. `teller` goes first where nobody knows yet whether the adapter echoes: unlike this one's, its
     reply is never a copy of its request.
     """
 
@@ -88,9 +106,12 @@ class Exchange:
         turnaround: float = 0.1,
         period: float = 0.0,
         insists: bool = False,
+        timeout: float = 0.0,
+        answer: tuple[int, int] | None = None,
         block: Block | None = None,
         teller: Exchange | None = None,
     ) -> None:
+        least, most = answer or (0, 0)
         build_request(framing, request)  # raises for what no frame can say
         self.framing = framing
         self.request = request
@@ -109,6 +130,9 @@ class Exchange:
                 "turnaround_ns": round(turnaround * 1e9),
                 "period_ns": round(period * 1e9),
                 "insists": insists,
+                "timeout_ns": round(timeout * 1e9),
+                "least": least,
+                "most": most,
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
                 "teller": teller.c if teller else ffi.NULL,

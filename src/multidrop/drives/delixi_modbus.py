@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
+from typing import Any
 
 from multidrop.drive import (
     Condition,
@@ -16,8 +18,8 @@ from multidrop.drive import (
     verb,
     write,
 )
-from multidrop.drives.delixi_parameters import DelixiParameters, parameter
-from multidrop.register import HOLDING, Kept, command, setting
+from multidrop.drives.delixi_parameters import Baudrate, DelixiParameters, parameter
+from multidrop.register import HOLDING, Kept, Register, command, setting
 
 
 class Control(IntEnum):
@@ -79,6 +81,12 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         place="P00.02",
         note="Every write wears the EEPROM. Used if P00.01 = 1.",
     )
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        """P04.30, its address, P04.28, its baud rate, or a bus voltage that no address reaches."""
+        known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
+        code = Baudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
+        return known if code == self.address else known | {self.baudrate_setting: (code, code)}
 
     @verb
     def identify(self) -> Script[None]:

@@ -67,7 +67,8 @@ class DelixiParameters(Drive):
 
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # P04.28
     addresses = range(1, 32)  # P04.30
-    response_timeout = 0.15  # the drive needs less than 80 ms
+    response_timeout = 0.15
+    answering_time = 0.08  # the drive needs less
     remote = "P00.00 must be 2 (RS-485)"
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),

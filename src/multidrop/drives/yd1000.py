@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum, IntFlag
-from typing import Unpack
+from typing import Any, Unpack
 
 from multidrop.drive import (
     BusError,
@@ -285,6 +286,10 @@ class YD1000(Drive):
     )
 
     _record: float | None = None  # the latest entry of the fault record when it was last looked at
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        """0802H, the drive's own address, and 0011H, a maximum frequency of 30 to 320 Hz."""
+        return {self.address_setting: (self.address, self.address), self.maximum_frequency: (3000, 32000)}
 
     @verb
     def identify(self) -> Script[None]:

@@ -1,0 +1,35 @@
+/* What is asked before an exchange: proofs that no late answer is taken for its reply, and then, where it is
+ * unknown whether the adapter echoes, a question whose reply is never a copy of it. */
+#include "late.h"
+
+enum { MOST_PROOFS_ASKED = 12 };
+
+static uint64_t heard(const struct md_drive *drive)
+{
+    return drive->tally.answered + drive->tally.late;
+}
+
+const struct md_exchange *md_before(struct md_before *before, const struct md_exchange *exchange, int echo, int64_t now_ns)
+{
+    if (before->then != exchange)
+        *before = (struct md_before){.then = exchange, .failures = exchange->drive->failures};
+    const struct md_exchange *proof = md_late_proof(exchange, now_ns);
+    int has_helped = before->proofs == 0 || heard(exchange->drive) != before->heard;
+    if (proof && has_helped && before->proofs < MOST_PROOFS_ASKED) {
+        before->proofs++;
+        before->heard = heard(exchange->drive);
+        return proof;
+    }
+    if (!exchange->teller || echo != MD_ECHO_UNKNOWN || before->is_told)
+        return NULL;
+    before->is_told = 1;
+    return exchange->teller;
+}
+
+int md_is_asked_again(struct md_before *before, const struct md_completion *completion)
+{
+    if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns && before->proofs < MOST_PROOFS_ASKED)
+        return 1;
+    before->then = NULL;
+    return 0;
+}

@@ -1,0 +1,326 @@
+/* Answers that come after their time-out, and how none of them is taken for another question's.
+ *
+ * Two things are known of them. A drive that is a little late may answer in any order: for some time
+ * after a time-out, the window, it is asked nothing that such an answer could be taken for. And a path
+ * that holds everything up (a modem, a gateway, a stalled network) keeps the order: a reply that no
+ * outstanding answer could be taken for proves that all answers to earlier requests have come, or never
+ * will. So what is outstanding is remembered beyond the window, and a proof is asked for first: a
+ * question whose reply differs from all that is outstanding in function, length or value.
+ *
+ * A reply that fits an outstanding question as well is counted as the answer to that one. Whichever it
+ * answers, the earliest request that it fits is accounted for, and so is all that was sent before it. */
+#include "late.h"
+#include "times.h"
+
+#include <string.h>
+
+enum { DATA_KEPT = sizeof((struct md_owed){0}.data), STATE_QUERY = 0x03, PARAMETER_QUERY = 0x07, LAST_READ = 0x04 };
+static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
+
+/* ---- what could be taken for what ---- */
+
+static int is_same_question(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    size_t kept = request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT;
+    return owed->framing == exchange->framing && owed->function == request->function && owed->start == request->start &&
+           owed->count == request->count && owed->least == exchange->least && owed->most == exchange->most &&
+           memcmp(owed->data, request->data, kept) == 0;
+}
+
+static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    return !owed->most || !exchange->most || (owed->least <= exchange->most && exchange->least <= owed->most);
+}
+
+int md_is_read(int framing, uint8_t function)
+{
+    return framing == MD_DELIXI ? function == STATE_QUERY || function == PARAMETER_QUERY : function <= LAST_READ;
+}
+
+/* An answer to the one could pass for the reply to the other. A refusal does not say which write it refuses,
+ * and a write that is wrongly told to be refused is a motor that is wrongly told to stand. */
+static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    if (owed->framing != exchange->framing)
+        return 0;
+    if (!md_is_read(exchange->framing, request->function))
+        return exchange->framing == MD_DELIXI || owed->function == request->function;
+    if (owed->function != request->function)
+        return 0;
+    if (exchange->framing == MD_DELIXI)
+        return owed->start == request->start || owed->function == STATE_QUERY;
+    return owed->reply_len == md_reply_length(exchange->framing, request) && may_hold_the_same(owed, exchange);
+}
+
+int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most)
+{
+    int value = reply->data[0] << 8 | reply->data[1];
+    return most == 0 || reply->exception || reply->data_len < 2 || (value >= least && value <= most);
+}
+
+static int64_t last_ns(const struct md_owed *owed)
+{
+    return owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1];
+}
+
+static void add_time(struct md_owed *owed, int64_t sent_ns)
+{
+    if (owed->times >= MD_TIMES_KEPT)
+        memmove(owed->sent_ns + 1, owed->sent_ns + 2, (MD_TIMES_KEPT - 2) * sizeof *owed->sent_ns);
+    owed->times++;
+    owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1] = sent_ns;
+}
+
+static void drop_earliest_time(struct md_owed *owed)
+{
+    if (owed->times-- <= MD_TIMES_KEPT)
+        memmove(owed->sent_ns, owed->sent_ns + 1, (MD_TIMES_KEPT - 1) * sizeof *owed->sent_ns);
+}
+
+/* A reply to a request that left later says that this one's answer has come, or never will. */
+static int is_open(const struct md_drive *drive, const struct md_owed *owed)
+{
+    return last_ns(owed) > drive->answered_ns;
+}
+
+static void drop(struct md_drive *drive, struct md_owed *owed)
+{
+    *owed = drive->owed[--drive->owed_count];
+}
+
+static void forget_settled(struct md_drive *drive, int64_t now_ns)
+{
+    for (uint32_t i = drive->owed_count; i-- > 0;) {
+        struct md_owed *owed = &drive->owed[i];
+        int is_over = now_ns >= drive->late_until_ns && (!is_open(drive, owed) || drive->proof_count == 0);
+        if (is_over || now_ns - last_ns(owed) > FORGET_NS)
+            drop(drive, owed);
+    }
+}
+
+/* Outstanding answers that could be taken for the exchange's; `own`: those to the same question too. */
+static unsigned count_mistakable(const struct md_exchange *exchange, int own)
+{
+    const struct md_drive *drive = exchange->drive;
+    unsigned found = 0;
+    for (uint32_t i = 0; i < drive->owed_count; i++) {
+        const struct md_owed *owed = &drive->owed[i];
+        int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
+        if (is_open(drive, owed) && (own || !is_same_question(owed, exchange)))
+            found += is_crowded || is_mistakable(owed, exchange);
+    }
+    return found;
+}
+
+/* ---- what may be asked ---- */
+
+/* An exception says no more of what was asked than the function, in Delixi's own protocol not even that. */
+static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
+{
+    const struct md_drive *drive = exchange->drive;
+    if (now_ns >= drive->late_until_ns)
+        return 0;
+    for (uint32_t i = 0; i < drive->owed_count; i++)
+        if (exchange->framing == MD_DELIXI || drive->owed[i].function == exchange->request.function)
+            return 1;
+    return 0;
+}
+
+static int is_proof(const struct md_exchange *exchange)
+{
+    const struct md_drive *drive = exchange->drive;
+    for (uint32_t i = 0; i < drive->proof_count; i++)
+        if (drive->proofs[i] == exchange)
+            return 1;
+    return 0;
+}
+
+int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
+{
+    struct md_drive *drive = exchange->drive;
+    if (drive->owed_count == 0 || exchange->insists)
+        return 0;
+    if (is_in_window(exchange, now_ns))
+        return 1;
+    forget_settled(drive, now_ns);
+    return !is_proof(exchange) && count_mistakable(exchange, 0) > 0;
+}
+
+/* The last of its proofs is kept for a drive that was heard again: so it is not outstanding from the time of
+ * silence, and its second reply at the latest settles all that is. */
+static const struct md_exchange *last_proof(const struct md_drive *drive)
+{
+    return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
+}
+
+/* While a drive is silent nothing is gained by another question than its own; whichever is answered then. */
+static int is_asked_alone(const struct md_exchange *exchange)
+{
+    const struct md_exchange *last = last_proof(exchange->drive);
+    struct md_owed own = {.framing = (uint8_t)exchange->framing, .function = exchange->request.function,
+                          .start = exchange->request.start,
+                          .reply_len = (uint16_t)md_reply_length(exchange->framing, &exchange->request)};
+    return exchange->drive->failures > 0 && !count_mistakable(exchange, 0) && (!last || !is_mistakable(&own, last));
+}
+
+static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
+{
+    for (uint32_t i = 0; i < drive->owed_count; i++)
+        if (is_open(drive, &drive->owed[i]) && is_mistakable(&drive->owed[i], proof))
+            return 0;
+    return 1;
+}
+
+/* When it was asked last, as far as its answer is outstanding. */
+static int64_t asked_ns(const struct md_drive *drive, const struct md_exchange *proof)
+{
+    for (uint32_t i = 0; i < drive->owed_count; i++)
+        if (is_same_question(&drive->owed[i], proof))
+            return last_ns(&drive->owed[i]);
+    return 0;
+}
+
+const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns)
+{
+    struct md_drive *drive = exchange->drive;
+    if (drive->owed_count == 0 || exchange->insists || is_in_window(exchange, now_ns))
+        return NULL;
+    forget_settled(drive, now_ns);
+    if (!count_mistakable(exchange, 1) || is_asked_alone(exchange))
+        return NULL;
+    int is_heard = drive->failures == 0;
+    const struct md_exchange *latest = NULL;
+    for (uint32_t n = 0; n + !is_heard < drive->proof_count; n++) {
+        const struct md_exchange *proof = drive->proofs[n];
+        if (is_free(drive, proof))
+            return proof;
+        if (!latest || asked_ns(drive, proof) > asked_ns(drive, latest)) /* its answer settles most */
+            latest = proof;
+    }
+    return is_heard ? last_proof(drive) : latest;
+}
+
+/* ---- what is outstanding ---- */
+
+static void link_drive(struct md_line *line, struct md_drive *drive)
+{
+    for (const struct md_drive *owing = line->late; owing; owing = owing->next_late)
+        if (owing == drive)
+            return;
+    drive->next_late = line->late;
+    line->late = drive;
+}
+
+static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange *exchange)
+{
+    for (uint32_t i = 0; i < drive->owed_count; i++)
+        if (is_same_question(&drive->owed[i], exchange))
+            return &drive->owed[i];
+    if (drive->owed_count == MD_MOST_OWED)
+        return NULL;
+    struct md_owed *owed = &drive->owed[drive->owed_count++];
+    const struct md_message *request = &exchange->request;
+    *owed = (struct md_owed){.framing = (uint8_t)exchange->framing, .address = request->address,
+                             .function = request->function, .start = request->start, .count = request->count,
+                             .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
+                             .least = exchange->least, .most = exchange->most};
+    owed->data_len = (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT);
+    memcpy(owed->data, request->data, owed->data_len);
+    return owed;
+}
+
+void md_late_expect(struct md_line *line, int64_t window_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_drive *drive = exchange->drive;
+    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    int64_t until_ns = window_ns ? line->quiet_ns + window_ns + reply_ns : 0;
+    forget_settled(drive, line->quiet_ns);
+    struct md_owed *owed = place_of(drive, exchange);
+    if (owed)
+        add_time(owed, line->quiet_ns);
+    drive->late_until_ns = later(until_ns, drive->late_until_ns);
+    link_drive(line, drive);
+}
+
+void md_late_resume(struct md_line *line, struct md_drive *drive)
+{
+    if (drive->owed_count)
+        link_drive(line, drive);
+}
+
+void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
+{
+    if (drive == before || before->late_until_ns <= drive->late_until_ns)
+        return;
+    drive->owed_count = before->owed_count;
+    memcpy(drive->owed, before->owed, sizeof drive->owed);
+    drive->late_until_ns = before->late_until_ns;
+    drive->answered_ns = before->answered_ns;
+}
+
+/* ---- what comes ---- */
+
+/* The length of the answer to this that begins there, MD_INCOMPLETE or a reason. */
+static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
+{
+    struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
+                                 .count = owed->count, .data_len = owed->data_len};
+    struct md_message reply;
+    memcpy(request.data, owed->data, owed->data_len);
+    if (owed->framing == MD_RTU && bytes[0] != owed->address)
+        return MD_BAD_ADDRESS;
+    int used = md_parse_reply(owed->framing, bytes, len, &request, &reply);
+    return used > 0 && !md_is_in_range(&reply, owed->least, owed->most) ? MD_BAD_ECHO : used;
+}
+
+/* Account for the earliest request that this answer fits. What fits no other, and nothing that was asked
+ * since, tells how late it is. */
+static int take_of(struct md_drive *drive, const uint8_t *bytes, size_t len, int64_t now_ns, int is_surely_late, int *found)
+{
+    struct md_owed *earliest = NULL;
+    int length = 0, fits = 0;
+    for (uint32_t i = 0; i < drive->owed_count; i++) {
+        int used = parse_owed(&drive->owed[i], bytes, len);
+        if (used == MD_INCOMPLETE)
+            *found = used;
+        fits += used > 0;
+        if (used > 0 && (!earliest || drive->owed[i].sent_ns[0] < earliest->sent_ns[0])) {
+            earliest = &drive->owed[i];
+            length = used;
+        }
+    }
+    if (!earliest)
+        return 0;
+    drive->tally.late++;
+    drive->failures = 0;
+    drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
+    if (is_surely_late && fits == 1)
+        md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
+    drop_earliest_time(earliest);
+    if (earliest->times == 0)
+        drop(drive, earliest);
+    if (drive->owed_count == 0)
+        drive->late_until_ns = 0;
+    return length;
+}
+
+int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_late)
+{
+    int found = MD_NO_START;
+    for (struct md_drive **link = &line->late; *link;) {
+        struct md_drive *drive = *link;
+        forget_settled(drive, now_ns);
+        if (drive->owed_count == 0) {
+            *link = drive->next_late;
+            continue;
+        }
+        int used = take_of(drive, line->rx + at, line->rx_len - at, now_ns, is_surely_late, &found);
+        if (used > 0)
+            return used;
+        link = &drive->next_late;
+    }
+    return found;
+}

@@ -1,0 +1,20 @@
+/* Answers that come after their time-out: what line.c asks of late.c. */
+#ifndef MULTIDROP_LATE_H
+#define MULTIDROP_LATE_H
+
+#include "multidrop.h"
+
+/* A late answer could be taken for its reply, and it may not be sent now. */
+int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
+/* The exchange under way is over, and its answer may still come: for so long in any order. */
+void md_late_expect(struct md_line *line, int64_t window_ns);
+/* Answers of this drive may still come that were asked for on another line, or before the port was lost. */
+void md_late_resume(struct md_line *line, struct md_drive *drive);
+/* Account for the late answer that begins there, unless it answers what was asked last: its length,
+ * MD_INCOMPLETE, or MD_NO_START. */
+int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_late);
+/* The reply is an exception, or its one register lies between these; `most` 0: it may hold anything. */
+int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most);
+int md_is_read(int framing, uint8_t function);
+
+#endif
