@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lines import polled, proofs, rows_of
@@ -87,12 +88,14 @@ LINES = {f"{family.model} {framing}": number for number, (family, framing, _) in
 class Story:
     """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
 
+    wires: type[WorldWire] = WorldWire
+
     def __init__(self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY) -> None:
         self.every = every
         self.asked = [_polls(drive, every) for drive in drives]
         self.motor = YD1000(31, name="motor")
         sims = [*(EncodedDrive(drive) for drive in drives), simulated(self.motor)]
-        self.wire = WorldWire(sims, Faults(seed=seed))
+        self.wire: Any = self.wires(sims, Faults(seed=seed))
         motor = polled(self.motor, self.motor.readings()[:1], every)
         self.world = World(self.wire, [*self.asked, motor])
         self.truth = proofs(*self.asked)
@@ -146,13 +149,16 @@ class Story:
                     asked.setdefault(row.drive, row.monotonic_ns)
         return max(asked.values())
 
-    def judge(self) -> None:
+    def judge_values(self) -> None:
         wrong = [
             (row, self.truth[row.drive, row.register])
             for row in self.rows
             if row.value not in (None, self.truth.get((row.drive, row.register), row.value))
         ]
         assert wrong == []
+
+    def judge(self) -> None:
+        self.judge_values()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert {why for why in misses if not why.startswith("exception ")} <= REASONS
         told = self.world.poller.summary()
