@@ -1,6 +1,6 @@
-"""A path that holds everything up and keeps the order: no value is another register's, and values keep coming.
+"""Stories of a path that holds everything up and keeps the order: a modem, a gateway, a stalled network.
 
-A modem, a gateway or a stalled network does so, for longer than any time-out; on a world's clock.
+No value is another register's, and values keep coming; on a world's clock.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class PathWire(WorldWire):
 
     @property
     def wake(self) -> float | None:
-        times = [time for time in (super().wake, self._path[0][0] if self._path else None) if time is not None]
-        return min(times, default=None)
+        arrival = self._path[0][0] if self._path else None
+        return min((time for time in (super().wake, arrival) if time is not None), default=None)
 
 
 def constant(seconds: float) -> Delay:
@@ -94,7 +94,9 @@ STALLS = {f"stalls of {longest:g} s": longest for longest in (0.1, 0.3, 0.9, 3.0
 @pytest.mark.parametrize("path", [constant, jittering])
 @pytest.mark.parametrize("seconds", DELAYS)
 @pytest.mark.parametrize("name", LINES)
-def test_a_slow_path_costs_time_and_no_truth(name: str, seconds: float, path: Callable[[float], Delay]) -> None:
+def test_a_slow_path_costs_time_and_no_truth(
+    name: str, seconds: float, path: Callable[[float], Delay]
+) -> None:
     story = Path(of_one_variant(LINES[name]))
     answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
     assert answering == {drive.name for drive in story.drives}

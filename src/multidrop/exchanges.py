@@ -152,7 +152,7 @@ class Exchanges:
         return completion
 
     def _carry_out(self, made: Exchange, expiry: float = 0.0) -> Completion:
-        """Wait once until no late answer comes in any order; then the core asks what proves that none will."""
+        """Wait once until no late answer comes in any order; the core then asks for the proof of it."""
         expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
         late_until_ns = made.respondent.late_until_ns
         completion = self.line.carry_out(made, expires_ns=expires_ns)

@@ -87,8 +87,8 @@ class Exchange:
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
     `insists`: not to wait for an earlier answer, which may then pass for its own. `timeout`: at least so
     long its reply is waited for; 0 as learnt. `answer`: the one register of its reply lies between these.
-    `block` is what rows are made of. `teller` goes first where nobody knows yet whether the adapter echoes: unlike this one's, its
-    reply is never a copy of its request.
+    `block` is what rows are made of. `teller` goes first where nobody knows yet whether the adapter echoes:
+    unlike this one's, its reply is never a copy of its request.
     """
 
     __slots__ = ("block", "c", "framing", "request", "respondent", "settings", "teller")

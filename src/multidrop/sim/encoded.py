@@ -19,7 +19,7 @@ def encoded(address: int, table: Table, register_address: int) -> int:
 def proof(drive: Drive, register: Register[Any]) -> float:
     """The register's value on an EncodedDrive, as a row has it."""
     if register in drive.known_counts():
-        return register.decode(_known(drive, register))
+        return _known(drive, register) * register.scale.numerator / register.scale.denominator
     at = range(register.address, register.address + register.words)
     size = 2 if register.table.carrier is Carrier.WORD else 4
     data = b"".join(encoded(drive.address, register.table, it).to_bytes(size) for it in at)
@@ -41,7 +41,7 @@ class EncodedDrive(SimulatedDrive):
     """
 
     def refresh(self, cell: Cell) -> None:
-        if cell.register in self.drive.known_counts():
+        if cell.register and cell.register in self.drive.known_counts():
             cell.raw = _known(self.drive, cell.register)
             return
         bits = 1 if cell.table.carrier is Carrier.BIT else 0x7FFF
