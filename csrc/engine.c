@@ -237,6 +237,7 @@ void md_port_tell_echo(struct md_port *port, int echo)
     enter(port->engine);
     port->line.echo = echo;
     port->line.echo_is_told = echo == MD_ECHO; /* an echo that shows is believed: it confirms no write */
+    md_put(&port->progress.echo, (uint32_t)echo);
     leave(port->engine);
 }
 

@@ -214,6 +214,8 @@ void md_port_finish(struct md_port *port)
 {
     enum turn turn = port->turn;
     port->turn = NOBODYS;
+    if (port->progress.echo != (uint32_t)port->line.echo)
+        md_put(&port->progress.echo, (uint32_t)port->line.echo);
     if (turn == BEFORE)
         return;
     int goes_on = !port->progress.lost && (turn == WISHED || !port->ending);

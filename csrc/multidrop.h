@@ -324,6 +324,7 @@ struct md_progress {
     uint32_t lost;      /* the descriptor failed: all that comes is MD_LINE_LOST */
     uint32_t repeating; /* exchanges are carried out again and again */
     uint32_t switches;  /* of baud rate and format */
+    uint32_t echo;      /* of its adapter, as far as is known (enum md_echo) */
     int64_t switching_ns; /* that they took */
 };
 const struct md_progress *md_port_progress(struct md_port *port);

@@ -418,6 +418,7 @@ class PolledLine:
             "exchanges_per_second": round(tally.answered / seconds, 2),
             "samples_per_second": round(tally.values / seconds, 2),
             "response_delay_ms": round(respondent.response_delay * 1e3, 3),
+            "timeout_ms": round(respondent.timeout * 1e3, 3),
             "p99_delay_ms": round(Statistics(seconds, tally).delays.p99 * 1e3, 3),
             "misses": dict(misses),
         }

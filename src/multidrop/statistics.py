@@ -105,6 +105,14 @@ class Statistics:
         return self.tally.late
 
     @property
+    def timeout(self) -> float:
+        """How long a reply is waited for at present, in s; of a line, the longest.
+
+        It follows a drive's own response delay, and grows where answers come late again and again.
+        """
+        return self.tally.timeout_ns / 1e9
+
+    @property
     def skipped_bytes(self) -> int:
         """Bytes that were no part of a reply: noise, late replies, an adapter's echo."""
         return self.tally.stray_bytes
@@ -164,7 +172,8 @@ def _together(tallies: Iterable[Tally]) -> Tally:
     found = Tally()
     for tally in tallies:
         longest = max(found.longest_ns, tally.longest_ns)
-        found = Tally._make(map(add, found, tally))._replace(longest_ns=longest)
+        timeout = max(found.timeout_ns, tally.timeout_ns)
+        found = Tally._make(map(add, found, tally))._replace(longest_ns=longest, timeout_ns=timeout)
     return found
 
 
@@ -173,7 +182,7 @@ def _difference(now: Tally, earlier: Tally) -> Tally:
     longest = now.longest_ns
     if longest == earlier.longest_ns:  # it may have been before
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
-    return found._replace(longest_ns=longest)
+    return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 
 
 def _quantile(tally: Tally, part: float) -> float:

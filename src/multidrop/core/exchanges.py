@@ -77,7 +77,7 @@ class Respondent:
 
     def tally(self) -> Tally:
         """What became of its exchanges so far, and of values that were due and not asked for."""
-        return read_tally(self.c.tally, self.unasked)
+        return read_tally(self.c.tally, int(lib.md_present_timeout_ns(self.c)), self.unasked)
 
 
 class Exchange:

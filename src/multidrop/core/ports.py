@@ -158,6 +158,11 @@ class Port:
         return bool(self._progress.lost)
 
     @property
+    def has_echo(self) -> bool:
+        """Its adapter is known to repeat what it sends, and a reply that is a copy is told from that."""
+        return int(self._progress.echo) == int(lib.MD_ECHO)
+
+    @property
     def switching(self) -> float:
         """Seconds that a change of baud rate or format takes, on average; 0 before the first one."""
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)

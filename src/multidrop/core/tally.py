@@ -23,6 +23,7 @@ class Tally(NamedTuple):
     stray_bytes: int = 0
     ideal_ns: int = 0
     longest_ns: int = 0  # response delay
+    timeout_ns: int = 0  # at present
     ended: Counter[Result] = Counter()  # exchanges without an answer, by reason; broadcasts by INCOMPLETE
     missed: Counter[Result] = Counter()  # values, by reason
     refused: Counter[int] = Counter()  # values, by exception code
@@ -37,8 +38,8 @@ def delay_edge(bucket: int) -> int:
     return int(lib.md_delay_edge(bucket))
 
 
-def read_tally(c: Any, unasked: Counter[Result]) -> Tally:
-    """A struct md_tally, and the values that were due and not asked for, by reason."""
+def read_tally(c: Any, timeout_ns: int, unasked: Counter[Result]) -> Tally:
+    """A struct md_tally, the time-out, and the values that were due and not asked for, by reason."""
     return Tally(
         c.exchanges,
         c.answered,
@@ -51,6 +52,7 @@ def read_tally(c: Any, unasked: Counter[Result]) -> Tally:
         c.stray_bytes,
         c.ideal_ns,
         c.longest_ns,
+        timeout_ns,
         _by_result(c.ended),
         _by_result(c.missed) + unasked,
         _by_place(c.refused, "I") if c.exceptions else Counter(),
