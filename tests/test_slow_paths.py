@@ -5,16 +5,24 @@ No value is another register's, and values keep coming; on a world's clock.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from random import Random
-from typing import Any
+from typing import Any, cast
 
 import pytest
+from lines import proof
 from test_hostile_line import LINES, Story, of_all_variants, of_one_variant
-from worlds import WorldWire
+from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 
-from multidrop.sim import Faults
+from multidrop import acquaintance, bus, exchanges, writing
+from multidrop.bus import Bus
+from multidrop.core import Completion, Exchange
+from multidrop.drive import Drive
+from multidrop.drives import YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import BusError
+from multidrop.outcome import Effect
+from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, simulated
 
 pytestmark = pytest.mark.story
 
@@ -23,6 +31,7 @@ Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
 SECONDS = 150.0  # of a story: what is outstanding is remembered for 120 s
 TAIL = 20.0  # s at its end, and TURNS times the delay, in which every drive must have answered
 TURNS = 20
+S = 1_000_000_000
 
 
 class PathWire(WorldWire):
@@ -106,6 +115,125 @@ def test_a_slow_path_costs_time_and_no_truth(
 @pytest.mark.parametrize("name", LINES)
 def test_a_stall_costs_time_and_no_truth(name: str, path: str) -> None:
     Path(of_one_variant(LINES[name])).tell_of(stalling(STALLS[path]))
+
+
+class PathLine:
+    """What a bus sees of a line behind such a path; time passes only while it waits."""
+
+    def __init__(self, wire: PathWire) -> None:
+        self.port = "world"
+        self.now = BEGIN_NS
+        self.wire = wire
+        self.is_called = False
+        self.queue = WorldPort(cast(World, self))
+
+    def require(self, settings: tuple[int, str]) -> None:
+        pass
+
+    def overruns(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def send(self, request: bytes, baudrate: int) -> None:
+        self.wire.receive(request, self.now / S, baudrate)
+
+    def sleep(self, seconds: float) -> None:
+        self._pass_until(self.now + round(seconds * S))
+
+    def carry_out(self, exchange: Exchange, *, expires_ns: int = 0) -> Completion:
+        self.queue.granted = None
+        self.queue.urgent.append(exchange)
+        self._pass_until(self.now + 1000 * S)
+        assert self.queue.granted
+        return self.queue.granted
+
+    def _pass_until(self, end_ns: int) -> None:
+        is_awaited = self.queue.granted is None
+        while self.now < end_ns and not (is_awaited and self.queue.granted):
+            wake = self.queue.advance(self.wire.advance(self.now / S))
+            at = self.wire.wake
+            arrival = NEVER if at is None else -int(-at * S // 1)
+            if not (is_awaited and self.queue.granted):
+                self.now = min(max(min(wake, arrival), self.now + 1), end_ns)
+
+
+@pytest.fixture
+def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLine]]:
+    def made(sims: list[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
+        wire = PathWire(sims, Faults())
+        wire.delay = delay
+        wire.open()
+        line = PathLine(wire)
+        monkeypatch.setattr(bus, "Line", lambda port, echo: line)
+        for module in (bus, exchanges, writing, acquaintance):
+            monkeypatch.setattr(module, "now_ns", lambda: line.now, raising=False)
+            monkeypatch.setattr(module, "sleep", line.sleep)
+        opened = Bus("world")
+        for sim in sims:
+            opened.attach(sim.drive)
+        return opened, line
+
+    return made
+
+
+@pytest.mark.parametrize("path", [constant, jittering])
+@pytest.mark.parametrize("seconds", DELAYS)
+@pytest.mark.parametrize("name", LINES)
+def test_what_a_bus_reads_over_a_slow_path_is_true(
+    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    """Four registers of each of two drives, read one after another by a client that only tries again."""
+    drives = of_one_variant(LINES[name])
+    opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
+    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
+    read: Counter[str] = Counter()
+    with opened:
+        for _ in range(24):
+            for drive, register in asked:
+                try:
+                    value = opened.read(drive, register)
+                except BusError:
+                    line.sleep(0.05)
+                else:
+                    assert value == proof(drive, register)
+                    read[drive.name] += 1
+    assert set(read) == {drive.name for drive in drives}
+
+
+WRITTEN = {
+    "setpoint": InvtCHE(1),
+    "frequency": YD1000(1),
+    "acceleration_time": InnovertIBD(1, ram=["acceleration_time"]),
+    "deceleration_time": ErmanERG220(1, ram=["deceleration_time"]),
+}
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6, 4.0])
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_became_of_a_write_over_a_slow_path_is_true(
+    name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = WRITTEN[name]
+    sim = simulated(drive)
+    opened, line = path_of([sim], constant(seconds))
+    register = drive.register(name)
+    done = 0
+    with opened:
+        for turn in range(30):
+            asked = float(10 + turn % 3)
+            try:
+                outcome = opened.try_write(drive, register, asked)
+            except BusError:
+                line.sleep(0.05)
+                continue
+            if outcome.effect is Effect.UNCONFIRMED:
+                continue
+            assert outcome.effect is Effect.DONE
+            assert (outcome.held, sim[name]) == (asked, asked)
+            done += 1
+    assert done > 10
 
 
 @pytest.mark.parametrize("kind", ["drop", "flip", "split", "noise"])

@@ -21,7 +21,7 @@ from multidrop._core import ffi, lib
 
 from multidrop import bus, polled_line, poller
 from multidrop.batch import Row
-from multidrop.core import Exchange, Inbox, Message, Result, new_completion
+from multidrop.core import Completion, Exchange, Inbox, Message, Result, completion, new_completion
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.exchanges import NO_ROWS, exchange
@@ -88,8 +88,13 @@ class WorldPort:
         self._before = ffi.new("struct md_before *")
         self._heard = b""
         self._has_ended = False
+        self.granted: Completion | None = None  # what became of the latest urgent exchange
 
     # ---- the poller's side ----
+
+    @property
+    def has_echo(self) -> bool:
+        return self._driver.echo == int(lib.MD_ECHO)
 
     def report_to(self, inbox: Inbox, number: int) -> None:
         self._inbox, self._number = inbox, number
@@ -207,6 +212,7 @@ class WorldPort:
             self._put_off = turn, exchange
             return
         if turn is Turn.WISHED:
+            self.granted = completion(found)
             return
         self._report(exchange, found)
         if turn is Turn.QUEUED:
