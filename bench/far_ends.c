@@ -3,7 +3,8 @@
  *
  * Every address holds 256 * address + register, and for function 04 the register 128 further on. A
  * reply comes at once, or when it would have been whole on a wire of --baudrate. Some of them come
- * later by up to --late-us and never by more, are lost, or come twice. Lines are descriptors that were inherited, or
+ * later by up to --late-us and never by more, are lost, or come twice. All of a line come --path-us later,
+ * in order, and what comes in the first --stall-us of each --stall-every-us at the end of that. Lines are descriptors that were inherited, or
  * new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
@@ -23,11 +24,12 @@
 enum { REQUEST = 8, MOST_REPLY = 256, EVENTS = 256, CHARACTER_BITS = 10 };
 
 static struct {
-    long baudrate, delay_us, late_us, late_permille, lost_permille, twice_permille, ptys;
+    long baudrate, delay_us, late_us, late_permille, lost_permille, twice_permille, ptys, path_us, stall_us, stall_every_us;
 } options;
 
 struct line {
     int fd;
+    int64_t last_due_ns; /* a path keeps the order */
     size_t have;
     uint8_t received[256];
 };
@@ -119,9 +121,23 @@ static void make_reply(struct reply *reply, const uint8_t *request)
     reply->bytes[reply->len - 1] = (uint8_t)(crc >> 8);
 }
 
-static void answer(int fd, const uint8_t *request, int64_t came_ns)
+/* When what enters the line's path at this time comes out of it. */
+static int64_t through_path(struct line *line, int64_t at_ns)
 {
-    struct reply reply = {.fd = fd};
+    int64_t due_ns = at_ns + options.path_us * 1000;
+    if (options.stall_every_us) {
+        int64_t since_ns = at_ns % (options.stall_every_us * 1000);
+        if (since_ns < options.stall_us * 1000)
+            due_ns += options.stall_us * 1000 - since_ns;
+    }
+    if (due_ns > line->last_due_ns)
+        line->last_due_ns = due_ns;
+    return line->last_due_ns;
+}
+
+static void answer(struct line *line, const uint8_t *request, int64_t came_ns)
+{
+    struct reply reply = {.fd = line->fd};
     requests++;
     make_reply(&reply, request);
     if (happens(options.lost_permille)) {
@@ -139,6 +155,8 @@ static void answer(int fd, const uint8_t *request, int64_t came_ns)
         late++;
         reply.due_ns += rand() % (options.late_us + 1) * 1000;
     }
+    if (options.path_us || options.stall_us)
+        reply.due_ns = through_path(line, reply.due_ns);
     if (reply.due_ns > came_ns)
         push(&reply);
     else
@@ -150,7 +168,7 @@ static void hear(struct line *line)
     ssize_t got = read(line->fd, line->received + line->have, sizeof line->received - line->have);
     if (got <= 0)
         return;
-    int64_t came_ns = character_ns || options.late_us ? now_ns() : 0;
+    int64_t came_ns = character_ns || options.late_us || options.path_us || options.stall_us ? now_ns() : 0;
     size_t at = 0;
     for (line->have += (size_t)got; line->have - at >= REQUEST; at += REQUEST) {
         if (md_crc16(line->received + at, REQUEST)) {
@@ -158,7 +176,7 @@ static void hear(struct line *line)
             at = line->have;
             break;
         }
-        answer(line->fd, line->received + at, came_ns);
+        answer(line, line->received + at, came_ns);
     }
     line->have -= at;
     memmove(line->received, line->received + at, line->have);
@@ -216,7 +234,8 @@ static void read_options(int argc, char **argv)
 {
     static const struct option known[] = {
         {"baudrate", 1, NULL, 'b'}, {"delay-us", 1, NULL, 'd'}, {"late-us", 1, NULL, 'l'}, {"late-permille", 1, NULL, 'm'},
-        {"lost-permille", 1, NULL, 'o'}, {"twice-permille", 1, NULL, 't'}, {"ptys", 1, NULL, 'p'}, {NULL, 0, NULL, 0}};
+        {"lost-permille", 1, NULL, 'o'}, {"twice-permille", 1, NULL, 't'}, {"ptys", 1, NULL, 'p'}, {"path-us", 1, NULL, 'P'},
+        {"stall-us", 1, NULL, 's'}, {"stall-every-us", 1, NULL, 'e'}, {NULL, 0, NULL, 0}};
     int key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
         long number = optarg ? strtol(optarg, NULL, 10) : 0;
@@ -228,9 +247,13 @@ static void read_options(int argc, char **argv)
         case 'o': options.lost_permille = number; break;
         case 't': options.twice_permille = number; break;
         case 'p': options.ptys = number; break;
+        case 'P': options.path_us = number; break;
+        case 's': options.stall_us = number; break;
+        case 'e': options.stall_every_us = number; break;
         default:
             fprintf(stderr, "usage: far_ends [--baudrate N (0: no waits)] [--delay-us N] [--late-us N] [--late-permille N]\n"
-                            "       [--lost-permille N] [--twice-permille N] [--ptys N] [DESCRIPTOR ...]\n");
+                            "       [--lost-permille N] [--twice-permille N] [--ptys N] [--path-us N]\n"
+                            "       [--stall-us N --stall-every-us N] [DESCRIPTOR ...]\n");
             exit(2);
         }
     }

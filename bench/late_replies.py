@@ -1,19 +1,23 @@
 """Whether a reply that comes late, twice or never is ever taken for another question's answer.
 
 Several drives on each line, four blocks of one length per drive; a value names its drive and its
-register. Replies are late by up to three times the time-out, lost, or doubled.
+register. Replies are late by up to three times the time-out, lost, or doubled; then all of them come
+over a path that holds them up for longer, and keeps their order.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterator
 
 import tables
 from many_lines import far_ends
 
 TIMEOUT_MS = 5
 LATE_PERMILLE, LOST_PERMILLE, TWICE_PERMILLE = 100, 20, 50
+PATHS_MS = (10, 100, 1000)
+FEW = 4  # lines, and drives on each
 
 
 def main() -> None:
@@ -21,6 +25,7 @@ def main() -> None:
     parser.add_argument("--exchanges", type=int, default=20_000)
     parser.add_argument("--lines", type=int, default=16)
     parser.add_argument("--drives", type=int, default=8, help="on each line")
+    parser.add_argument("--seconds", type=float, default=20, help="of each slow path")
     arguments = parser.parse_args()
     import many_adapter
 
@@ -48,6 +53,22 @@ def main() -> None:
         f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
         "\nLater than that: over three time-outs after the request, when the far ends were late to hear it."
     )
+    print()
+    tables.show(("path", "exchanges", "values", "another register's", "late"), list(slow_paths(arguments)))
+    print("\nStalls come every five times their length. Late: replies that were recognised as such.")
+
+
+def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
+    """A row for each path, with few drives on few lines: each exchange takes as long as the path."""
+    import many_adapter
+
+    for path_ms in PATHS_MS:
+        constant = "--path-us", 1000 * path_ms
+        stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms
+        for name, options in ((f"{path_ms} ms", constant), (f"stalls of {path_ms} ms", stalls)):
+            with far_ends("socketpair", FEW, *options, "--lost-permille", LOST_PERMILLE) as (ports, _):
+                judged = many_adapter.judge_for(ports, arguments.seconds, FEW)
+            yield name, judged.exchanges, judged.samples, judged.wrong, judged.late
 
 
 if __name__ == "__main__":

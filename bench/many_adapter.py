@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -159,6 +160,16 @@ class Judged:
 
 def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
     """Poll until so many exchanges are done, and hold each value against what its register holds."""
+    return _judged(ports, drives, lambda judged: judged.exchanges >= exchanges)
+
+
+def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
+    """The same for so many seconds."""
+    end = time.monotonic() + seconds
+    return _judged(ports, drives, lambda judged: time.monotonic() >= end)
+
+
+def _judged(ports: Sequence[str], drives: int, is_over: Callable[[Judged], bool]) -> Judged:
     judged = Judged()
     names = [_name(port, address) for port in ports for address in range(1, drives + 1)]
     held = {
@@ -171,7 +182,7 @@ def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
         for port in ports
     }
     with _polling_drives(lines, None) as poller:
-        while judged.exchanges < exchanges:
+        while not is_over(judged):
             for batch in poller.batches(1.0):
                 _judge(batch, held, judged)
             judged.exchanges = sum(line.exchanges for line in poller.statistics().values())

@@ -18,7 +18,6 @@ from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 from multidrop import acquaintance, bus, exchanges, writing
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
-from multidrop.drive import Drive
 from multidrop.drives import YD1000, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.outcome import Effect
