@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from halls import one
 from scripts import Wire, frame, rows, typed
 from test_drives_delixi_modbus import MONITORS
 
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
-from multidrop.drives.delixi_native import PARAMETER_RAM, DelixiNative, Status
+from multidrop.drives.delixi_native import PARAMETER, PARAMETER_RAM, DelixiNative, Status
 from multidrop.drives.delixi_parameters import Baudrate, Fault, RunSource, parameter
 from multidrop.errors import NoReply
+from multidrop.ledger import Ledger
 from multidrop.register import Carrier, Kept, setting
 
 FORWARD = ":010200020000000005"  # printed
@@ -172,6 +176,41 @@ def test_a_subclass_keeps_its_tables_and_adds_its_own() -> None:
     assert Mine.output_current.table is DelixiNative.output_current.table
     assert frame(Mine(1), Mine.acceleration_time, 20).startswith(":01050011000000C8")
     assert set(Mine.registers) - set(DelixiNative.registers) == {"acceleration_time"}
+
+
+class Owned(DelixiNative):
+    """One parameter written by K = 05, which does not store it, and one by K = 06, which does."""
+
+    ramp = setting(parameter(0, 17), "s", step=0.1, table=PARAMETER_RAM)
+    stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
+
+
+def test_the_function_code_says_whether_a_parameter_is_stored() -> None:
+    assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
+    kept = {name: it.kept for name, it in DelixiNative.registers.items() if it.writable}
+    assert kept == {
+        "control": Kept.RAM,
+        "frequency": Kept.RAM,
+        "pi_setpoint": Kept.RAM,
+        "stored_frequency": Kept.EEPROM,
+    }
+    with pytest.raises(ValueError, match="a 'parameter' is kept in EEPROM, not in RAM"):
+        setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
+
+
+def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ledger = Ledger(tmp_path / "wear", budget=1000)
+    hall, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
+    for seconds in (1.0, 2.0, 3.0):
+        hall.bus.write(drive, drive.ramp, seconds)
+    assert ledger.wear(hall.seconds) == []
+    assert not sim.counters.eeprom_writes
+    hall.bus.write(drive, drive.stored_ramp, 1.0)
+    with pytest.raises(Refused, match="less often"):
+        hall.bus.write(drive, drive.stored_ramp, 2.0)
+    assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
 
 @pytest.mark.parametrize("name", ["coast", "emergency_stop", "jog"])

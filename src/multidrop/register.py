@@ -59,12 +59,13 @@ class Carrier(Enum):
 
 @dataclass(frozen=True)
 class Table:
-    """One of a drive's address spaces, and the function codes that reach it."""
+    """One of a drive's address spaces, the function codes that reach it, and what a write there wears."""
 
     name: str
     read: int | None
     write: int | None
     carrier: Carrier = Carrier.WORD
+    kept: Kept = Kept.UNKNOWN  # where the function code alone decides it
 
 
 HOLDING = Table("holding register", 0x03, 0x06)
@@ -91,7 +92,7 @@ class Details(TypedDict):
     at_least, at_most: the register or option whose present value bounds it besides
     wire: how the number lies in the frame
     table: address space and function codes
-    kept: RAM or EEPROM
+    kept: RAM or EEPROM; that of the table where the table has one
     ram_address: where the same quantity can be written without wearing the EEPROM
     default: value from the factory
     while_running: may be changed while the motor turns; None where not stated
@@ -158,6 +159,11 @@ class Register(Generic[T]):
             object.__setattr__(self, "wire", Wire.BIT)
         elif self.table.carrier is not Carrier.WORD:
             object.__setattr__(self, "wire", Wire.U32)
+        if self.access is not Access.READING and self.table.kept is not Kept.UNKNOWN:
+            if self.kept not in (Kept.UNKNOWN, self.table.kept):
+                table = f"{self.table.name!r} is kept in {self.table.kept.value}"
+                raise ValueError(f"register {self.address:04X}H: a {table}, not in {self.kept.value}")
+            object.__setattr__(self, "kept", self.table.kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
         object.__setattr__(self, "name", name)

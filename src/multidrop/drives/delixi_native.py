@@ -21,11 +21,11 @@ from multidrop.drive import (
 from multidrop.drives.delixi_parameters import DelixiParameters, parameter
 from multidrop.register import Carrier, Kept, Register, Table, command, reading, setting
 
-COMMAND = Table("run command", None, 0x02, Carrier.NUMBER)
+COMMAND = Table("run command", None, 0x02, Carrier.NUMBER, Kept.RAM)
 STATE = Table("run state", 0x03, None, Carrier.NUMBER)
-SETPOINT = Table("run setpoint", None, 0x04, Carrier.LONG)
-PARAMETER_RAM = Table("parameter, not stored", 0x07, 0x05, Carrier.LONG)
-PARAMETER = Table("parameter", 0x07, 0x06, Carrier.LONG)
+SETPOINT = Table("run setpoint", None, 0x04, Carrier.LONG, Kept.RAM)
+PARAMETER_RAM = Table("parameter, not stored", 0x07, 0x05, Carrier.LONG, Kept.RAM)
+PARAMETER = Table("parameter", 0x07, 0x06, Carrier.LONG, Kept.EEPROM)
 
 
 class Control(IntEnum):
@@ -48,7 +48,8 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     A function code K has a table each: 02 run command, 03 run state, 04 run setpoint (not stored),
     05 and 06 parameters not stored and stored, 07 parameters read. A user's own parameters are
-    declared in a subclass, `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`.
+    declared in a subclass, `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`. The table says
+    where a value is kept: what 06 writes is in EEPROM, and what 02, 04 and 05 write is not.
 
     Where the document errs or is silent, the safest reading is taken:
 
@@ -84,24 +85,18 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         0,
         Control,
         table=COMMAND,
-        kept=Kept.RAM,
         broadcast=(Control.STOP,),
         harmless=(Control.STOP,),
         place="part 3, section 5: K = 02",
     )
     status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
-    frequency = command(
-        0x0001, "Hz", step=0.01, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0001"
-    )
-    pi_setpoint = command(
-        0x0007, step=0.1, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0007"
-    )
+    frequency = command(0x0001, "Hz", step=0.01, table=SETPOINT, place="part 3, section 5: K = 04, 0001")
+    pi_setpoint = command(0x0007, step=0.1, table=SETPOINT, place="part 3, section 5: K = 04, 0007")
     stored_frequency = setting(
         parameter(0, 2),
         "Hz",
         step=0.01,
         table=PARAMETER,
-        kept=Kept.EEPROM,
         place="P00.02",
         note="Used if P00.01 = 1.",
     )
