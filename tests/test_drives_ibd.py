@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import checksums
 import pytest
-from scripts import Wire, rows, typed
+from halls import one
+from scripts import Wire, frame, rows, typed
 
 from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
 from multidrop.drives.innovert_ibd import (
@@ -116,19 +118,51 @@ def test_a_direction_is_refused(direction: Direction) -> None:
 
 @pytest.mark.parametrize(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
 def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reverse: str) -> None:
-    says = {**STANDING, "terminals": Terminals(0), "output_current": 0.4}
-    wire = Wire(InnovertIBD(1, forward_bit=forward_bit), says)
+    says = {**STANDING, "terminals": Terminals(0)}
+    drive = InnovertIBD(1, forward_bit=forward_bit)
+    words = [frame(drive, drive.control, Control(int(it, 16))) for it in (forward, reverse, "02")]
+    wire = Wire(drive, says, turns=TURNS | {it: {"output_current": 0.4} for it in words})
     wire.drive.set_frequency(50)
-    wire.drive.start(Direction.FORWARD)
-    wire.drive.start(Direction.REVERSE)
-    wire.drive.start()
-    assert [it[:17] for it in wire.sent[1:]] == [f"01 06 20 00 00 {it}" for it in (forward, reverse, "02")]
+    for direction in (Direction.FORWARD, Direction.REVERSE, None):
+        wire.drive.start(direction)
+        wire.drive.stop()
+    assert [it for it in wire.sent[1:] if it != STOP[Framing.RTU]] == words
+
+
+JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
 
 
 def test_jog() -> None:
-    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), "output_current": 0.4})
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0)}, turns={JOG: {"output_current": 0.4}})
     wire.drive.jog()
-    assert [it[:17] for it in wire.sent] == ["01 06 20 00 00 03"]
+    assert wire.sent == [JOG]
+
+
+@pytest.mark.parametrize(
+    "turning",
+    [{"motor_speed": 120.0}, {"output_current": 0.4}, {**PROGRAMMED, "terminals": Terminals.M01}],
+    ids=["speed", "current", "outputs"],
+)
+def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[str, object]) -> None:
+    """A jog is left by a stop and a new start (table 3)."""
+    wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
+    wire.drive.set_frequency(50)
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match=r"turns, and a jog would go on through this: call stop\(\) first"):
+            verb()
+    assert wire.sent == [FIFTY[Framing.RTU]]
+
+
+def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, sim = one(monkeypatch, InnovertIBD(1))
+    drive.jog()
+    drive.set_frequency(50)
+    with pytest.raises(Refused, match=r"stop\(\) first"):
+        drive.start()
+    drive.stop()
+    drive.start()
+    sim.pass_time(hall.seconds + 60)
+    assert sim.motor.frequency == 50
 
 
 @pytest.mark.parametrize(

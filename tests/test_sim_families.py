@@ -384,6 +384,49 @@ def test_ibd_turns_the_other_way_without_being_told_to_run(ibd: Bench) -> None:
         assert ibd.motor.energised
 
 
+def test_ibd_a_jog_is_left_by_a_stop_and_a_new_run_alone(ibd: Bench) -> None:
+    ibd.write(0x2001, 5000)
+    ibd.write(0x2000, 3)
+    ibd.wait(60)
+    assert ibd.write(0x2000, 2) == 0  # confirmed, and of no effect
+    ibd.wait(60)
+    assert ibd.motor.frequency == ibd.motor.jog_frequency
+    ibd.write(0x2000, 0)
+    ibd.write(0x2000, 2)
+    ibd.wait(60)
+    assert ibd.motor.frequency == ibd.motor.jog_frequency
+    ibd.write(0x2000, 1)
+    ibd.write(0x2000, 2)
+    ibd.wait(60)
+    assert ibd.motor.frequency == 50
+
+
+def test_ibd_a_trip_ends_a_jog(ibd: Bench) -> None:
+    ibd.write(0x2001, 5000)
+    ibd.write(0x2000, 3)
+    ibd.sim.trip(1)
+    ibd.write(0x2000, 0x10)
+    ibd.write(0x2000, 2)
+    ibd.wait(60)
+    assert ibd.motor.frequency == 50
+
+
+def test_ibd_runs_by_the_line_only_if_it_is_set_up_for_it(ibd: Bench) -> None:
+    ibd.write(0x2001, 5000)
+    ibd.write(102, 0)  # Prb.02
+    assert ibd.write(0x2000, 2) == 0
+    assert not ibd.motor.energised
+    ibd.write(102, 2)
+    ibd.write(100, 3000)  # Prb.00
+    ibd.write(101, 0)  # Prb.01
+    ibd.write(0x2000, 2)
+    ibd.wait(60)
+    assert ibd.motor.frequency == 30
+    ibd.write(101, 5)
+    ibd.wait(60)
+    assert ibd.motor.frequency == 50
+
+
 def test_ibd_clamps_silently(ibd: Bench) -> None:
     assert ibd.write(107, 60_000) == 0
     assert ibd.ask(3, 107) == [36_000]

@@ -113,6 +113,8 @@ class InnovertIBD(Drive):
       of the bits before): a direction is refused, unless the option `forward_bit` says which bit was
       seen on site to be forward. Without a direction both bits are 0, and `start` turns the motor in
       whatever direction is in force. The toggle of the direction is never sent.
+    - A jog is left by a stop and a new start (table 3), and whether a motor that turns does so in a jog
+      cannot be read: `start` and `jog` are refused while it turns, and want a stop first.
     - There is no state word. The state is unknown unless the outputs are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3), which `state` and `stop` look up.
       Otherwise `stop` goes by current and speed.
@@ -245,12 +247,12 @@ class InnovertIBD(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start in the direction in force; in another only where `forward_bit` is declared."""
+        """Start from rest in the direction in force; in another only where `forward_bit` is declared."""
         yield from self._command(Control.RUN, direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn at PrE.00 until stopped, in the direction in force; for another see `start`."""
+        """Turn from rest at PrE.00 until stopped, in the direction in force; for another see `start`."""
         yield from self._command(Control.JOG, direction)
 
     def _command(self, word: Control, direction: Direction | None) -> Script[None]:
@@ -260,6 +262,8 @@ class InnovertIBD(Drive):
             raise Refused(f"{self.name} has a fault: see to it, then call reset_fault()")
         if word is Control.RUN:
             yield from self._setpoint_in_force()
+        if (yield from self._runs()):
+            raise Refused(f"{self.name} turns, and a jog would go on through this: call stop() first")
         yield from write(self.control, sent)
         yield from self._started()
 

@@ -7,7 +7,10 @@ from multidrop.sim.memory import Cell
 from multidrop.sim.motor import Phase
 from multidrop.sim.powered import PoweredDrive
 
-CONTROL = 0x2000
+CONTROL, SETPOINT = 0x2000, 0x2001
+STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .02
+BY_PARAMETER, BY_LINE, RUN_BY_LINE = 0, 5, 2
+STOP, RUN, JOG = 1, 2, 3  # bits 1 and 0 of 2000H
 ALWAYS_SEEN = 1 << 11 | 1 << 12  # in PrA.22, by the manual's example
 LARGEST = {107: 36000, 108: 36000}  # of Prb.07 and Prb.08; the manual has maxima and does not give them
 OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # bits of PrA.22 by Prd.23, .24, .25, .28
@@ -20,13 +23,27 @@ class SimulatedIBD(PoweredDrive):
     """Set up for RS-485 (Prb.01 = 5, Prb.02 = 2), its outputs programmed as the manual's example.
 
     The manual has no exceptions: what cannot be done is not answered. A value above the largest
-    is stored as the largest, and the echo shows the value that was asked for.
+    is stored as the largest, and the echo shows the value that was asked for. A run while it jogs
+    changes nothing: a jog is left by a stop and a new run (table 3).
+
+    Not in the manual: a command is confirmed and has no effect unless Prb.02 = 2; the setpoint is 0
+    where Prb.01 is neither 5 nor 0; Prb.00 counts 0.01 Hz, as 2001H does.
     """
 
     functions = (0x03, 0x06)
     needs_silence = True  # table "message in RTU mode"
     codes = {}
-    begins = {101: 5, 102: 2, 323: RUNNING, 324: ACCELERATING, 325: DECELERATING, 328: FAULT}
+    begins = {
+        FREQUENCY_SOURCE: BY_LINE,
+        RUN_SOURCE: RUN_BY_LINE,
+        323: RUNNING,
+        324: ACCELERATING,
+        325: DECELERATING,
+        328: FAULT,
+    }
+
+    def prepare(self) -> None:
+        self._jogs = False
 
     @property
     def most_gap(self) -> float:
@@ -38,11 +55,20 @@ class SimulatedIBD(PoweredDrive):
             return min(raw, register.encode(register.span[1]))
         return min(raw, LARGEST.get(cell.address, raw))
 
+    def setpoint(self) -> float:
+        source = {BY_LINE: SETPOINT, BY_PARAMETER: STORED_SETPOINT}.get(self.word(FREQUENCY_SOURCE))
+        return self.word(source) / 100 if source is not None else 0.0
+
     def _control(self, bits: int) -> None:
         """Direction bits as the number that BIT3, BIT2 make; the manual can be read both ways."""
         if bits & 0x10:
             self.motor.reset()
-        self.run_or_stop(bits & 0x03, {0x04: -1, 0x08: 1, 0x0C: -self.motor.direction}.get(bits & 0x0C))
+        action = bits & 0x03
+        jogs = self._jogs and self.motor.energised
+        if self.word(RUN_SOURCE) != RUN_BY_LINE or (jogs and action == RUN):
+            return
+        self.run_or_stop(action, {0x04: -1, 0x08: 1, 0x0C: -self.motor.direction}.get(bits & 0x0C))
+        self._jogs = action == JOG or (jogs and action != STOP)
 
     def _terminals(self) -> int:
         says = {
