@@ -118,8 +118,8 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         (["start", "/dev/ttyX", TOY, "1", "--frequency", "60"], "frequency = 60 is outside 0 to 50 Hz"),
         (["start", "/dev/ttyX", TOY, "1", "--frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
         (
-            ["write", "/dev/ttyX", "yd1000", "1", "command_mode", "0.5"],
-            "command_mode takes a whole number, not 0.5",
+            ["write", "/dev/ttyX", "yd1000", "1", "meter_selection", "0.5"],
+            "meter_selection takes a whole number, not 0.5",
         ),
         (
             ["read", "sockt://10.0.0.7:4001", TOY, "1"],

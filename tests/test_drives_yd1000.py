@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import checksums
 import pytest
+from halls import one
 from scripts import Wire, frame, rows, typed
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
-from multidrop.drives.yd1000 import YD1000, Control, Inputs, Outputs, Status
+from multidrop.drives.yd1000 import YD1000, Control, Inputs, Outputs, Status, extended
 from multidrop.register import Kept
 
 FORWARD = "01 06 10 00 C4 00 DF CA"
@@ -17,6 +19,7 @@ EIGHTY = "01 06 10 01 1F 40 D5 0A"
 STANDING = {
     "output_frequency": 0.0,
     "deceleration_time": 10.0,
+    "held_frequency": 0.0,
     "fault_record_1": 0.0,
     "maximum_frequency": 80.0,
 }
@@ -131,9 +134,52 @@ def test_ram_and_eeprom() -> None:
 
 
 def test_what_is_never_written() -> None:
-    never = {it.address for it in YD1000.registers.values() if it.never}
-    assert never >= {0x0001, 0x0007, 0x0015, 0x0800, 0x0801, 0x0802, 0x0803}
-    assert never - {0x0001, 0x0007, 0x0015, 0x0800, 0x0801, 0x0802, 0x0803} == {0x0006, 0x0016}
+    never: dict[str, set[int]] = {}
+    for register in YD1000.registers.values():
+        never.setdefault(register.never, set()).add(register.address)
+    del never[""]
+    assert never == {
+        "it is effective from the panel only": {0x0001, 0x0007, 0x0015},
+        "its scale is not stated": {0x0006, 0x0016},
+        "it changes the drive's end of the line; set it on the panel": {0x0800, 0x0801, 0x0802},
+        "it sets others, which are not named": {0x0002},
+        "it belongs to the command over the motor; set it on the panel": {
+            0x0003,  # CNOD
+            0x0004,  # FNOD
+            0x0008,  # FR
+            0x0103,  # F103, ST
+            0x0104,  # F104, RST
+            0x0110,  # F110, always on
+            *range(0x0111, 0x0116),  # F111 to F115, the inputs
+        },
+    }
+
+
+def test_what_a_change_of_the_line_needs() -> None:
+    """Section 7: 0800H and 0801H after a reset or power-on, 0802H and 0803H at once."""
+    later = {it.address for it in YD1000.registers.values() if "after a reset" in it.note}
+    at_once = {it.address for it in YD1000.registers.values() if "at once" in it.note}
+    assert (later, at_once) == ({0x0800, 0x0801}, {0x0802, 0x0803})
+    assert YD1000.address_setting.span == (0, 63)
+    assert YD1000.communication_timeout.span == (0, 100)
+
+
+def test_an_extended_parameter_has_its_name_s_number() -> None:
+    """F is put as 0 (section 6.2), as the table itself has it."""
+
+    class Mine(YD1000):
+        """A YD1000 whose owner has its manual."""
+
+        start_frequency = extended("F240", "Hz", step=0.01)
+
+    assert (Mine.start_frequency.address, Mine.start_frequency.kept) == (0x0240, Kept.EEPROM)
+    assert Mine.start_frequency.place == "6.2, F240"
+    for register in YD1000.registers.values():
+        if register.place.startswith("6.2, "):
+            assert extended(register.place.removeprefix("6.2, ")).address == register.address
+    for wrong in ("F1000", "F24A", "f240", "240", "F24"):
+        with pytest.raises(ValueError, match="F and three digits"):
+            extended(wrong)
 
 
 def test_bits() -> None:
@@ -208,6 +254,73 @@ def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None
     wire = Wire(YD1000(1), {**AT_30_HZ, **TURNS[REVERSE]})
     wire.drive.start()
     assert wire.sent == [REVERSE]
+
+
+def yd_word(word: int) -> str:
+    """A write of the control word (section 5.2), with its checksum."""
+    return checksums.rtu(f"01 06 10 00 {word:04X}").hex(" ").upper()
+
+
+@pytest.mark.parametrize(
+    ("options", "forward", "reverse"),
+    [
+        ({"setpoint_by_fnod": 1}, 0x8400, 0x8600),  # both printed in section 8.1
+        ({"second_ramp": 1}, 0xC440, 0xC640),
+        ({"second_ramp": 1, "setpoint_by_fnod": 1}, 0x8440, 0x8640),
+        ({"second_ramp": 0, "setpoint_by_fnod": 0}, 0xC400, 0xC600),
+    ],
+)
+def test_options_of_start(options: dict[str, float], forward: int, reverse: int) -> None:
+    words = [yd_word(forward), yd_word(reverse)]
+    wire = Wire(YD1000(1, **options), AT_30_HZ, turns=dict.fromkeys(words, TURNS[FORWARD]))
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)
+    assert wire.sent == words
+
+
+def test_where_fnod_has_the_setpoint_1001h_is_not_looked_at() -> None:
+    wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
+    wire.drive.start()
+    assert wire.sent == [yd_word(0x8400)]
+    for option in ("setpoint_by_fnod", "preset_speed"):
+        with pytest.raises(Refused, match=option):
+            Wire(YD1000(1, **{option: 1})).drive.set_frequency(20)
+
+
+AT_PRESET = {**STANDING, "reference_frequency": 0.0, **{f"preset_speed_{it}": 5.0 * it for it in range(1, 8)}}
+
+
+@pytest.mark.parametrize(
+    ("number", "bits"), [(1, 0x8), (2, 0x4), (3, 0xC), (4, 0x2), (5, 0xA), (6, 0x6), (7, 0xE)]
+)
+def test_a_preset_speed_is_seen_at_rest_before_the_motor_is_started(number: int, bits: int) -> None:
+    select, run = yd_word(0xC000 | bits), yd_word(0xC600 | bits)
+    wire = Wire(
+        YD1000(1, preset_speed=number),
+        AT_PRESET,
+        turns={select: {"reference_frequency": 5.0 * number}, run: TURNS[REVERSE]},
+    )
+    wire.drive.start(Direction.REVERSE)
+    assert wire.sent == [STOP, select, run]
+
+
+@pytest.mark.parametrize(
+    ("says", "sent", "sentence"),
+    [
+        ({}, [STOP, yd_word(0xC00C), STOP], "does not take 15 Hz, preset speed 3"),
+        ({"reference_frequency": 15.0}, [STOP], "nothing would show the wrong bits"),
+        ({"preset_speed_3": 0.0}, [], "is 0: set preset_speed_3 first"),
+        ({**TURNS[FORWARD]}, [], r"turns: .*call stop\(\) first"),
+        ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
+    ],
+)
+def test_a_preset_speed_that_is_not_seen_starts_nothing(
+    says: dict[str, object], sent: list[str], sentence: str
+) -> None:
+    wire = Wire(YD1000(1, preset_speed=3), {**AT_PRESET, **says})
+    with pytest.raises(Refused, match=sentence):
+        wire.drive.start()
+    assert wire.sent == sent
 
 
 def test_jog_leaves_the_run_bit_off() -> None:
@@ -323,3 +436,63 @@ def test_a_motor_with_a_fault_is_not_started() -> None:
         with pytest.raises(Refused, match=r"has a fault, code 0AH: see to it, then call reset_fault\(\)$"):
             verb()
     assert wire.sent == []
+
+
+def test_a_trip_shows_in_what_it_froze() -> None:
+    """Section 8.2: 1200H is held while the drive has tripped, and 1100H is not."""
+    wire = Wire(YD1000(1), {**STANDING, "held_frequency": 30.0, "fault_record_1": 0x0A})
+    assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
+    starting = {**STANDING, "held_frequency": 0.2, "output_frequency": [0.0, 0.0, 0.4]}
+    assert Wire(YD1000(1), starting).drive.state().condition is Condition.STOPPED
+
+
+def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a new object too, as the command line has it each time."""
+    hall, drive, sim = one(monkeypatch, YD1000(1))
+    drive.set_frequency(30)
+    drive.start()
+    hall.sleep(3)
+    drive.emergency_stop()
+    hall.bus.detach(drive)
+    drive = hall.attach(YD1000(1))
+    with pytest.raises(Refused, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
+        drive.start()
+    drive.reset_fault()
+    drive.set_frequency(30)
+    drive.start()
+    assert sim.motor.energised
+
+
+def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is frozen then, and the record is new to nobody who did not look before."""
+    _, drive, _ = one(monkeypatch, YD1000(1))
+    drive.emergency_stop()
+    drive.set_frequency(30)
+    with pytest.raises(Unconfirmed, match=r"not seen to run; .*emergency stop the drive needs reset_fault"):
+        drive.start()
+
+
+def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, sim = one(monkeypatch, YD1000(1))
+    assert hall.bus.write(drive, drive.communication_timeout, 5) == 5
+    assert sim["communication_timeout"] == 5
+    for wrong in (-1, 101, 0.5):
+        with pytest.raises(Refused, match="communication_timeout"):
+            hall.bus.write(drive, drive.communication_timeout, wrong)
+    drive.set_frequency(30)
+    drive.start()
+    with pytest.raises(Refused, match="only while the motor stands"):
+        hall.bus.write(drive, drive.communication_timeout, 2)
+
+
+@pytest.mark.parametrize("speed", range(1, 8))
+def test_a_preset_speed_on_a_simulated_drive(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
+    hall, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
+    sim[f"preset_speed_{speed}"] = 12.5
+    drive.start()
+    hall.sleep(60)
+    sim.pass_time(hall.seconds)
+    assert sim.motor.frequency == 12.5
+    drive.stop()

@@ -437,11 +437,27 @@ HAZARDS = [
         sends=("01 06 10 00 E0 00", "01 06 10 00 C0 00"),
     ),
     Hazard(
-        "Y13: 0800H to 0803H act on the line at once",
+        "Y13: 0802H acts on the line at once",
         yd,
         write("address_setting", 2.0),
         naive="01 06 08 02 00 02",
         refuses="drive's end of the line",
+    ),
+    Hazard(
+        "0008H may be changed while the motor runs, and has the panel's direction",
+        yd,
+        write("panel_direction", 1.0),
+        naive="01 06 00 08 00 01",
+        refuses="belongs to the command over the motor",
+    ),
+    Hazard(
+        "what the bits of the preset speeds select is seen before the motor is started",
+        lambda: YD1000(1, preset_speed=4),
+        start,
+        naive="01 06 10 00 C4 01",
+        sends=("01 06 10 00 C0 00", "01 06 10 00 C0 02", "01 06 10 00 C0 00"),
+        refuses="does not take 12.5 Hz, preset speed 4",
+        shows={"preset_speed_4": 12.5, "reference_frequency": 0.0},
     ),
     Hazard(
         "Y14: the emergency stop is not broadcast",
@@ -649,11 +665,15 @@ def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPa
     drive.stop()
 
 
-def test_y12_the_watchdog_is_off_from_the_factory_and_that_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
+def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hall, drive, sim = one(monkeypatch, YD1000(1))
     assert "off" in hall.bus.watchdog(drive)
-    assert "0803H" not in YD1000.watchdog
-    assert drive.communication_timeout.never
+    sim["communication_timeout"] = 7
+    assert "7 s" in hall.bus.watchdog(drive)
+    assert "from the factory is not stated" in YD1000.watchdog
+    assert drive.communication_timeout.default is None
 
 
 def test_0_8_what_wears_an_eeprom_is_declared() -> None:

@@ -68,7 +68,7 @@ def yd(it: Message) -> bool:
         control = word(it)
         resets = control & 0x2000 and control & 0x0500
         return it.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
-    never = (1, 6, 7, 0x15, 0x16, 0x0800, 0x0801, 0x0802, 0x0803)
+    never = (1, 2, 3, 4, 6, 7, 8, 0x15, 0x16, 0x103, 0x104, *range(0x110, 0x116), 0x0800, 0x0801, 0x0802)
     readings = it.start == 0x1100 or 0x1200 <= it.start <= 0x1214
     return (
         it.function == 6

@@ -684,6 +684,8 @@ def test_yd_freezes_what_it_shows_in_a_trip(yd: Bench) -> None:
     assert yd.ask(3, 0x1100) == [0]
     assert yd.ask(3, 0x1200) == [5000]
     assert yd.ask(3, 0x1201) == [1 << 10]
+    assert yd.ask(3, 0x1202) == [5000]
+    assert (yd.ask(3, 0x1203), yd.ask(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are held
     assert yd.ask(3, 0x1210) != [0]
 
 
@@ -696,6 +698,106 @@ def test_yd_restarts_on_a_reset_and_is_deaf_meanwhile(yd: Bench) -> None:
     assert yd.ask(3, 0x1210) == [3]
     assert yd.ask(3, 0x1001) == [0]
     assert yd.ask(3, 0x1200) == [0]
+
+
+@pytest.mark.parametrize("bit", [13, 12, 11, 10, 8, 7], ids=lambda bit: f"bit {bit}")
+def test_yd_no_command_works_without_bit_15(yd: Bench, bit: int) -> None:
+    """The panel that is in command then lets the motor run (8.1)."""
+    assert isinstance(yd.sim, SimulatedYD1000)
+    yd.sim.panel_runs = True
+    yd.write(0x1001, 3000)
+    yd.write(0x1000, FORWARD)
+    yd.wait(60)
+    assert yd.write(0x1000, 1 << 14 | 1 << bit) == 0
+    yd.wait(60)
+    assert (yd.motor.frequency, yd.motor.fault) == (30, 0)
+    assert yd.ask(3, 0x1001) == [3000]
+
+
+@pytest.mark.parametrize(
+    ("word", "state"),
+    [
+        (0xC400, 1 << 10),
+        (0xC600, 1 << 10 | 1 << 9),
+        (0xC440, 1 << 10 | 1 << 6),
+        (0xC100, 1 << 10 | 1 << 8),
+        (0xC080, 1 << 10 | 1 << 7),  # "in DC braking this bit is run" (8.2, table 2)
+        (0xC000, 0),
+    ],
+)
+def test_yd_shows_what_it_does(yd: Bench, word: int, state: int) -> None:
+    yd.write(0x1001, 3000)
+    yd.write(0x1000, word)
+    yd.wait(60)
+    assert yd.ask(3, 0x1201) == [state]
+    yd.write(0x1000, STOP)
+    yd.wait(60)
+    assert not yd.motor.energised
+
+
+def test_yd_brakes_by_direct_current_until_it_is_told_to_stop(yd: Bench) -> None:
+    yd.write(0x1001, 3000)
+    yd.write(0x1000, FORWARD)
+    yd.wait(60)
+    yd.write(0x1000, STOP | 1 << 7)
+    yd.wait(10)
+    assert (yd.ask(3, 0x1100), yd.motor.energised) == ([0], True)
+
+
+@pytest.mark.parametrize(
+    ("bits", "speed"), [(0x8, 1), (0x4, 2), (0xC, 3), (0x2, 4), (0xA, 5), (0x6, 6), (0xE, 7)]
+)
+def test_yd_preset_speeds(yd: Bench, bits: int, speed: int) -> None:
+    yd.write(0x1001, 5000)
+    for number, address in enumerate((0x18, 0x19, 0x20, 0x21, 0x22, 0x23, 0x24), start=1):
+        assert yd.write(address, 1000 + number * 100) == 0
+    yd.write(0x1000, FORWARD | bits)
+    yd.wait(60)
+    assert yd.ask(3, 0x1100) == yd.ask(3, 0x1202) == [1000 + speed * 100]
+
+
+@pytest.mark.parametrize(
+    ("address", "value"),
+    [
+        (0x0012, 8001),  # UL: 0.5 to FH
+        (0x0012, 49),
+        (0x0013, 8001),  # LL: 0.0 to UL
+        (0x0018, 8001),  # Sr1: LL to UL
+        (0x0100, 8001),  # F100: 0.0 to FH
+        (0x1001, 8001),  # 0.0 to FH
+        (0x1002, 8001),
+        (0x0802, 64),
+        (0x0803, 101),
+    ],
+    ids=lambda it: f"{it:04X}",
+)
+def test_yd_refuses_what_is_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
+    before = yd.ask(3, address)
+    assert yd.write(address, value) == 3
+    assert yd.ask(3, address) == before
+
+
+def test_yd_its_limits_are_those_that_it_holds(yd: Bench) -> None:
+    assert yd.write(0x0012, 6000) == 0  # UL
+    assert (yd.write(0x0013, 6001), yd.write(0x0013, 2000)) == (3, 0)  # LL
+    assert (yd.write(0x0018, 1999), yd.write(0x0018, 2000)) == (3, 0)  # Sr1
+    assert (yd.write(0x0012, 1999), yd.write(0x0011, 5999)) == (3, 3)  # neither UL below LL nor FH below UL
+
+
+@pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
+def test_yd_what_is_the_panel_s_is_not_kept(yd: Bench, address: int) -> None:
+    assert yd.write(address, 1) == 0
+    assert yd.ask(3, address) == [0]
+    assert not yd.sim.counters.eeprom_writes
+
+
+def test_yd_its_watch_begins_anew_after_a_reset(yd: Bench) -> None:
+    yd.write(0x0803, 1)
+    yd.write(0x1000, RESET)
+    yd.now += 5
+    assert yd.ask(3, 0x1210) == [0]
+    yd.now += 5
+    assert yd.ask(3, 0x1210) != [0]
 
 
 def test_yd_obeys_broadcasts_of_command_and_frequency_only(yd: Bench) -> None:
@@ -711,6 +813,7 @@ def test_yd_all_but_commands_wears_the_eeprom(yd: Bench) -> None:
 
 
 def test_yd_locks_some_parameters_while_it_runs(yd: Bench) -> None:
+    assert yd.write(0x0012, 6000) == 0  # UL, which FH is not below
     assert yd.write(0x0011, 6000) == 0
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)

@@ -193,6 +193,7 @@ class Drive:
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
+    line_parameters: ClassVar[str] = ""  # those for its address, baud rate and format
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import re
 from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
@@ -20,6 +21,7 @@ from multidrop.drive import (
     Unconfirmed,
     insist,
     read,
+    until,
     verb,
     wait,
     write,
@@ -27,11 +29,15 @@ from multidrop.drive import (
 from multidrop.register import Details, Kept, Register, command, reading, setting
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
+SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command
 RESET_TIME = 3.0  # s in which the drive restarts and may be deaf
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
+COMMAND = "it belongs to the command over the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
+AT_ONCE = "Takes effect at once."
+AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
 
 class Control(IntFlag):
@@ -53,7 +59,9 @@ class Control(IntFlag):
     PRESET_SPEED_4 = 1 << 0
 
 
-STOP = Control.COMMAND_VALID | Control.FREQUENCY_VALID  # all that this library sends has these two
+STOP = Control.COMMAND_VALID | Control.FREQUENCY_VALID  # bits 15 and 14, and not run
+
+PRESET_SPEEDS = (Control.PRESET_SPEED_1, Control.PRESET_SPEED_2, Control.PRESET_SPEED_3)  # as 1, 2 and 4
 
 
 class Status(IntFlag):
@@ -116,6 +124,22 @@ def preset(number: int, place: str, /) -> Register[float]:
     return hertz(number, place, at_least="minimum_frequency", at_most="upper_limit_frequency", default=0.0)
 
 
+def extended(name: str, unit: str = "", /, **details: Unpack[Details]) -> Register[float]:
+    """An extended parameter by its name in one's own manual: F800 is 0800H (section 6.2).
+
+    It is kept in EEPROM. Whoever has the manual at hand, for the numbers alone are known here, declares it
+    in a subclass:
+
+        class MyYD1000(YD1000):
+            start_frequency = extended("F240", "Hz", step=0.01)
+    """
+    if not re.fullmatch(r"F[0-9]{3}", name):
+        raise ValueError(f"{name!r} is no extended parameter, which is F and three digits, such as F170")
+    details["kept"] = Kept.EEPROM
+    details.setdefault("place", f"6.2, {name}")
+    return setting(int(name[1:], 16), unit, **details)
+
+
 def _parameter(place: str, more: Details) -> Details:
     return {"kept": Kept.EEPROM, "while_running": True, "place": place, **more}
 
@@ -134,19 +158,32 @@ class YD1000(Drive):
       and may say run. A stop keeps bit 15, and so does everything else.
     - Bit 14 should stay as it was, and what it is cannot be told for sure: every command has it set.
       So the setpoint is 1001H from the first verb on, which is 0 Hz until set_frequency is called.
+      With the option `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
+    - Bits 3 to 0 are called preset speed 1 to 4, and there are seven, Sr1 to Sr7: the bits are taken for
+      the number's, 1, 2, 4 and 8, as relatives have it. With the option `preset_speed` they are
+      written without the run bit first, from rest, and the motor is started only if 1202H changes to
+      that speed.
+    - How bit 7, the direct-current brake, goes with run and stop is not stated: it is never set.
     - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: relatives restart again and
       again while they are set. A reset keeps bit 15 and the run bit off, so that no terminal starts the
       motor; its reply may be cut off, and 3 s later the stop is written again.
     - Jog is written without the run bit, which would turn the motor at the setpoint if jog is not obeyed.
     - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. A motor
-      has stopped when it is 0 twice. A trip cannot be seen, only a change in the fault record.
-    - Registers marked "panel only" are never written, although section 8.1 writes 0007H to initialise;
-      0800H to 0803H neither: they act on the line at once.
+      has stopped when it is 0 twice. A trip shows as a 1200H that is not 0 while 1100H is; a trip at
+      rest, as an emergency stop may be, only as a change in the fault record.
+    - Registers marked "panel only" are never written, although section 8.1 writes 0007H to initialise.
+      0800H to 0802H neither: they are the drive's end of the line. 0800H and 0801H take effect after a
+      reset or at the next power-on, 0802H and 0803H at once (section 7).
+    - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and AU3 sets
+      others, which are not named: they are read and never written.
+    - 0803H, the watchdog, is written only while the motor stands (the document does not ask for that): a
+      time shorter than the gap between two polls trips the drive.
     - The table of faults is missing: codes are shown as they are. Exceptions are a relative's, VF-S15's.
     - Addresses above 31 need a version above V104. The stop bits are not stated: 1.
 
-    All but 1000H to 12FFH is kept in EEPROM. F800 = 3 and F801 = 1 are required: 9600 8E1. An S7e has
-    no F800 and is fixed at 1200 bit/s.
+    All but 1000H to 12FFH is kept in EEPROM. The number of any other extended parameter is its name's
+    with 0 for F (section 6.2): declare those of one's own manual in a subclass, with `extended`.
+    F800 = 3 and F801 = 1 are required: 9600 8E1. An S7e has no F800 and is fixed at 1200 bit/s.
     """
 
     model = "yd1000"
@@ -166,25 +203,40 @@ class YD1000(Drive):
         4: "cannot be done now (after VF-S15)",
     }
     broadcasts = True
-    remote = "a start has bits 15 and 14 set, so that neither CNOD nor FNOD matters"
+    remote = (
+        "nothing is to be set for it: bits 15 and 14 of a start go before CNOD and FNOD; after a trip or an "
+        "emergency stop the drive needs reset_fault()"
+    )
+    line_parameters = (
+        "F800 baud rate (0 to 3: 1200, 2400, 4800, 9600; it must be 3, and an S7e is fixed at 1200), F801 "
+        "parity (0 none, 1 even, 2 odd; it must be 1), both in effect after a reset or power-on; F802 address"
+    )
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; without it, dEC and 5 s"),
+        "second_ramp": Option("", (0, 1), "1: `start` takes acceleration and deceleration 2 (bit 6)"),
+        "preset_speed": Option("", (1, 7), "`start` runs at this preset speed, Sr1 to Sr7, and not at 1001H"),
+        "setpoint_by_fnod": Option(
+            "", (0, 1), "1: FNOD says where the setpoint comes from; `start` and `jog` leave bit 14 off"
+        ),
     }
     watchdog = (
-        "F803: trips with Err.5 when no valid message comes for 1 to 100 s; 0 is off. Set it on the panel, "
-        "longer than the longest gap between two polls."
+        "F803: trips with Err.5 when no valid message comes for 1 to 100 s, counted from the first one; 0 is "
+        "off, and what it is from the factory is not stated. It is communication_timeout here: longer "
+        "than the longest gap between two polls."
     )
 
     # Section 6.1, basic parameters
     automatic_ramp = choice(0x0000, "6.1, AU1", 1, default=0)
     automatic_torque_boost = choice(0x0001, "6.1, AU2", default=0, while_running=False, never=PANEL)
-    automatic_environment = choice(0x0002, "6.1, AU3", 2, default=0, while_running=False)
-    command_mode = choice(0x0003, "6.1, CNOD", 1, default=1)
-    frequency_mode = choice(0x0004, "6.1, FNOD", 2, default=2)
+    automatic_environment = choice(
+        0x0002, "6.1, AU3", 2, default=0, while_running=False, never="it sets others, which are not named"
+    )
+    command_mode = choice(0x0003, "6.1, CNOD", 1, default=1, never=COMMAND)
+    frequency_mode = choice(0x0004, "6.1, FNOD", 2, default=2, never=COMMAND)
     meter_selection = choice(0x0005, "6.1, FNSL", 1, default=0)
     meter_adjustment = choice(0x0006, "6.1, FN", step=None, never=NO_SCALE)
     initialisation = choice(0x0007, "6.1, TYP", default=0, while_running=False, never=PANEL)
-    panel_direction = choice(0x0008, "6.1, FR", 1, default=0)
+    panel_direction = choice(0x0008, "6.1, FR", 1, default=0, never=COMMAND)
     acceleration_time = seconds(0x0009, "6.1, ACC", default=10.0)
     deceleration_time = seconds(0x0010, "6.1, DEC", default=10.0)
     maximum_frequency = hertz(
@@ -210,14 +262,14 @@ class YD1000(Drive):
     low_speed_frequency = hertz(0x0100, "6.2, F100", at_most="maximum_frequency", default=0.0)
     speed_reach_frequency = hertz(0x0101, "6.2, F101", at_most="maximum_frequency", default=0.0)
     speed_reach_band = hertz(0x0102, "6.2, F102", at_most="maximum_frequency", default=2.5)
-    st_selection = choice(0x0103, "6.2, F103", 2, default=1)
-    rst_selection = choice(0x0104, "6.2, F104", 1, default=0)
-    always_on_function = choice(0x0110, "6.2, F110", 37, default=0)
-    input_1_function = choice(0x0111, "6.2, F111", 37, default=2)
-    input_2_function = choice(0x0112, "6.2, F112", 37, default=3)
-    input_3_function = choice(0x0113, "6.2, F113", 37, default=10)
-    input_4_function = choice(0x0114, "6.2, F114", 37, default=6)
-    input_5_function = choice(0x0115, "6.2, F115", 37, default=7)
+    st_selection = choice(0x0103, "6.2, F103", 2, default=1, never=COMMAND)
+    rst_selection = choice(0x0104, "6.2, F104", 1, default=0, never=COMMAND)
+    always_on_function = choice(0x0110, "6.2, F110", 37, default=0, never=COMMAND)
+    input_1_function = choice(0x0111, "6.2, F111", 37, default=2, never=COMMAND)
+    input_2_function = choice(0x0112, "6.2, F112", 37, default=3, never=COMMAND)
+    input_3_function = choice(0x0113, "6.2, F113", 37, default=10, never=COMMAND)
+    input_4_function = choice(0x0114, "6.2, F114", 37, default=6, never=COMMAND)
+    input_5_function = choice(0x0115, "6.2, F115", 37, default=7, never=COMMAND)
     output_1_function = choice(0x0130, "6.2, F130", 9, default=4)
     output_2_function = choice(0x0131, "6.2, F131", 9, default=6)
 
@@ -278,11 +330,29 @@ class YD1000(Drive):
     run_hours = reading(0x1214, "h", step=1, place="6.5: 1214")
 
     # Section 7, communication
-    baudrate_setting = setting(0x0800, Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800")
-    parity_setting = setting(0x0801, Parity, kept=Kept.EEPROM, never=LINE, place="7 (2), F801")
-    address_setting = setting(0x0802, kept=Kept.EEPROM, never=LINE, place="7 (3), F802")
+    baudrate_setting = setting(
+        0x0800, Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
+    )
+    parity_setting = setting(
+        0x0801, Parity, kept=Kept.EEPROM, never=LINE, place="7 (2), F801", note=AFTER_RESET
+    )
+    address_setting = setting(
+        0x0802,
+        span=(0, 63),
+        kept=Kept.EEPROM,
+        never=LINE,
+        place="7 (3), F802",
+        note=f"Up to 31 before version V104. {AT_ONCE}",
+    )
     communication_timeout = setting(
-        0x0803, "s", step=1, kept=Kept.EEPROM, never=LINE, place="7 (4), F803", note="0 is off; 1 to 100 s."
+        0x0803,
+        "s",
+        step=1,
+        span=(0, 100),
+        kept=Kept.EEPROM,
+        while_running=False,
+        place="7 (4), F803",
+        note=f"0 is off. {AT_ONCE}",
     )
 
     _record: float | None = None  # the latest entry of the fault record when it was last looked at
@@ -303,9 +373,52 @@ class YD1000(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at 1001H; without a direction, in the one it turns in, or forward."""
-        yield from self._setpoint_in_force()
-        yield from self._turn(Control.RUN, direction)
+        """Start at 1001H; without a direction, in the one it turns in, or forward.
+
+        The options `preset_speed` and `setpoint_by_fnod` give it another setpoint, `second_ramp` the
+        other ramp; a stop is along the first one.
+        """
+        how = Control.RUN
+        if self.option.get("second_ramp"):
+            how |= Control.SECOND_RAMP
+        if self.option.get("preset_speed"):
+            how |= yield from self._preset()
+        elif not self._by_fnod():
+            yield from self._setpoint_in_force()
+        yield from self._turn(how, direction)
+
+    def _by_fnod(self) -> bool:
+        return bool(self.option.get("setpoint_by_fnod"))
+
+    def _preset(self) -> Script[Control]:
+        """The bits of the preset speed, once 1202H has shown, at rest, that they select it."""
+        number = int(self.option["preset_speed"])
+        hz = yield from read(self.registers[f"preset_speed_{number}"])
+        if hz == 0:
+            raise Refused(f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first")
+        if (yield from self._without_fault()).condition is Condition.RUNNING:
+            raise Refused(f"{self.name} turns: a preset speed is started from rest, so call stop() first")
+        yield from insist(self.control, STOP)
+        if (yield from read(self.reference_frequency)) == hz:
+            raise Refused(
+                f"{self.name} has {hz:g} Hz as its frequency command without preset speed {number} too, so "
+                "that nothing would show the wrong bits: write another frequency to 1001H first"
+            )
+        bits = Control(0)
+        for at, bit in enumerate(PRESET_SPEEDS):
+            if number >> at & 1:
+                bits |= bit
+        yield from write(self.control, self._valid() | bits)
+        if not (yield from until(lambda: self._is_commanded(hz), limit=SELECTION_TIME)):
+            yield from insist(self.control, STOP)
+            raise Refused(
+                f"{self.name} does not take {hz:g} Hz, preset speed {number}, as its frequency command when "
+                "the bits for it are set: it is not started"
+            )
+        return bits
+
+    def _is_commanded(self, hz: float) -> Script[bool]:
+        return (yield from read(self.reference_frequency)) == hz
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
@@ -313,14 +426,22 @@ class YD1000(Drive):
         yield from self._turn(Control.JOG, direction)
 
     def _turn(self, how: Control, direction: Direction | None) -> Script[None]:
-        state = yield from self.state.script()
-        if state.condition is Condition.FAULT:
-            raise Refused(f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()")
+        state = yield from self._without_fault()
         if direction is None and state.condition is Condition.RUNNING:
             direction = state.direction
         reverse = Control.REVERSE if direction is Direction.REVERSE else Control(0)
-        yield from write(self.control, STOP | how | reverse)
+        yield from write(self.control, self._valid() | how | reverse)
         yield from self._started()
+
+    def _valid(self) -> Control:
+        """Bit 15, and bit 14 unless FNOD is to say where the setpoint comes from."""
+        return Control.COMMAND_VALID if self._by_fnod() else STOP
+
+    def _without_fault(self) -> Script[State]:
+        state = yield from self.state.script()
+        if state.condition is Condition.FAULT:
+            raise Refused(f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()")
+        return state
 
     def _direction(self) -> Script[Direction]:
         """Of a motor that turns: then 1201H is not frozen."""
@@ -385,16 +506,25 @@ class YD1000(Drive):
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint, which is at most FH."""
+        for name in ("preset_speed", "setpoint_by_fnod"):
+            if self.option.get(name):
+                raise Refused(f"{self.name} takes no setpoint from 1001H: its option {name} gives it another")
         yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
-        """Whether it turns; a fault only if the record has changed since this object's last look."""
+        """Return that it turns, or its fault: one that freezes 1200H, or is new since the last look."""
         if not (yield from self._stands()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
         if self._record is None:
             self._record = record
-        if record != self._record:
+        if record != self._record or (yield from self._is_frozen()):
             return State(Condition.FAULT, fault=f"code {int(record):02X}H")
-        return State(Condition.STOPPED, note="a trip before the first look would not show")
+        return State(Condition.STOPPED, note="a trip at rest before the first look would not show")
+
+    def _is_frozen(self) -> Script[bool]:
+        """1200H is held in a trip and 1100H is not (section 8.2); one that has just started has both."""
+        if (yield from read(self.held_frequency)) == 0:
+            return False
+        return (yield from read(self.output_frequency)) == 0

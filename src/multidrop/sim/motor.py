@@ -68,6 +68,7 @@ class Motor:
         self.fault = 0
         self.faults: deque[int] = deque(maxlen=4)  # the latest first
         self._goal: float | None = 0.0  # Hz; None: the target
+        self._brakes = False  # by direct current
 
     # ---- what it is told ----
 
@@ -84,14 +85,24 @@ class Motor:
         self.direction = direction or self.direction
         self.energised = True
         self._goal = goal
+        self._brakes = False
 
     def stop(self) -> None:
         """Go down the ramp, then take the voltage off."""
         self._goal = 0.0
+        self._brakes = False
+
+    def brake(self) -> None:
+        """Hold the motor by direct current, until it is told something else."""
+        if self.fault:
+            return
+        self.coast()
+        self._brakes = self.energised = True
 
     def coast(self) -> None:
         """Take the voltage off; the shaft runs out."""
         self._goal = 0.0
+        self._brakes = False
         self.frequency = 0.0
         self.energised = False
 
@@ -129,7 +140,7 @@ class Motor:
             seconds = self._approach(0.0, self.deceleration_time, seconds)
         slowing = abs(goal) < abs(self.frequency)
         self._approach(goal, self.deceleration_time if slowing else self.acceleration_time, seconds)
-        if self._goal == 0.0 and self.frequency == 0.0:
+        if self._goal == 0.0 and self.frequency == 0.0 and not self._brakes:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:

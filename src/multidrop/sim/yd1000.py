@@ -6,27 +6,40 @@ import math
 
 from multidrop.core import Message
 from multidrop.register import HOLDING
-from multidrop.sim.dialect import Reason
-from multidrop.sim.memory import Cell
+from multidrop.sim.dialect import Reason, Refusal
+from multidrop.sim.memory import Cell, decode
 from multidrop.sim.powered import PoweredDrive
 
 CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY = 0x1000, 0x1001, 0x1002
 TIMEOUT_SETTING = 0x0803
-COMMANDED, BY_FREQUENCY, RESET, EMERGENCY_STOP, COAST, RUN, REVERSE, JOG = (
-    1 << bit for bit in range(15, 7, -1)
+COMMANDED, BY_FREQUENCY, RESET, EMERGENCY_STOP, COAST, RUN, REVERSE, JOG, DC_BRAKE, SECOND_RAMP = (
+    1 << bit for bit in range(15, 5, -1)
 )
+PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # of the preset speed's number
+PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # Sr1 to Sr7
+PANEL_ONLY = (0x0001, 0x0007, 0x0015)
 BAUDRATES = (1200, 2400, 4800, 9600)  # by the codes of F800
 RESTART_TIME = 2.0  # s without ears after a reset
-EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18  # the notes have no table of fault codes
-HELD = range(0x1200, 0x1206)  # frozen at a trip until the reset
+EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
+HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
 
 
 class SimulatedYD1000(PoweredDrive):
-    """Without bit 15 the panel is in command: it runs the motor when `panel_runs` says so."""
+    """Without bit 15 the panel is in command: it runs the motor when `panel_runs` says so.
+
+    A value outside its limits in section 6 is refused, also where such a limit is another parameter. What
+    is effective from the panel only is confirmed and not kept (6.1; section 8.1 has 0007H initialise).
+
+    The notes do not say the following, which is as relatives do: the exception codes (VF-S15); the codes
+    of faults, that an emergency stop is one, and that a reset restarts the drive, deaf for 2 s, with its
+    commands gone (VF-S11); that the preset speeds' bits are the bits of a number. The ramp times of the
+    second ramp are not in the notes: it has those of the first. That the brake takes the frequency to 0 at
+    once, and goes before run, is this simulator's own.
+    """
 
     functions = (0x03, 0x06)
     needs_silence = True  # 4.3
-    codes = {  # the notes list no codes; these are the VF-S15's
+    codes = {
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 2,
         Reason.WRITE_ADDRESS: 2,
@@ -38,6 +51,7 @@ class SimulatedYD1000(PoweredDrive):
 
     def prepare(self) -> None:
         self.panel_runs = False
+        self._in_force = 0  # the control word that it obeys
         self._heard_at = math.inf  # the watch begins with the first message
         self.memory.make_readable(HOLDING, [CONTROL])
 
@@ -49,8 +63,26 @@ class SimulatedYD1000(PoweredDrive):
         return request.function == 0x06 and request.start in (CONTROL, COMMUNICATION_FREQUENCY)
 
     def setpoint(self) -> float:
-        by_line = self.word(CONTROL) & BY_FREQUENCY
-        return self.word(COMMUNICATION_FREQUENCY if by_line else PANEL_FREQUENCY) / 100
+        word = self.word(CONTROL)
+        number = sum(value for bit, value in PRESET_BITS.items() if word & bit) if word & COMMANDED else 0
+        if 1 <= number <= len(PRESET_SPEEDS):
+            return self.word(PRESET_SPEEDS[number - 1]) / 100
+        return self.word(COMMUNICATION_FREQUENCY if word & BY_FREQUENCY else PANEL_FREQUENCY) / 100
+
+    def accept(self, cell: Cell, raw: int) -> int:
+        register = cell.register
+        if cell.address in PANEL_ONLY:
+            return cell.raw
+        if register is not None and register.values is None:
+            value = decode(register, raw)
+            if register.at_least and value < self[register.at_least]:
+                raise Refusal(Reason.VALUE)
+            if register.at_most and value > self[register.at_most]:
+                raise Refusal(Reason.VALUE)
+        return super().accept(cell, raw)
+
+    def wears(self, cell: Cell, function: int, address: int) -> bool:
+        return cell.address not in PANEL_ONLY and super().wears(cell, function, address)
 
     def pass_time(self, now: float) -> None:
         limit = self.word(TIMEOUT_SETTING) or math.inf  # F803, 0 is off
@@ -61,7 +93,7 @@ class SimulatedYD1000(PoweredDrive):
         super().pass_time(now)
 
     def trip(self, code: int) -> None:
-        """A fault: what 1200H to 1205H show is frozen."""
+        """A fault: what 1200H and 1201H show is frozen."""
         for address in HELD:
             cell = self.memory.readable(0x03, address)
             if cell:
@@ -73,28 +105,33 @@ class SimulatedYD1000(PoweredDrive):
             super().refresh(cell)
 
     def _control(self, word: int) -> None:
-        if word & RESET:
+        direction = -1 if word & REVERSE else 1
+        if not word & COMMANDED:  # then no other bit works (8.1)
+            panel = self.motor.run if self.panel_runs else self.motor.stop
+            panel()
+        elif word & RESET:
             self._restart()
         elif word & EMERGENCY_STOP:
             if not self.motor.fault:
                 self.trip(EMERGENCY_STOPPED)
         elif word & COAST:
             self.motor.coast()
-        elif not word & COMMANDED:
-            panel = self.motor.run if self.panel_runs else self.motor.stop
-            panel()
+        elif word & DC_BRAKE:
+            self.motor.brake()
         elif word & JOG:
-            self.motor.jog(-1 if word & REVERSE else 1)
+            self.motor.jog(direction)
         elif word & RUN:
-            self.motor.run(-1 if word & REVERSE else 1)
+            self.motor.run(direction)
         else:
             self.motor.stop()
+        self._in_force = word if word & COMMANDED else 0
 
     def _restart(self) -> None:
         """Everything that is not in the EEPROM is gone, and the drive is deaf for a while."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
+        self._heard_at = math.inf  # the watch begins anew with the first message
         for address in (CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY):
             cell = self.memory.writable(0x06, address)
             if cell:
@@ -102,8 +139,10 @@ class SimulatedYD1000(PoweredDrive):
         self.set_up()
 
     def _state(self) -> int:
-        bits = RUN if self.motor.energised else 0
-        return bits | (REVERSE if self.motor.direction < 0 else 0)
+        bits = self._in_force & SECOND_RAMP | (REVERSE if self.motor.direction < 0 else 0)
+        if not self.motor.energised:
+            return bits
+        return bits | RUN | self._in_force & (JOG | DC_BRAKE)  # braking is run too (8.2, table 2)
 
     obeys = {(0x03, CONTROL): _control}
     shows = {
