@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import checksums
 import pytest
+from halls import one
 from scripts import Wire, rows, typed
 
 from multidrop.drive import (
@@ -15,7 +19,16 @@ from multidrop.drive import (
     Unconfirmed,
     Unsupported,
 )
-from multidrop.drives.invt_che import CommunicationFault, Control, Fault, InvtCHE, Status, parameter
+from multidrop.drives.invt_che import (
+    CommunicationFault,
+    Control,
+    Fault,
+    InvtCHE,
+    Status,
+    parameter,
+    stored_parameter,
+)
+from multidrop.ledger import Ledger
 from multidrop.register import HOLDING, Kept
 from multidrop.register import Wire as Lie
 
@@ -231,6 +244,45 @@ def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
     for wrong in (-1, 512):
         with pytest.raises(ValueError, match="0 to 511"):
             parameter(wrong)
+
+
+def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Written where it is kept, and counted; 11.6.2 has the frame, with a value that means nothing here."""
+
+    class Mine(InvtCHE):
+        """A CHE whose owner has its manual."""
+
+        jump = stored_parameter(8, place="P0.08")
+        ramp = parameter(11, "s", step=0.1)
+
+    assert (Mine.jump.kept, Mine.jump.ram_address) == (Kept.EEPROM, None)
+    with pytest.raises(ValueError, match="0 to 511"):
+        stored_parameter(512)
+    ledger = Ledger(tmp_path / "wear", budget=100)
+    hall, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
+    hall.bus.write(drive, drive.ramp, 3.0)
+    assert ledger.wear(hall.seconds) == []
+    hall.bus.write(drive, drive.jump, 0x1388)
+    assert hall.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
+    with pytest.raises(Refused, match="less often"):
+        hall.bus.write(drive, drive.jump, 0x1389)
+    assert sim.counters.eeprom_writes == {"jump": 1}
+
+
+def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
+    jog = checksums.rtu("01 06 10 00 00 03").hex(" ").upper()
+    wire = Wire(
+        InvtCHE(1),
+        STANDBY,
+        turns={**TURNS, jog: {"status": Status.FORWARD}, STOP: {"status": Status.STANDBY}},
+    )
+    wire.drive.jog()
+    with pytest.raises(Refused, match=r"may still jog.*call stop\(\) first"):
+        wire.drive.start()
+    wire.drive.stop()
+    wire.drive.start()
+    wire.drive.start()  # while it runs
+    assert wire.sent == [jog, STOP, FORWARD, FORWARD]
 
 
 def test_there_is_no_emergency_stop() -> None:

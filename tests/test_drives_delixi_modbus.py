@@ -65,7 +65,7 @@ MONITORS = """
 0000 run_source           - RunSource
 0001 frequency_source     1
 01AC baudrate_setting     - Baudrate
-01AD format_setting       1
+01AD format_setting       - Format
 01AE address_setting      1
 """
 
@@ -94,6 +94,24 @@ def test_the_line_and_its_limits() -> None:
 
 def test_the_words_have_a_direction_and_no_toggle() -> None:
     assert {it.value for it in Control} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
+
+
+def test_formats_are_named_as_the_manual_has_them() -> None:
+    """P04.29: 0 to 2 are ASCII with seven bits, 3 to 5 RTU with eight."""
+    names = ["ASCII_7N2", "ASCII_7E1", "ASCII_7O1", "RTU_8N2", "RTU_8E1", "RTU_8O1"]
+    assert [DelixiModbus.format_setting.decode(raw).name for raw in range(6)] == names
+
+
+def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
+    jog = frame(DelixiModbus(1), DelixiModbus.control, Control.JOG_FORWARD)
+    wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING} | TURNS)
+    wire.drive.jog()
+    with pytest.raises(Refused, match=r"may still jog.*call stop\(\) first"):
+        wire.drive.start(Direction.FORWARD)
+    wire.drive.stop()
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)  # while it runs
+    assert wire.sent == [jog, STOP[Framing.RTU], FORWARD[Framing.RTU], REVERSE[Framing.RTU]]
 
 
 def test_faults() -> None:

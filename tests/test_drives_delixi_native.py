@@ -64,6 +64,11 @@ def test_the_line_and_its_limits() -> None:
     assert DelixiNative(1).needed_silence() == 0
 
 
+def test_formats_are_named_as_the_manual_has_them() -> None:
+    """P04.29 has other codes than in standard Modbus."""
+    assert [DelixiNative.format_setting.decode(raw).name for raw in range(3)] == ["N81", "E81", "O81"]
+
+
 def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
     broadcast = {name: it.broadcast for name, it in DelixiNative.registers.items() if it.broadcast}
     assert broadcast == {"control": (1,)}

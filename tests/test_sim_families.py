@@ -20,6 +20,7 @@ from multidrop.drives.yd1000 import YD1000
 from multidrop.register import setting
 from multidrop.sim import EncodedDrive, PoweredDrive, Wire, encoded, simulated
 from multidrop.sim.che import SimulatedCHE
+from multidrop.sim.delixi import SimulatedDelixiNative
 from multidrop.sim.yd1000 import SimulatedYD1000
 
 
@@ -497,6 +498,18 @@ def test_delixi_shows_its_frequency_in_ascii() -> None:
     assert delixi.say(":010301F4000106") == ":01030213885F"
 
 
+def test_delixi_runs_by_the_line_only_if_it_is_set_up_for_it(delixi: Bench) -> None:
+    delixi.say("01 06 00 02 13 88 25 5C")
+    delixi.sim["run_source"] = 0  # P00.00
+    assert delixi.say("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
+    assert not delixi.motor.energised
+    delixi.sim["run_source"] = 2
+    delixi.sim["frequency_source"] = 0  # P00.01
+    delixi.say("01 06 20 00 00 12 02 07")
+    delixi.wait(60)
+    assert (delixi.motor.energised, delixi.motor.frequency) == (True, 0)
+
+
 def test_delixi_turns_backwards(delixi: Bench) -> None:
     delixi.say("01 06 00 02 13 88 25 5C")
     delixi.say("01 06 20 00 00 22 02 13")  # built
@@ -585,6 +598,34 @@ def test_native_limits_and_locks() -> None:
 
 def test_native_start_in_a_fault_cannot_be_executed(native: Bench) -> None:
     native.sim.trip(1)
+    assert native.say(":010200020000000005") == ":01F0000000000000F1"
+    assert not native.motor.energised
+
+
+@pytest.mark.parametrize("fault", [9, 10, 14])
+def test_native_a_fault_and_its_record_agree(native: Bench, fault: int) -> None:
+    native.sim.trip(fault)
+    assert native.sim["fault"] == fault
+    shown = native.say(":01070213000000001D")[9:17]
+    for number, record in enumerate((shown, "00000000", "00000000", "00000000")):
+        asked = checksums.delixi(f"0107{0x020D + number:04X}00000000")
+        assert native.hear(asked)[9:17].decode() == record
+
+
+def test_native_a_locked_parameter(native: Bench) -> None:
+    assert isinstance(native.sim, SimulatedDelixiNative)
+    native.sim.locked = True
+    locked = checksums.delixi("01FE000000000000")
+    assert native.say(":0106000200001388A4").encode() + b"\r\n" == locked
+    assert native.hear(checksums.delixi("0105000200001388")) == locked
+    assert native.say(":0104000100001388A1") == ":0104000100001388A1"  # no parameter
+    assert native.say(":010200020000000005") == ":010200020000000005"
+    native.sim.locked = False
+    assert native.say(":0106000200001388A4") == ":0106000200001388A4"
+
+
+def test_native_cannot_be_commanded_where_the_line_does_not_command_it(native: Bench) -> None:
+    native.sim["run_source"] = 0  # P00.00
     assert native.say(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 

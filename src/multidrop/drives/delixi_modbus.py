@@ -18,7 +18,7 @@ from multidrop.drive import (
     verb,
     write,
 )
-from multidrop.drives.delixi_parameters import Baudrate, DelixiParameters, parameter
+from multidrop.drives.delixi_parameters import KEYPAD, Baudrate, DelixiParameters, parameter
 from multidrop.register import HOLDING, Kept, Register, command, setting
 
 
@@ -33,6 +33,17 @@ class Control(IntEnum):
     JOG_REVERSE = 0x23
 
 
+class Format(IntEnum):
+    """P04.29, in the firmware that speaks standard Modbus."""
+
+    ASCII_7N2 = 0
+    ASCII_7E1 = 1
+    ASCII_7O1 = 2
+    RTU_8N2 = 3
+    RTU_8E1 = 4
+    RTU_8O1 = 5
+
+
 class DelixiModbus(DelixiParameters, table=HOLDING):
     """Delixi 9200 (RTU firmware) and 9100-SC; RS-485 communication protocol, part 2, standard Modbus.
 
@@ -44,6 +55,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     - Whether a run command without a direction keeps the old one is not stated: both are always
       sent together. `start` without a direction goes forward from rest; while the motor turns it is
       refused, because the direction cannot be read. The toggle of the direction is never sent.
+    - Whether a start ends a jog is not stated: one that was jogged is to be stopped before a start.
     - There is no fault reset, and reserved bits are not tried.
     - There is no state word: an output frequency of 0 may be a stop, or a run at a setpoint of 0.
     - "3800" bit/s is 4800; the fault "0C-xx" is OC-2, and 04 is OU.
@@ -81,6 +93,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         place="P00.02",
         note="Every write wears the EEPROM. Used if P00.01 = 1.",
     )
+    format_setting = setting(parameter(4, 29), Format, never=KEYPAD, place="P04.29")
+
+    _jogged = False  # by this object, since it was last seen to stand
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
         """P04.30, its address, P04.28, its baud rate, or a bus voltage that no address reaches."""
@@ -99,10 +114,13 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction forward, and only from rest."""
+        if self._jogged and not (yield from self._stands()):
+            raise Refused(f"{self.name} may still jog, which a start may not end: call stop() first")
         forward = yield from self._forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
         yield from self._setpoint_in_force()
+        self._jogged = False
         yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
         yield from self._started()
 
@@ -110,6 +128,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly until stopped; without a direction forward, and only from rest."""
         forward = yield from self._forward(direction)
+        self._jogged = True
         yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
         yield from self._started()
 

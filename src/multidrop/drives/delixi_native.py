@@ -18,7 +18,7 @@ from multidrop.drive import (
     verb,
     write,
 )
-from multidrop.drives.delixi_parameters import DelixiParameters, parameter
+from multidrop.drives.delixi_parameters import KEYPAD, DelixiParameters, parameter
 from multidrop.register import Carrier, Kept, Register, Table, command, reading, setting
 
 COMMAND = Table("run command", None, 0x02, Carrier.NUMBER, Kept.RAM)
@@ -41,6 +41,14 @@ class Status(IntEnum):
     REVERSE = 3
     FAULT = 4
     UNDERVOLTAGE = 5
+
+
+class Format(IntEnum):
+    """P04.29, in the firmware that speaks Delixi's own protocol."""
+
+    N81 = 0
+    E81 = 1
+    O81 = 2
 
 
 class DelixiNative(DelixiParameters, table=PARAMETER):
@@ -100,6 +108,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         place="P00.02",
         note="Used if P00.01 = 1.",
     )
+    format_setting = setting(parameter(4, 29), Format, table=PARAMETER, never=KEYPAD, place="P04.29")
 
     @property
     def telling(self) -> Register[Any]:

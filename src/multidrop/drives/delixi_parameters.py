@@ -61,6 +61,8 @@ class Baudrate(IntEnum):
 class DelixiParameters(Drive):
     """The parameters of Delixi's inverters; a subclass says which table of its protocol carries them.
 
+    P04.29, the format, has other codes in each protocol, and is the subclass's.
+
     Values come without their decimal point, and the list that says where it belongs is lost: only the
     scale of the output frequency is known, from an example.
     """
@@ -70,6 +72,10 @@ class DelixiParameters(Drive):
     response_timeout = 0.15
     answering_time = 0.08  # the drive needs less
     remote = "P00.00 must be 2 (RS-485)"
+    line_parameters = (
+        "P04.28 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400), P04.29 format (its codes are those "
+        "of format_setting), P04.30 address"
+    )
     options = {
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
     }
@@ -79,9 +85,6 @@ class DelixiParameters(Drive):
         parameter(0, 1), never=KEYPAD, place="P00.01", note="1, the digital setting, for P00.02 to be used."
     )
     baudrate_setting = setting(parameter(4, 28), Baudrate, never=KEYPAD, place="P04.28")
-    format_setting = setting(
-        parameter(4, 29), never=KEYPAD, place="P04.29", note="Its codes depend on the firmware's protocol."
-    )
     address_setting = setting(parameter(4, 30), never=KEYPAD, place="P04.30")
 
     output_frequency = reading(parameter(5, 0), "Hz", step=0.01, place="P05.00")

@@ -144,6 +144,10 @@ class InnovertIBD(Drive):
     exceptions = {}
     broadcasts = True
     remote = "set Prb.01 to 5 and Prb.02 to 2 on the keypad"
+    line_parameters = (
+        "PrH.00 baud rate (1 is 9600), PrH.01 format (0 to 2: ASCII, 3 to 5: RTU; each 8N1, 8E1, 8O1), "
+        "PrH.02 address"
+    )
     options = {
         "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that may be written"),
         "forward_bit": Option("", (2, 3), "2 or 3, the bit of 2000H that was seen to turn it forward"),

@@ -103,18 +103,37 @@ def parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> R
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
     """A function code by its ordinal number in the table of one's own model's manual (section 11.6.4).
 
-    It is kept in EEPROM, and written to its alias in RAM: bit 15 of the address set. Compare what is
-    read with the keypad before anything is written: a wrong ordinal may restore the factory settings.
+    It is kept in EEPROM, and written to its alias in RAM: bit 15 of the address set. That is lost with the
+    power; what is to outlast it is a `stored_parameter`. Compare what is read with the keypad before
+    anything is written: a wrong ordinal may restore the factory settings.
 
         class MyCHE(InvtCHE):
             acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
+            stored_deceleration_time = stored_parameter(9, "s", step=0.1, place="P0.09")
     """
+    _in_section_11_6_4(ordinal, details)
+    details["ram_address"] = ordinal | 0x8000
+    return setting(ordinal, what, **details)
+
+
+@overload
+def stored_parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+@overload
+def stored_parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+    """A function code that is written where it is kept, in EEPROM, and outlasts a loss of power.
+
+    Every write wears the EEPROM (section 11.6.4): it is written on change, and its writes are counted.
+    """
+    _in_section_11_6_4(ordinal, details)
+    return setting(ordinal, what, **details)
+
+
+def _in_section_11_6_4(ordinal: int, details: Details) -> None:
     if not 0 <= ordinal <= 0x01FF:
         raise ValueError(f"ordinal {ordinal} is outside 0 to 511: the address's high byte is 00 or 01")
     details["kept"] = Kept.EEPROM
-    details["ram_address"] = ordinal | 0x8000
     details.setdefault("place", f"section 11.6.4, ordinal {ordinal}")
-    return setting(ordinal, what, **details)
 
 
 class InvtCHE(Drive):
@@ -128,14 +147,15 @@ class InvtCHE(Drive):
 
     - A function code's address is its ordinal number, but the two examples contradict each other
       (P5.05 is 003AH by counting, P0.07 is said to be 000CH): no ordinal is computed. A model's own
-      codes are declared in a subclass, with `parameter`.
+      codes are declared in a subclass, with `parameter` or `stored_parameter`.
     - Addresses with bit 15 set write to RAM only and cannot be read.
     - 2000H is a percentage of the maximum frequency (P0.04), so `set_frequency` needs that as the
       option `maximum_frequency`. It may be negative, which likely reverses: 0 to 100 % is written.
     - Newer INVT families have the control word at 2000H: see `identify`.
     - GD200L and GD300L print the DC bus voltage with and without a decimal: its scale is left open.
     - The example that writes 5000 to 0008H does not say what that is, and is not to be repeated.
-    - STOP may not end a jog: when the drive has not stopped after it, STOP_JOG follows.
+    - STOP may not end a jog: when the drive has not stopped after it, STOP_JOG follows. Nor may a
+      start: one that was jogged is to be stopped before a start.
     - Exception 03 is a malformed frame; a value out of range is 12H.
 
     The drive may also speak ASCII (CHE100 manual); the chapter has RTU only. P0.01 = 2 takes
@@ -166,6 +186,11 @@ class InvtCHE(Drive):
     broadcasts = True
     setpoint_name = "setpoint"
     remote = "P0.01 must be 2, and P0.03 take the frequency from the line"
+    line_parameters = (
+        "PC.00 address (1 from the factory), PC.01 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400; "
+        "3 from the factory), PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2, all RTU; 0 from the "
+        "factory); CHE100 manual v1.4"
+    )
     options = {
         "maximum_frequency": Option("Hz", (1, 3000), "P0.04, of which the setpoint is a percentage"),
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
@@ -228,6 +253,8 @@ class InvtCHE(Drive):
     )
     communication_fault = reading(0x5001, CommunicationFault, outside=CHE100_NEXT)
 
+    _jogged = False  # by this object, since it was last seen to stand
+
     @verb
     def identify(self) -> Script[None]:
         """3016H is 0101H or 0102H."""
@@ -238,8 +265,11 @@ class InvtCHE(Drive):
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
+        if self._jogged and not (yield from self._stands()):
+            raise Refused(f"{self.name} may still jog, which a start may not end: call stop() first")
         forward = yield from self._forward(direction)
         yield from self._setpoint_in_force()
+        self._jogged = False
         yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
         yield from self._started()
 
@@ -247,6 +277,7 @@ class InvtCHE(Drive):
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
         forward = yield from self._forward(direction)
+        self._jogged = True
         yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
         yield from self._started()
 

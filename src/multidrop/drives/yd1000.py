@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack

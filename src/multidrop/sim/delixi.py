@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.sim.dialect import COMMAND, QUERY, STATE, Reason, Refusal
+from multidrop.sim.dialect import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
 from multidrop.sim.memory import Cell
 from multidrop.sim.powered import PoweredDrive
 
@@ -14,11 +14,17 @@ BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
 MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # of P04.29, first ASCII, then RTU
 NATIVE_FORMATS = ("8N1", "8E1", "8O1")
 COMMANDS, STARTS = range(1, 5), (2, 3)  # what K = 02 may command
-BY_LINE = {0: 2, 1: 1}  # P00.00 and P00.01
+RUN_SOURCE, FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
+BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
+RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 
 
 class SimulatedDelixi(PoweredDrive):
-    """Standard Modbus: the document has no exceptions, so what cannot be done is not answered."""
+    """Standard Modbus: the document has no exceptions, so what cannot be done is not answered.
+
+    Not in the document: a run command is confirmed and has no effect in a fault and where P00.00 is not 2,
+    and the setpoint is 0 where P00.01 is not 1; a start ends a jog. Gaps are those of part 3.
+    """
 
     functions = (0x03, 0x06)
     codes = {}
@@ -31,7 +37,13 @@ class SimulatedDelixi(PoweredDrive):
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start == 0x2000  # run commands only
 
+    def setpoint(self) -> float:
+        by_line = self.word(FREQUENCY_SOURCE) == BY_LINE[FREQUENCY_SOURCE]
+        return super().setpoint() if by_line else 0.0
+
     def _control(self, bits: int) -> None:
+        if self.word(RUN_SOURCE) != BY_LINE[RUN_SOURCE]:
+            return
         self.run_or_stop(bits & 0x03, {0x10: 1, 0x20: -1, 0x30: -self.motor.direction}.get(bits & 0x30))
 
     def _format(self) -> int:
@@ -46,16 +58,29 @@ class SimulatedDelixi(PoweredDrive):
 
 
 class SimulatedDelixiNative(PoweredDrive):
-    """Delixi's own protocol: a set is answered with its copy, a query with what was asked for."""
+    """Delixi's own protocol: a set is answered with its copy, a query with what was asked for.
+
+    While `locked` is set, no parameter may be written: FEH. A run command cannot be executed (F0H) in a
+    fault, for a start, nor where P00.00 is not 2; of the latter the document says nothing. Nor does it say
+    what P00.01 does to K = 04: here the setpoint that was written last counts. Faults from 10 on are
+    shown as they are printed, as decimal digits, in their records too.
+    """
 
     begins = BY_LINE
+
+    def prepare(self) -> None:
+        self.locked = False
 
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == COMMAND
 
     def accept(self, cell: Cell, raw: int) -> int:
-        if cell.table.write == COMMAND and (raw not in COMMANDS or (raw in STARTS and self.motor.fault)):
-            raise Refusal(Reason.CANNOT)
+        if cell.table.write == COMMAND:
+            by_line = self.word(RUN_SOURCE) == BY_LINE[RUN_SOURCE]
+            if raw not in COMMANDS or not by_line or (raw in STARTS and self.motor.fault):
+                raise Refusal(Reason.CANNOT)
+        elif self.locked and cell.table.write in (SET, STORE):
+            raise Refusal(Reason.LOCKED)
         return super().accept(cell, raw)
 
     def changed(self, cell: Cell) -> None:
@@ -85,5 +110,13 @@ class SimulatedDelixiNative(PoweredDrive):
         (QUERY, 428): lambda self: BAUDRATES.index(self.drive.settings.baudrate),
         (QUERY, 429): lambda self: NATIVE_FORMATS.index(self.drive.settings.format),
         (QUERY, 430): lambda self: self.drive.address,
-        (QUERY, 0x0213): lambda self: int(str(self.motor.fault), 16),  # 10 is printed 00000010
+        (QUERY, 0x0213): lambda self: _printed(self.motor.fault),
+    } | {
+        (QUERY, address): lambda self, number=number: _printed(self.motor.fault_record(number))
+        for number, address in enumerate(RECORDS, start=1)
     }
+
+
+def _printed(fault: int) -> int:
+    """The count whose hex digits are the fault's decimal ones: 10 is printed 00000010."""
+    return int(str(fault), 16)
