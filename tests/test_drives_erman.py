@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import checksums
 import pytest
+from halls import one
 from scripts import Wire, frame, rows, typed
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 from multidrop.drives.erman_er_g_220 import Coil, ErmanERG220, Fault, Modes, Status
 from multidrop.errors import NoReply
-from multidrop.register import HOLDING, INPUT, Kept
+from multidrop.register import COIL, HOLDING, INPUT, Kept
 from multidrop.register import Wire as Lie
 
 START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7
@@ -50,6 +52,10 @@ TABLE = """
 03/06 000C acceleration_time       0.1 s
 03/06 000D deceleration_time       0.1 s
 03/06 0015 braking_threshold         1 V
+01/05 0000 start_held                - Coil
+01/05 0001 stop_held                 - Coil
+01/05 0002 emergency_stop_held       - Coil
+01/05 0009 fault_reset_held          - Coil
 """
 
 
@@ -61,7 +67,7 @@ def test_the_line_and_its_limits() -> None:
     drive = ErmanERG220(1)
     assert str(drive.settings) == "38400 8N1"
     assert ErmanERG220.addresses == range(1, 32)
-    assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17}
+    assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
     assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
     assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
     assert "write" in drive.exception(4)
@@ -257,5 +263,34 @@ def test_what_the_document_does_not_have(name: str) -> None:
     assert wire.sent == []
 
 
-def test_no_coil_is_read() -> None:
-    assert not any(it.readable for it in ErmanERG220.registers.values() if it.table.write == 0x05)
+def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The order of two bytes would be doubtful (section 6, the example of function 01)."""
+    hall, drive, sim = one(monkeypatch, ErmanERG220(1))
+    coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
+    assert not set(coils) & set(drive.readings())
+    held = hall.bus.read_many(drive, coils)
+    assert held == dict.fromkeys((it.name for it in coils), Coil.OFF)
+    asked = [frame for request, frame in hall.frames if request.function == 1]
+    assert asked == [checksums.rtu(it).hex(" ").upper() for it in ("01 01 00 00 00 03", "01 01 00 09 00 01")]
+    drive.set_frequency(20)
+    drive.start()
+    assert hall.bus.read(drive, drive.start_held) is Coil.ON
+    drive.stop()
+    assert hall.bus.read(drive, drive.start_held) is Coil.OFF
+    assert hall.bus.read(drive, drive.stop_held) is Coil.ON
+    for register in coils:
+        with pytest.raises(Refused, match="it is a reading"):
+            hall.bus.write(drive, register, Coil.ON)
+
+
+def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Function 08 by raw (section 8), its error reply as printed and as it should be."""
+    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
+    assert hall.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
+    assert hall.frames[-1][1] == "01 08 00 00 A5 37 DA 8D"
+    for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
+        hall.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
+        with pytest.raises(DriveRefused, match="unknown command"):
+            hall.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")

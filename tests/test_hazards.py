@@ -202,9 +202,9 @@ HAZARDS = [
         sends=("01 05 00 00 00 00", "01 05 00 09 FF 00", "01 05 00 09 00 00"),
     ),
     Hazard(
-        "E5: the coils' order in a reply to 01 is doubtful, so they are not read",
+        "E5: the order of bytes in a reply to 01 is doubtful, so that one byte at most is asked for",
         erman,
-        lambda hall, drive, sim: drive.state(),
+        lambda hall, drive, sim: hall.bus.read_many(drive, [drive.start_held, drive.fault_reset_held]),
         naive="01 01 00 00 00 0C",
     ),
     Hazard(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum, IntFlag
+from typing import Any
 
 from multidrop.drive import (
     BusError,
@@ -20,7 +21,7 @@ from multidrop.drive import (
     verb,
     write,
 )
-from multidrop.register import COIL, HOLDING, INPUT, Wire, command, reading, setting
+from multidrop.register import COIL, HOLDING, INPUT, Register, Wire, command, reading, setting
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 
@@ -81,8 +82,12 @@ class ErmanERG220(Drive):
       0002H; 0001H is never written.
     - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
       Coils are written one at a time (05), and reset and start are two calls.
-    - The order of coils in a reply to function 01 is doubtful: coils are not read. Whether the
+    - The order of the bytes in a reply to function 01 is doubtful: coils are read where one byte holds
+      them, and not polled unless that is asked for. They tell what was commanded. Whether the
       motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
+    - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
+      has the code 89H instead of 88H. `bus.raw(drive, 0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
+      a copy of the request, as an adapter's echo is: it does not prove that a drive is there.
     - The order of the two words at 0400H and 0402H is not stated; one of them is always 0.
     - 0402H is the last fault, and nothing says that a reset clears it, or that it is still in
       force. `start` is refused until that fault has been reset by this object's `reset_fault`, or
@@ -96,8 +101,8 @@ class ErmanERG220(Drive):
     - A setpoint is written between the minimum and the maximum frequency, for which the drive has no
       refusal.
 
-    No ranges, defaults, timing, nor what is kept in EEPROM are stated. Nor is it stated that
-    broadcasts stay without an answer, so there are none. b.001 and b.002 must select RS-485.
+    No ranges, defaults, timing, nor what is kept in EEPROM are stated. Address 0 is called the broadcast,
+    but not whether anybody answers it, so it is never sent. b.001 and b.002 must select RS-485.
     """
 
     model = "erman-er-g-220"
@@ -107,8 +112,13 @@ class ErmanERG220(Drive):
     formats = dict.fromkeys(Drive.framings, ("8N1",))
     baudrates = (38400,)
     remote = "b.001 must be 2 and b.002 5 (RS-485)"
+    line_parameters = (
+        "b.010 address (1 from the factory), set while the motor stands, in effect when the mains come back; "
+        "38400 bit/s and 1 stop bit are fixed, and there is no parity"
+    )
+    no_broadcasts = "the manual calls address 0 one, and does not say that nobody answers: none is sent"
     addresses = range(1, 32)
-    most_registers = {HOLDING: 88, INPUT: 17}
+    most_registers = {HOLDING: 88, INPUT: 17, COIL: 12}
     readable_gaps = {HOLDING: range(0x0000, 0x0059), INPUT: range(0x0000, 0x1000)}
     exceptions = {
         1: "unknown command",
@@ -190,7 +200,23 @@ class ErmanERG220(Drive):
         0x0015, "V", place="E.06; section 10, control: 21", note="Of dynamic braking."
     )
 
+    # The coils of the commands as they are held (sections 6 and 10); no gap is read across, so that all
+    # that is read at once lies in one byte
+    start_held = reading(0x0000, Coil, table=COIL, place="section 6, function 01; section 10, commands: 0")
+    stop_held = reading(0x0001, Coil, table=COIL, place="section 6, function 01; section 10, commands: 1")
+    emergency_stop_held = reading(
+        0x0002, Coil, table=COIL, place="section 6, function 01; section 10, commands: 2"
+    )
+    fault_reset_held = reading(
+        0x0009, Coil, table=COIL, place="section 6, function 01; section 10, commands: 9"
+    )
+
     _reset_fault = Fault(0)  # the last fault when this object reset it
+
+    @classmethod
+    def readings(cls) -> tuple[Register[Any], ...]:
+        """All but the coils, which tell what was commanded."""
+        return tuple(register for register in super().readings() if register.table is not COIL)
 
     @verb
     def identify(self) -> Script[None]:

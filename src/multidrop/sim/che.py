@@ -22,7 +22,8 @@ def _signed(raw: int) -> int:
 class SimulatedCHE(PoweredDrive):
     """The setpoint is a percentage of P0.04, which is the drive's option `maximum_frequency`.
 
-    `storing` s after a write to the EEPROM the drive is busy.
+    `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or the
+    jog's own stop do to a jog and to a run: here both stops end both, and a start ends a jog.
     """
 
     functions = (0x03, 0x06)

@@ -19,7 +19,9 @@ class SimulatedERMAN(PoweredDrive):
     """Coils keep what is written; START acts when it is written while neither stop is on.
 
     The manual does not say whether a coil is a level or a pulse. Here clearing START stops as
-    well, and neither clearing a stop nor a reset starts anything.
+    well, and neither clearing a stop nor a reset starts anything. Nor does it say when the motor counts as
+    overloaded (here above 1.2 times its rated current), or what the line's commands do where b.001
+    is not 2: here they are always obeyed.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
@@ -31,7 +33,6 @@ class SimulatedERMAN(PoweredDrive):
     }
 
     def prepare(self) -> None:
-        self.most[0x01] = 12
         self.memory.make_readable(COIL, COILS)
         self.memory.make_writable(COIL, COILS)
 
