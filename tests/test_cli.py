@@ -288,10 +288,12 @@ def test_models_lists_the_families(run: Run) -> None:
 def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
     _, out, _ = run("models", TOY)
     for line in (
-        "addresses     1-31",
-        "baud rates    9600, 19200 (the first is the default)",
-        "rtu formats   8N1, 8E1, 8O1, 8N2",
-        "verbs         start, stop, set-frequency, state",
+        "addresses       1-31",
+        "baud rates      9600, 19200 (the first is the default)",
+        "rtu formats     8N1, 8E1, 8O1, 8N2",
+        "rtu silence     3.5 characters, above 19200 bit/s 1.75 ms, before and after a",
+        "ascii silence   none",
+        "verbs           start, stop, set-frequency, state",
         "  02H  illegal address",
         "  rated_frequency  rated frequency of the motor (10 to 400 Hz)",
         "holding registers (read 03H, 10 at most; write 06H)",
@@ -314,6 +316,85 @@ def test_a_family_s_json_has_every_register(run: Run) -> None:
     assert by_name["acceleration_time"]["span"] == [0.1, 600]
     assert by_name["fault"]["values"] == {"NONE": 0, "OVERCURRENT": 1}
     assert by_name["mystery"]["step"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "facts"),
+    [
+        (
+            "erman-er-g-220",
+            [
+                "b.010 address (1 from the factory), set while the motor stands",
+                "remote b.001 must be 2 and b.002 5 (RS-485)",
+                "broadcast the manual calls address 0 one, and does not say that nobody answers: none",
+                "coils (read 01H, 12 at most; write 05H)",
+                "verbs alone write it, but for ON",
+                "(0 to 4294967295)",
+            ],
+        ),
+        (
+            "invt-che",
+            [
+                "PC.00 address (1 from the factory), PC.01 baud rate",
+                "PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2",
+                "remote P0.01 must be 2",
+                "verbs alone write it, but for STOP, COAST, STOP_JOG",
+            ],
+        ),
+        (
+            "innovert-ibd",
+            [
+                "rtu silence 10 ms before and after",
+                "ascii silence none",
+                "PrH.02 address",
+                "remote set Prb.01",
+            ],
+        ),
+        ("delixi-modbus", ["P04.30 address", "P00.00 must be 2 (RS-485), and P00.01 1", "0 ASCII_7N2"]),
+        ("delixi-native", ["delixi formats 8N1", "delixi silence none", "P00.00 must be 2", "0 N81, 1 E81"]),
+        (
+            "yd1000",
+            [
+                "24 characters (27.5 ms at 9600 bit/s) until measured; none after 500 ms",
+                "F802 address",
+                "at least minimum_frequency; at most maximum_frequency",
+                "but for COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
+                "never together: RESET and RUN, RESET and JOG",
+                "what it is from the factory is not stated",
+            ],
+        ),
+    ],
+)
+def test_a_sheet_has_what_is_to_be_set_on_the_drive_and_what_bounds_a_value(
+    run: Run, name: str, facts: list[str]
+) -> None:
+    """In a family's own words (section 3 of ERMAN's manual, 4.3 and 6.1 of the YD1000's notes)."""
+    _, out, _ = run("models", name)
+    shown = " ".join(out.split())
+    assert [fact for fact in facts if fact not in shown] == []
+    assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
+
+
+def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
+    _, out, _ = run("models", "yd1000", "--json")
+    sheet = json.loads(out)
+    by_name = {register["name"]: register for register in sheet["registers"]}
+    upper = by_name["upper_limit_frequency"]  # 0.5 to FH
+    assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
+    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # LL to UL
+    limits = {("minimum_frequency", "upper_limit_frequency")}
+    assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
+    assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
+    assert by_name["control"]["never_together"] == [0x2400, 0x2100]
+    assert by_name["acceleration_time"]["harmless"] is None
+    assert sheet["response_delay_s"] == pytest.approx(24 * 11 / 9600)
+    assert sheet["needed_silence_s"]["rtu"] == pytest.approx(24 * 11 / 9600)
+    assert "F802" in sheet["line_parameters"]
+    assert "reset_fault" in sheet["remote"]
+    _, out, _ = run("models", "delixi-native", "--json")
+    assert json.loads(out)["needed_silence_s"] == {"delixi": 0}
+    _, out, _ = run("models", "erman-er-g-220", "--json")
+    assert "address 0" in json.loads(out)["no_broadcasts"]
 
 
 @pytest.mark.parametrize("name", MODELS)

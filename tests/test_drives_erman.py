@@ -267,7 +267,7 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The order of two bytes would be doubtful (section 6, the example of function 01)."""
-    hall, drive, sim = one(monkeypatch, ErmanERG220(1))
+    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
     held = hall.bus.read_many(drive, coils)

@@ -11,12 +11,13 @@ from typing import Any
 
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import aligned
-from multidrop.drive import VERBS, Drive, Option
+from multidrop.drive import VERBS, Drive, Framing, Option
 from multidrop.drives import MODELS
 from multidrop.models import find_model
 from multidrop.register import Access, Kept, Register, Table
 
 WIDTH = 80
+INDENT = 16  # of a family's facts
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +54,9 @@ def _range(numbers: range) -> str:
 def _sheet(family: type[Drive]) -> str:
     lines = [family.title or family.__name__, *_paragraph(family.manual), ""]
     for name, text in _lines_of(family):
-        lines += textwrap.wrap(text, WIDTH, initial_indent=f"{name:<14}", subsequent_indent=" " * 14)
+        lines += textwrap.wrap(
+            text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT
+        )
     exceptions = {f"{code:02X}H": meaning for code, meaning in family.exceptions.items()}
     options = {name: _option(option) for name, option in family.options.items()}
     for heading, entries in (("exceptions", exceptions), ("options", options)):
@@ -79,16 +82,20 @@ def _notes(docstring: str) -> Iterator[str]:
 def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     yield "model", family.model or "(a file of your own)"
     yield "addresses", _range(family.addresses)
-    yield "baud rates", ", ".join(map(str, family.baudrates)) + " (the first is the default)"
+    default = " (the first is the default)" if len(family.baudrates) > 1 else ""
+    yield "baud rates", ", ".join(map(str, family.baudrates)) + default
     for framing, formats in family.formats.items():
         yield f"{framing} formats", ", ".join(formats)
-    yield "silence", _silence(family)
-    yield "response", f"{_ms(family.response_delay)} typical, none after {_ms(family.response_timeout)}"
-    broadcast = (
-        f"yes; then {_ms(family.turnaround_delay)} of pause" if family.broadcasts else "none documented"
-    )
-    yield "broadcast", broadcast
+    for framing in family.framings:
+        yield f"{framing} silence", _silence(family, framing)
+    yield "response", f"{_response_delay(family)} until measured; none after {_ms(family.response_timeout)}"
+    pause = f"yes; then {_ms(family.turnaround_delay)} of pause"
+    yield "broadcast", pause if family.broadcasts else family.no_broadcasts
     yield "verbs", ", ".join(_verbs(family)) or "none"
+    if family.line_parameters:
+        yield "line", family.line_parameters
+    if family.remote != Drive.remote:
+        yield "remote", family.remote
     yield "watchdog", family.watchdog
 
 
@@ -96,13 +103,29 @@ def _ms(seconds: float) -> str:
     return f"{seconds * 1e3:g} ms"
 
 
-def _silence(family: type[Drive]) -> str:
+def _silence(family: type[Drive], framing: Framing) -> str:
+    if not _needed_silence(family, framing):
+        return "none"
     own = []
     if family.silence:
         own.append(_ms(family.silence))
     if family.silence_characters:
         own.append(f"{family.silence_characters:g} characters")
-    return f"{' and '.join(own) or '3.5 characters (RTU)'} before and after a frame"
+    standard = "3.5 characters, above 19200 bit/s 1.75 ms,"
+    return f"{' and '.join(own) or standard} before and after a frame"
+
+
+def _needed_silence(family: type[Drive], framing: Framing) -> float:
+    """In s, at the family's default baud rate."""
+    return family(family.addresses[0], framing=framing).needed_silence()
+
+
+def _response_delay(family: type[Drive]) -> str:
+    if not family.response_delay_characters:
+        return _ms(family.response_delay)
+    drive = family(family.addresses[0])
+    at = f"{_ms(drive.response_delay)} at {drive.settings.baudrate} bit/s"
+    return f"{family.response_delay_characters:g} characters ({at})"
 
 
 def _verbs(family: type[Drive]) -> list[str]:
@@ -115,7 +138,8 @@ def _entries(entries: dict[str, str]) -> Iterator[str]:
 
 
 def _option(option: Option) -> str:
-    return f"{option.meaning} ({option.span[0]:g} to {option.span[1]:g} {option.unit}".rstrip() + ")"
+    low, high = (f"{end:d}" if isinstance(end, int) else f"{end:g}" for end in option.span)
+    return f"{option.meaning} ({low} to {high} {option.unit}".rstrip() + ")"
 
 
 def _table_heading(table: Table, family: type[Drive]) -> str:
@@ -155,17 +179,30 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
         yield f"written at {register.ram_address:04X}H, in RAM"
     if register.words > 1:
         yield f"{register.words} words, {register.wire.name}"
+    if register.at_least:
+        yield f"at least {register.at_least}"
+    if register.at_most:
+        yield f"at most {register.at_most}"
     if register.default is not None:
         yield f"from the factory {register.default:g}"
     if register.while_running is not None:
         yield "may change while running" if register.while_running else "only while stopped"
     if register.broadcast:
         yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
+    if register.harmless is not None:
+        harmless = ", ".join(register.format(register.decode(raw)) for raw in register.harmless)
+        yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"
+    if register.never_together:
+        yield "never together: " + ", ".join(_bits(register, mask) for mask in register.never_together)
     if register.never:
         yield f"never written: {register.never}"
     if register.values is not None:
         yield ", ".join(f"{member.value} {member.name}" for member in register.values)
     yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
+
+
+def _bits(register: Register[Any], mask: int) -> str:
+    return register.format(register.decode(mask)).replace("|", " and ")
 
 
 # ---- for programs ----
@@ -188,10 +225,13 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
         "formats": {str(framing): formats for framing, formats in family.formats.items()},
         "silence_s": family.silence,
         "silence_characters": family.silence_characters,
-        "response_delay_s": family.response_delay,
+        "needed_silence_s": {str(framing): _needed_silence(family, framing) for framing in family.framings},
+        "response_delay_s": family(family.addresses[0]).response_delay,
+        "response_delay_characters": family.response_delay_characters,
         "response_timeout_s": family.response_timeout,
         "turnaround_delay_s": family.turnaround_delay,
         "broadcasts": family.broadcasts,
+        "no_broadcasts": None if family.broadcasts else family.no_broadcasts,
         "most_registers": {table.name: most for table, most in family.most_registers.items()},
         "exceptions": family.exceptions,
         "options": {
@@ -199,6 +239,8 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
             for name, it in family.options.items()
         },
         "verbs": _verbs(family),
+        "line_parameters": family.line_parameters,
+        "remote": family.remote,
         "watchdog": family.watchdog,
         "registers": [_register(register) for register in family.registers.values()],
         "notes": inspect.cleandoc(family.__doc__ or ""),
@@ -215,6 +257,8 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "unit": register.unit,
         "step": register.step,
         "span": register.span,
+        "at_least": register.at_least or None,
+        "at_most": register.at_most or None,
         "values": None if names is None else {member.name: member.value for member in names},
         "wire": register.wire.name,
         "kept": register.kept.value,
@@ -222,6 +266,8 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "default": register.default,
         "while_running": register.while_running,
         "broadcast": register.broadcast,
+        "harmless": register.harmless,
+        "never_together": register.never_together,
         "never": register.never,
         "place": register.place,
         "outside": register.outside,

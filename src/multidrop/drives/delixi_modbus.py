@@ -77,6 +77,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     }
     exceptions = {}
     broadcasts = True
+    remote = "P00.00 must be 2 (RS-485), and P00.01 1 (digital setting)"
 
     control = command(
         0x2000,
