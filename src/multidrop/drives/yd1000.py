@@ -221,8 +221,8 @@ class YD1000(Drive):
     }
     watchdog = (
         "F803: trips with Err.5 when no valid message comes for 1 to 100 s, counted from the first one; 0 is "
-        "off, and what it is from the factory is not stated. It is communication_timeout here: longer "
-        "than the longest gap between two polls."
+        "off, and what it is from the factory is not stated. Set it, as communication_timeout, longer than "
+        "the longest gap between two polls."
     )
 
     # Section 6.1, basic parameters
