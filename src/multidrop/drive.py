@@ -190,11 +190,11 @@ class Drive:
     damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and those that say the drive will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
-    no_broadcasts: ClassVar[str] = "none documented"  # in words, where there are none
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
     line_parameters: ClassVar[str] = ""  # those for its address, baud rate and format
+    no_broadcasts: ClassVar[str] = "none documented"  # in words, where there are none
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
