@@ -142,7 +142,7 @@ def test_what_is_never_written() -> None:
         "it is effective from the panel only": {0x0001, 0x0007, 0x0015},
         "its scale is not stated": {0x0006, 0x0016},
         "it changes the drive's end of the line; set it on the panel": {0x0800, 0x0801, 0x0802},
-        "it sets others, which are not named": {0x0002},
+        "what it sets by itself is not stated": {0x0002},
         "it belongs to the command over the motor; set it on the panel": {
             0x0003,  # CNOD
             0x0004,  # FNOD
@@ -176,7 +176,10 @@ def test_an_extended_parameter_has_its_name_s_number() -> None:
     assert Mine.start_frequency.place == "6.2, F240"
     for register in YD1000.registers.values():
         if register.place.startswith("6.2, "):
-            assert extended(register.place.removeprefix("6.2, ")).address == register.address
+            name = register.place.removeprefix("6.2, ")
+            assert f"F{register.address:03X}" == name
+            with pytest.raises(ValueError, match=f"^{name} is declared by every YD1000, as {register.name}$"):
+                extended(name)  # nor is what is never written declared anew as writable
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
             extended(wrong)

@@ -135,9 +135,13 @@ def extended(name: str, unit: str = "", /, **details: Unpack[Details]) -> Regist
     """
     if not re.fullmatch(r"F[0-9]{3}", name):
         raise ValueError(f"{name!r} is no extended parameter, which is F and three digits, such as F170")
+    address = int(name[1:], 16)
+    for known in YD1000.registers.values():
+        if known.address == address:
+            raise ValueError(f"{name} is declared by every YD1000, as {known.name}")
     details["kept"] = Kept.EEPROM
     details.setdefault("place", f"6.2, {name}")
-    return setting(int(name[1:], 16), unit, **details)
+    return setting(address, unit, **details)
 
 
 def _parameter(place: str, more: Details) -> Details:
@@ -174,8 +178,8 @@ class YD1000(Drive):
     - Registers marked "panel only" are never written, although section 8.1 writes 0007H to initialise.
       0800H to 0802H neither: they are the drive's end of the line. 0800H and 0801H take effect after a
       reset or at the next power-on, 0802H and 0803H at once (section 7).
-    - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and AU3 sets
-      others, which are not named: they are read and never written.
+    - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and what AU3
+      sets by itself is not stated: they are read and never written.
     - 0803H, the watchdog, is written only while the motor stands (the document does not ask for that): a
       time shorter than the gap between two polls trips the drive.
     - The table of faults is missing: codes are shown as they are. Exceptions are a relative's, VF-S15's.
@@ -229,7 +233,7 @@ class YD1000(Drive):
     automatic_ramp = choice(0x0000, "6.1, AU1", 1, default=0)
     automatic_torque_boost = choice(0x0001, "6.1, AU2", default=0, while_running=False, never=PANEL)
     automatic_environment = choice(
-        0x0002, "6.1, AU3", 2, default=0, while_running=False, never="it sets others, which are not named"
+        0x0002, "6.1, AU3", 2, default=0, while_running=False, never="what it sets by itself is not stated"
     )
     command_mode = choice(0x0003, "6.1, CNOD", 1, default=1, never=COMMAND)
     frequency_mode = choice(0x0004, "6.1, FNOD", 2, default=2, never=COMMAND)
