@@ -17,6 +17,7 @@ import multidrop.cli.extra
 from multidrop.batch import Row
 from multidrop.look import Look, load, plot, plot_page, png, report_page
 from multidrop.look.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
+from multidrop.look.lanes import MOST_LANES
 from multidrop.look.used import used
 from multidrop.look.values import MOST_PANELS, MOST_POINTS, thinned
 from multidrop.plant import load_plant
@@ -144,12 +145,12 @@ def test_a_fault_is_a_span_that_misses_do_not_end(look: Look) -> None:
 
 def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> None:
     flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
-    about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "step": 1, "values": flags}}}}}
+    about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
     rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
     (series,) = load(record(tmp_path / "it.arrows", rows, about)).series
     assert [(it.what, it.end - it.begin) for it in series.faults()] == [
         ("HIGH HOT", 2 * SECOND),
-        ("code 128", SECOND),
+        ("bit 7", SECOND),
     ]
 
 
@@ -362,15 +363,98 @@ def test_zero_is_there_if_it_is_near(tmp_path: Path) -> None:
         assert low == bottom if bottom is not None else 0 < low < least
 
 
-def test_counts_that_have_names_are_named(tmp_path: Path) -> None:
-    states = {"unit": "", "step": 1, "values": {"FORWARD": 1, "STOPPED": 3, "REVERSE": 2}}
-    rows = [row(at, "pump", "status", value) for at, value in enumerate((3, 1, 1, 3))]
-    about = {"drives": {"pump": {"registers": {"status": states}}}}
-    (axes,) = plot(load(record(tmp_path / "it.arrows", rows, about)))[0].axes
-    assert [(it.get_position()[1], it.get_text()) for it in axes.get_yticklabels()] == [
-        (1, "forward"),
-        (3, "stopped"),
+STATUS = {  # the families' own, as their documents have them
+    "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
+    "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
+}
+
+
+def states(path: Path, rows: list[Row]) -> Look:
+    """A recording of two enumerations and one register of bits, all called status."""
+    meanings: dict[str, Any] = {
+        name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
+    }
+    meanings["yd"] = {"unit": "", "values": {"JOG": 4, "REVERSE": 2, "RUN": 16}, "bits": True}
+    about = {"drives": {name: {"registers": {"status": meaning}} for name, meaning in meanings.items()}}
+    return load(record(path / "it.arrows", rows, about))
+
+
+def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
+    """What stands in each lane, by its label: texts with their bars, in s since the first row."""
+    lanes = {text.get_text(): [] for text in axes.get_yticklabels()}
+    names = list(lanes)
+    bars: dict[int, list[tuple[float, float]]] = {}
+    for collection in axes.collections:
+        for path in collection.get_paths():
+            left, right = path.vertices[:, 0].min(), path.vertices[:, 0].max()
+            bars.setdefault(round(path.vertices[:, 1].mean()), []).append((left, right))
+    texts = {(round(at.xy[1]), at.xy[0]): at.get_text() for at in axes.texts}
+    epoch = min(left for found in bars.values() for left, _ in found)
+    for lane, found in bars.items():
+        for left, right in sorted(found):
+            span = ((left - epoch) * 86400, (right - epoch) * 86400)
+            lanes[names[lane]].append((texts.get((lane, left), ""), *(round(at, 2) for at in span)))
+    return lanes
+
+
+def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> None:
+    """3 is decelerating on one of them and standby on the other."""
+    rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
+    rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert drawn(axes) == {
+        "erman": [("stopped", 0, 1), ("accelerating", 1, 2), ("running", 2, 3), ("decelerating", 3, 5)],
+        "che": [("standby", 0, 2), ("forward", 2, 3), ("standby", 4, 5), ("", 5, 5)],
+    }
+    (ticks,) = axes.lines  # the miss, in its drive's lane
+    assert ticks.get_ydata()[0] == pytest.approx(1.4)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
+
+
+def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
+    rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert drawn(axes) == {  # from 1 s on, when the first one is set
+        "yd reverse": [("", 1, 4)],
+        "yd jog": [],
+        "yd run": [("", 0, 2)],
+        "yd bit 6": [("", 3, 4)],
+    }
+    assert axes.get_legend() is None
+
+
+def test_a_number_without_a_name_is_no_sum_of_others(tmp_path: Path) -> None:
+    """A fault that is not in the enumeration is not several others at once."""
+    series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
+    assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
+        "OVERHEAT",
+        "OVERLOAD",
+        "code 24",
+        "code 1e+308",
+        "code -1",
+        "code 0.5",
     ]
+
+
+def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
+    bits = {f"B{bit}": 1 << bit for bit in range(16)}
+    drives = [f"yd{number}" for number in range(80)]
+    meaning = {"unit": "", "values": bits, "bits": True}
+    about = {"drives": {name: {"registers": {"status": meaning}} for name in drives}}
+    rows = [row(at, name, "status", at) for at in range(2) for name in drives]
+    (axes,) = plot(load(record(tmp_path / "it.arrows", rows, about)))[0].axes
+    assert len(axes.get_yticklabels()) == MOST_LANES
+    assert axes.get_yticklabels()[0].get_text() == "yd0 b0"
+    assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
+
+
+def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
+    rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(100_000)]
+    rows[50_001] = row(500.01, "che", "status", 4)
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert len(drawn(axes)["che"]) == 3
+    order = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert order == ["fault"]
 
 
 def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Flag
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -96,7 +97,8 @@ def _described(line: Line, polled: PolledDrive) -> dict[str, Any]:
 def _meaning(register: Register[Any]) -> dict[str, Any]:
     values = {it.name: it.value for it in register.values} if register.values else None
     place = {"function": register.table.read, "address": register.address, "words": register.words}
-    return {"unit": register.unit, "step": register.step, "values": values, **place}
+    bits = register.values is not None and issubclass(register.values, Flag)
+    return {"unit": register.unit, "step": register.step, "values": values, "bits": bits, **place}
 
 
 class PlantError(ValueError):

@@ -13,6 +13,7 @@ from matplotlib.ticker import PercentFormatter
 from multidrop.core import UNASKED, Framing, Message, build_request
 from multidrop.look.recorded import Array, Look, Series
 from multidrop.look.style import COLOURS, TEXT, days, line_style, new_figure, tell_time, time_edges
+from multidrop.printable import printable
 from multidrop.timing import Settings
 
 MOST_REASONS = 6  # in a picture; the rest are one
@@ -57,7 +58,7 @@ def _request_seconds(look: Look, drive: str) -> float | None:
         baudrate, format = about["settings"].split()
         framing = {str(it): it for it in Framing}[about["framing"]]
         character = Settings(int(baudrate), format).character
-    except (KeyError, ValueError):
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
         return None
     message = Message(1, 7, data=bytes(4)) if framing is Framing.DELIXI else Message(1, 3, 0, 1)
     return (len(build_request(framing, message)) + 1) * character
@@ -72,7 +73,7 @@ def draw_delays(found: Sequence[Delays]) -> Figure:
         whis=(1, 99),
         widths=0.6,
         patch_artist=True,
-        tick_labels=[it.drive for it in found],
+        tick_labels=[printable(it.drive) for it in found],
         boxprops={"facecolor": "#CFE3F1", "edgecolor": COLOURS[0]},
         medianprops={"color": COLOURS[1], "linewidth": 1.6},
         whiskerprops={"color": COLOURS[0]},
@@ -96,7 +97,7 @@ def draw_rates(look: Look) -> Figure:
     middles = days(((edges[1:] + edges[:-1]) / 2).astype(np.int64))
     for number, drive in enumerate(look.drives):
         counts = sum(_counted(it.time[~it.missed], edges) for it in look.of(drive))
-        rates.plot(middles, counts / width, linewidth=1.3, label=drive, **line_style(number))
+        rates.plot(middles, counts / width, linewidth=1.3, label=printable(drive), **line_style(number))
     rates.set_title("values a second", loc="left", fontsize=10)
     rates.set_ylim(bottom=0)
     reasons = [reason for reason, _ in _reasons(look.series).most_common()]
@@ -110,7 +111,12 @@ def draw_rates(look: Look) -> Figure:
     misses.set_title("misses a second, by reason", loc="left", fontsize=10)
     if stacked:
         misses.stackplot(
-            middles, list(stacked.values()), labels=list(stacked), colors=_SHADES, step="mid", linewidth=0
+            middles,
+            list(stacked.values()),
+            labels=list(map(printable, stacked)),
+            colors=_SHADES,
+            step="mid",
+            linewidth=0,
         )
         misses.legend(fontsize=8, frameon=False, loc="upper left", ncols=3)
         misses.set_ylim(0, 1.35 * float(np.sum(list(stacked.values()), axis=0).max()))
@@ -151,10 +157,11 @@ def miss_shares(look: Look, drive: str) -> tuple[Array, Array] | None:
     """
     (frequency, *_) = (*look.of(drive, FREQUENCY), None)
     reasons = [it for it in reasons_of(look, drive) if not it.startswith(UNASKED)]
-    if frequency is None or frequency.missed.all() or not reasons:
+    if frequency is None or not reasons:
         return None
-    known_time, known = frequency.time[~frequency.missed], frequency.value[~frequency.missed]
-    if known.max() - known.min() < 1.0:
+    there = ~np.isnan(frequency.drawable)
+    known_time, known = frequency.time[there], frequency.value[there]
+    if not len(known) or known.max() - known.min() < 1.0:
         return None
     edges = np.linspace(known.min(), known.max(), BINS + 1)
     missed, asked = np.zeros(BINS), np.zeros(BINS)
@@ -178,7 +185,9 @@ def draw_miss_shares(look: Look) -> Figure | None:
     figure, (axes,) = new_figure([2.4])
     for number, (drive, found) in enumerate(shares.items()):
         if found:
-            axes.plot(*found, marker="o", markersize=4, linewidth=1.3, label=drive, **line_style(number))
+            axes.plot(
+                *found, marker="o", markersize=4, linewidth=1.3, label=printable(drive), **line_style(number)
+            )
     axes.set_ylim(bottom=0, top=max(0.01, axes.get_ylim()[1]))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_xlabel("output frequency of the drive, Hz", loc="left")

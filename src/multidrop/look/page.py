@@ -15,6 +15,7 @@ from multidrop.look.recorded import Look
 from multidrop.look.style import png
 from multidrop.look.used import Used, draw_used, used
 from multidrop.look.values import FAULTS, plot
+from multidrop.printable import printable
 
 SHORT = 32  # characters, in a cell that is not broken
 
@@ -59,8 +60,8 @@ def _page(title: str, parts: Sequence[str]) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>\n"
-        f"<h1>{html.escape(title)}</h1>\n" + "\n".join(parts) + "\n</body></html>\n"
+        f"<title>{_escape(title)}</title><style>{_STYLE}</style></head><body>\n"
+        f"<h1>{_escape(title)}</h1>\n" + "\n".join(parts) + "\n</body></html>\n"
     )
 
 
@@ -73,7 +74,7 @@ def _about(look: Look) -> str:
         f"From {begin:%Y-%m-%d %H:%M:%S} UTC, {_duration(look.seconds)}; "
         f"{_count(len(look.drives), 'drive')}; {_count(values, 'value')}, {_count(misses, 'miss', 'misses')}"
     )
-    return f'<p class="about">{html.escape(text + (f"; plant {plant}" if plant else ""))}</p>'
+    return f'<p class="about">{_escape(text + (f"; plant {plant}" if plant else ""))}</p>'
 
 
 def _count(number: int, one: str, many: str = "") -> str:
@@ -202,21 +203,24 @@ def _values(look: Look) -> Iterator[str]:
         return
     figure, left = plot(look)
     if left:
-        names = html.escape("; ".join(left))
+        names = _escape("; ".join(left))
         yield f"<p>Not shown: {names}. <code>multidrop plot --register NAME</code> shows each.</p>"
     yield _image(figure, "values over time")
+
+
+def _escape(text: str) -> str:
+    return html.escape(printable(text))
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A column whose head begins with # has numbers, which stand to the right."""
     kinds = [f' class="{_kind(column)}"' for column in zip(heads, *rows, strict=True)]
     head = "".join(
-        f"<th{kind}>{html.escape(text.removeprefix('#'))}</th>"
-        for kind, text in zip(kinds, heads, strict=True)
+        f"<th{kind}>{_escape(text.removeprefix('#'))}</th>" for kind, text in zip(kinds, heads, strict=True)
     )
     body = "\n".join(
         "<tr>"
-        + "".join(f"<td{kind}>{html.escape(cell)}</td>" for kind, cell in zip(kinds, row, strict=True))
+        + "".join(f"<td{kind}>{_escape(cell)}</td>" for kind, cell in zip(kinds, row, strict=True))
         + "</tr>"
         for row in rows
     )
@@ -231,4 +235,4 @@ def _kind(column: Sequence[str]) -> str:
 
 def _image(figure: Figure, what: str) -> str:
     data = base64.b64encode(png(figure)).decode()
-    return f'<img alt="{html.escape(what)}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{_escape(what)}" src="data:image/png;base64,{data}">'

@@ -16,6 +16,8 @@ from multidrop.batch import Row
 from multidrop.recording import open_reader
 
 RAW = "raw count"  # the unit where no document states the scale
+LARGEST = 1e150  # of what can be drawn: axes reckon with differences and products
+LARGEST_COUNT = 2**53  # that a column of values can hold exactly
 Array = NDArray[Any]
 
 
@@ -49,10 +51,21 @@ class Series:
     def has_values(self) -> bool:
         return not self.missed.all()
 
-    @property
+    @cached_property
+    def drawable(self) -> Array:
+        """Its values, and NaN also for those that are too large for a picture."""
+        return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
+
+    @cached_property
     def names(self) -> dict[int, str]:
         """What its counts mean, where they have names."""
-        return {number: name for name, number in (self.meaning.get("values") or {}).items()}
+        names: Mapping[str, int] = self.meaning.get("values") or {}
+        return {number: name for name, number in names.items()}
+
+    @property
+    def is_bits(self) -> bool:
+        """Its count is a sum of bits, each with a meaning of its own."""
+        return bool(self.names) and self.meaning.get("bits") is True
 
     @property
     def unit(self) -> str:
@@ -86,12 +99,17 @@ class Series:
         ]
 
     def name_of(self, value: float) -> str:
-        """The name of a count; of flags those that are set; or the number itself."""
+        """The name of a count; of bits those that are set; or the number itself."""
+        if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
+            return f"code {value:g}"
         number = int(value)
         if number in self.names:
             return self.names[number]
-        flags = [name for bit, name in self.names.items() if bit and bit & number == bit]
-        return " ".join(flags) or f"code {number}"
+        if not self.is_bits:
+            return f"code {number}"
+        return " ".join(
+            self.names.get(1 << bit, f"bit {bit}") for bit in range(number.bit_length()) if number >> bit & 1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +179,7 @@ def load(path: str | Path) -> Look:
     drive, register, status, time, value, uncertainty = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
-    about = reader.metadata.get("drives", {})
+    metadata = {**reader.metadata, "drives": _described(reader.metadata.get("drives"))}
     statuses = tuple(names["status"])
     series = []
     pair = drive.astype(np.int64) * len(names["register"]) + register
@@ -170,7 +188,7 @@ def load(path: str | Path) -> Look:
         rows_of = rows_of[np.argsort(time[rows_of], kind="stable")]
         drive_name = names["drive"][key // len(names["register"])]
         register_name = names["register"][key % len(names["register"])]
-        meaning = about.get(drive_name, {}).get("registers", {}).get(register_name, {})
+        meaning = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})
         series.append(
             Series(
                 drive_name,
@@ -183,7 +201,33 @@ def load(path: str | Path) -> Look:
                 meaning,
             )
         )
-    return Look(Path(path), reader.metadata, tuple(series), reader.torn)
+    return Look(Path(path), metadata, tuple(series), reader.torn)
+
+
+def _described(drives: object) -> dict[str, Any]:
+    """What the metadata says of drives and registers, without what `Plant.metadata` would not write."""
+    found = {}
+    for name, about in _tables(drives):
+        registers = {register: _meaning(meaning) for register, meaning in _tables(about.get("registers"))}
+        found[name] = {**about, "registers": registers}
+    return found
+
+
+def _tables(tables: object) -> list[tuple[str, dict[str, Any]]]:
+    if not isinstance(tables, dict):
+        return []
+    return [(name, table) for name, table in tables.items() if isinstance(table, dict)]
+
+
+def _meaning(meaning: dict[str, Any]) -> dict[str, Any]:
+    values = meaning.get("values")
+    if not isinstance(values, dict):
+        return {**meaning, "values": None}
+    return {**meaning, "values": {name: count for name, count in values.items() if _is_count(count)}}
+
+
+def _is_count(count: object) -> bool:
+    return isinstance(count, int) and not isinstance(count, bool) and 0 <= count < LARGEST_COUNT
 
 
 def _numbers(column: Any) -> Array:

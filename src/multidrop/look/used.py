@@ -13,6 +13,11 @@ from matplotlib.ticker import PercentFormatter
 from multidrop.core import Framing, Message, reply_length
 from multidrop.look.recorded import Array, Look
 from multidrop.look.style import days, line_style, new_figure, tell_time, time_edges
+from multidrop.printable import printable
+
+_LINE_FIGURES = ("utilisation", "cycle_ms")
+_DRIVE_FIGURES = ("exchanges_per_second", "silence_ms", "character_ms")
+MOST_FIGURE = 1e9  # a plan that says more is none of ours
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +27,7 @@ class Used:
     line: str
     planned: Mapping[str, Any]
     time: Array  # ns UTC
-    needed: Array  # s: silence before it, request, response delay, reply
+    needed: Array  # s: request, response delay, reply, silence after it; never more than it took
     asked: Mapping[str, int]  # exchanges that were answered, by drive
     values: int  # in their replies
     seconds: float
@@ -47,11 +52,27 @@ def used(look: Look) -> list[Used]:
     """Of every line whose plan the recording carries; none, where that is not as it was written."""
     try:
         return [_used(look, line, planned) for line, planned in look.metadata.get("planned", {}).items()]
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError):
         return []
 
 
+def _checked(planned: Mapping[str, Any]) -> dict[str, Any]:
+    """The same plan, if its figures are some; else an error of the kinds that `used` expects."""
+    drives = {
+        name: {**drive, **{key: _figure(drive[key]) for key in _DRIVE_FIGURES}}
+        for name, drive in planned["drives"].items()
+    }
+    return {**planned, **{key: _figure(planned[key]) for key in _LINE_FIGURES}, "drives": drives}
+
+
+def _figure(number: float) -> float:
+    if not 0 <= number < MOST_FIGURE:
+        raise ValueError(number)
+    return float(number)
+
+
 def _used(look: Look, line: str, planned: Mapping[str, Any]) -> Used:
+    planned = _checked(planned)
     parts: list[tuple[Array, Array, Array]] = []
     asked, values = {}, 0
     for name, drive in planned["drives"].items():
@@ -65,7 +86,9 @@ def _used(look: Look, line: str, planned: Mapping[str, Any]) -> Used:
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
     if len(time):  # the longer of two neighbours' silences is kept
-        needed = needed + np.maximum(silence, np.concatenate([silence[:1], silence[:-1]]))
+        needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
+        # A port that is faster than its settings, such as a network's, needs no more than it took.
+        needed[:-1] = np.minimum(needed[:-1], np.diff(time) / 1e9)
     end = float(needed[-1]) if len(time) else 0.0
     return Used(line, planned, time, needed, asked, values, max(look.seconds + end, 1e-9))
 
@@ -109,9 +132,9 @@ def draw_used(found: Sequence[Used], look: Look) -> Figure:
     for number, it in enumerate(found):
         share = np.histogram(it.time, edges, weights=it.needed)[0] / width
         colour = line_style(number)["color"]
-        axes.plot(middles, share, linewidth=1.3, color=colour, label=it.line)
+        axes.plot(middles, share, linewidth=1.3, color=colour, label=printable(it.line))
         planned = min(it.planned["utilisation"], 1.0)
-        label = f"{it.line}, planned"
+        label = f"{printable(it.line)}, planned"
         axes.axhline(planned, linewidth=1.0, linestyle="dashed", color=colour, label=label)
     axes.set_ylim(0, 1.08)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))

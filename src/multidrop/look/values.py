@@ -1,4 +1,4 @@
-"""The picture of a recording's values: a panel a quantity, misses marked, faults as spans."""
+"""The picture of a recording's values: a panel a quantity, states as lanes, faults and misses marked."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from multidrop.look.lanes import draw_lanes, lanes_inches, lanes_of, name_bar
 from multidrop.look.recorded import RAW, Array, Look, Series
 from multidrop.look.style import FAULT, GRID, TEXT, day, days, line_style, new_figure, tell_time
+from multidrop.printable import printable
 
 FIRST = (  # shown before others when there are more than fit
     "output_frequency",
@@ -27,10 +29,10 @@ FIRST = (  # shown before others when there are more than fit
 MOST_PANELS = 8
 MOST_POINTS = 4000  # of a line: more cannot be seen
 FEW_POINTS = 200  # each has a dot of its own
-MOST_NAMED = 12  # values of an enumeration that are named beside the axis
 FAULTS = "fault"
 
-Panel = tuple[str, str]  # register, unit
+CURVES_INCHES = 1.9
+Panel = tuple[str, str, bool]  # register, unit, and whether its counts are states, which have names
 
 
 def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) -> tuple[Figure, list[str]]:
@@ -49,25 +51,49 @@ def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) 
     shown, left = panels[:MOST_PANELS], panels[MOST_PANELS:]
     if registers:
         shown, left = panels, []
-    names = sorted({it.drive for it in chosen}, key=look.drives.index)
     told = [it for it in chosen if it.register == FAULTS]
     faults = [it for it in told if it.faults()] or ([] if shown else told)
     strip = [0.35 + 0.22 * len(faults)] if faults else []
-    figure, axes = new_figure([*strip, *([1.9] * len(shown))], sharex=True)
+    contents = [[it for it in chosen if _panel(it) == panel] for panel in shown]
+    lanes_by_panel = [
+        lanes_of(series) if panel[2] else ([], 0) for panel, series in zip(shown, contents, strict=True)
+    ]
+    heights = [lanes_inches(lanes) if lanes else CURVES_INCHES for lanes, _ in lanes_by_panel]
+    figure, axes = new_figure([*strip, *heights], sharex=True)
     spans = [(it, span) for it in faults for span in it.faults()]
     if faults:
         _draw_faults(axes[0], faults, look)
-    for panel, one in zip(shown, axes[len(strip) :], strict=True):
-        _draw_panel(one, panel, [it for it in chosen if (it.register, it.unit) == panel], look)
+    for panel, series, (lanes, hidden), one in zip(
+        shown, contents, lanes_by_panel, axes[len(strip) :], strict=True
+    ):
+        if panel[2]:
+            note = f" ({hidden} more lanes: choose with --drive)" if hidden else ""
+            one.set_title(f"{_title(panel)}{note}", loc="left", fontsize=10)
+            draw_lanes(one, lanes, look)
+        else:
+            _draw_panel(one, panel, series, look)
         for _, span in spans:
             one.axvspan(day(span.begin), day(span.end), color=FAULT, alpha=0.08, lw=0)
     tell_time(axes[-1])
     axes[-1].set_xlim(day(look.begin), day(max(look.end, look.begin + 1_000_000)))
-    handles = [Line2D([], [], label=name, **line_style(look.drives.index(name))) for name in names]
+    curves = {
+        it.drive for panel, series in zip(shown, contents, strict=True) for it in series if not panel[2]
+    }
+    handles = [
+        Line2D([], [], label=printable(name), **line_style(number))
+        for number, name in enumerate(look.drives)
+        if name in curves
+    ]
     if any(it.missed.any() for it in chosen):
         handles.append(Line2D([], [], color=TEXT, marker="|", linestyle="", label="missed"))
-    figure.legend(handles=handles, loc="outside upper left", ncols=min(6, len(handles)), frameon=False)
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=min(6, max(1, len(handles))), frameon=False
+    )
     return figure, [_title(panel) for panel in left]
+
+
+def _panel(series: Series) -> Panel:
+    return series.register, series.unit, bool(series.names)
 
 
 def _check(what: str, given: Sequence[str], known: Sequence[str]) -> None:
@@ -83,33 +109,32 @@ def _told(series: Sequence[Series]) -> str:
 
 def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
     """One for each register and unit: amperes and per cent do not share an axis."""
-    found = dict.fromkeys(
-        (it.register, it.unit) for it in chosen if not registers or it.register in registers
-    )
+    found = dict.fromkeys(_panel(it) for it in chosen if not registers or it.register in registers)
     order = {name: at for at, name in enumerate(registers or FIRST)}
     return sorted(found, key=lambda panel: (order.get(panel[0], len(order)), panel[1] == RAW))
 
 
 def _title(panel: Panel) -> str:
-    return f"{panel[0]}, {panel[1]}" if panel[1] else panel[0]
+    return printable(f"{panel[0]}, {panel[1]}" if panel[1] else panel[0])
 
 
 def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], look: Look) -> None:
-    axes.set_title(_title(panel), loc="left", fontsize=10)
+    too_large = sum(int((np.isnan(it.drawable) & ~it.missed).sum()) for it in series)
+    note = f" ({too_large} values of 1e150 and more are not drawn)" if too_large else ""
+    axes.set_title(f"{_title(panel)}{note}", loc="left", fontsize=10)
     for it in series:
-        time, value = thinned(it.time, it.value)
+        time, value = thinned(it.time, it.drawable)
         style = line_style(look.drives.index(it.drive))
-        drawstyle = "steps-post" if it.names else "default"
         marker = "." if len(time) < FEW_POINTS else ""
-        axes.plot(days(time), value, linewidth=1.3, drawstyle=drawstyle, marker=marker, markersize=3, **style)
+        axes.plot(days(time), value, linewidth=1.3, marker=marker, markersize=3, **style)
     _mark_misses(axes, series, look)
     _fit(axes, series)
-    _name_values(axes, series)
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
     """Counts stand at whole numbers; a value that never changes is no tiny span; 0 is there if it is near."""
-    seen = np.concatenate([it.value[~it.missed] for it in series])
+    drawn = np.concatenate([it.drawable for it in series])
+    seen = drawn[~np.isnan(drawn)]
     if not len(seen):
         axes.set_yticks([])
         axes.text(0.5, 0.5, "no value", transform=axes.transAxes, ha="center", va="center", color=TEXT)
@@ -143,15 +168,6 @@ def _mark_misses(axes: Axes, series: Sequence[Series], look: Look) -> None:
             )
 
 
-def _name_values(axes: Axes, series: Sequence[Series]) -> None:
-    names = {number: name for it in series for number, name in it.names.items()}
-    seen = {float(value) for it in series for value in np.unique(it.value[~it.missed])}
-    named = sorted(number for number in seen if number in names)
-    if named and len(named) <= MOST_NAMED:
-        axes.set_yticks(named, [names[int(number)].lower() for number in named], fontsize=8)
-        axes.set_ylim(named[0] - 0.5, named[-1] + 0.5)
-
-
 def _draw_faults(axes: Axes, series: Sequence[Series], look: Look) -> None:
     """A row for each drive; a bar with its name while there is one."""
     axes.set_title("faults" if any(it.faults() for it in series) else "faults: none", loc="left", fontsize=10)
@@ -159,17 +175,8 @@ def _draw_faults(axes: Axes, series: Sequence[Series], look: Look) -> None:
         for span in it.faults():
             begin, end = day(span.begin), day(span.end)
             axes.barh(row, end - begin, left=begin, height=0.7, color=FAULT, alpha=0.85)
-            axes.annotate(
-                span.what.lower(),
-                (begin, row),
-                xytext=(3, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=7.5,
-                color="white",
-                clip_on=True,
-            )
-    axes.set_yticks(range(len(series)), [it.drive for it in series], fontsize=8)
+            name_bar(axes, printable(span.what).lower(), begin, row)
+    axes.set_yticks(range(len(series)), [printable(it.drive) for it in series], fontsize=8)
     axes.set_ylim(len(series) - 0.5, -0.5)
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
 
