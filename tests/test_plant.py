@@ -419,8 +419,10 @@ def test_a_file_that_tomllib_chokes_on_is_a_sentence(tmp_path: Path, text: str, 
 
 
 def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> None:
-    (sentence,) = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
-    assert sentence.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
+    name, address = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
+    assert name.startswith(r'line "L", drive "D\n\x1b[2J": name = ')
+    assert name.endswith("has characters that do not print; leave them out")
+    assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
 
 
 def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:

@@ -213,7 +213,8 @@ def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
 # ---- any rows at all ----
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
-NAME = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+ANY = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+NAME = ANY | st.text("'=+-@\t\r\nx", max_size=4)  # what a spreadsheet may take for a formula
 SAMPLE = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.floats(allow_nan=False), st.just("ok"))
 NO_NUMBER = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.just(math.nan), st.just("ok"))
 MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
@@ -247,6 +248,11 @@ def test_any_batches_converted(
     assert repr(rows(open_reader(folder / f"b{target}"))) == repr(written)
 
 
+def as_text(name: str) -> str:
+    """As it stands in a cell: no spreadsheet takes it for a formula."""
+    return f"'{name}" if name.lstrip("'")[:1] in tuple("=+-@\t\r\n") else name
+
+
 @settings(max_examples=60, deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
 def test_any_csv_means_the_same_to_another_reader(
@@ -258,12 +264,28 @@ def test_any_csv_means_the_same_to_another_reader(
     with path.open(encoding="utf-8", newline="") as file:
         found = list(csv.DictReader(file))
     assert [(row["drive"], row["register"], row["status"]) for row in found] == [
-        (row.drive, row.register, row.status) for row in some
+        tuple(map(as_text, (row.drive, row.register, row.status))) for row in some
     ]
     for row, expected in zip(found, some, strict=True):
         second = datetime.fromisoformat(row["time"][:19] + "+00:00")
         assert int(second.timestamp()) * 10**9 + int(row["time"][20:29]) == expected.time
         assert (float(row["value"]) if row["value"] else None) == expected.value
+
+
+FORMULAS = ("=1+1", "+cmd|' /C calc'!A0", "-2", "@SUM(A1)", "\t=1", "\r=1", "'=1", "''-", "'old'", "a=b", "")
+
+
+def test_no_text_of_a_csv_is_a_formula_and_all_come_back(tmp_path: Path) -> None:
+    some = [Row(1, 1, None, name, name, None, name) for name in FORMULAS]
+    with open_writer(tmp_path / "a.csv", {}) as writer:
+        writer.write(from_rows(some))
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        found = [tuple(row[name] for name in ("drive", "register", "status")) for row in csv.DictReader(file)]
+    cells = [drive for drive, _, _ in found]
+    assert found == [(cell, cell, cell) for cell in cells]
+    assert not [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert cells[6:] == ["''=1", "'" + "''-", "'old'", "a=b", ""]
+    assert rows(open_reader(tmp_path / "a.csv")) == some
 
 
 # ---- converting ----

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from multidrop.printable import printable
+
 T = TypeVar("T")
 
 
@@ -69,9 +71,7 @@ class Place:
     def wrong(self, sentence: object) -> None:
         """This is a mistake. What a terminal would not print as it stands is spelt out."""
         text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
-        self.mistakes.append(
-            f"{self.path}: {''.join(it if it.isprintable() else repr(it)[1:-1] for it in text)}"
-        )
+        self.mistakes.append(f"{self.path}: {printable(text)}")
 
     def once(self, *what: object, sentence: str) -> None:
         """It is a mistake if this has been seen before; `{first}` in the sentence is where."""
@@ -101,6 +101,8 @@ class Place:
                     self.wrong(f"{name!r} is missing; add {key.example}")
             elif isinstance(value, bool) or not isinstance(value, key.kind) or value in ("", []):
                 self.wrong(f"{name} = {value!r} is not right; write {key.example}")
+            elif isinstance(value, str) and not value.isprintable():
+                self.wrong(f"{name} = {value!r} has characters that do not print; leave them out")
             else:
                 good[name] = value
         return good

@@ -1,9 +1,14 @@
-"""Finds a family by the name that a person writes: a built-in one, or a class in a file of their own."""
+"""Finds a family by the name that a person writes: a built-in one, or a class in a file of their own.
+
+A file of one's own is a program: looking a class up in it runs it, with all the rights of whoever asks.
+Each file that is run is told to the logger `multidrop.models`, before.
+"""
 
 from __future__ import annotations
 
 import difflib
 import importlib.util
+import logging
 import sys
 import traceback
 from functools import cache
@@ -17,7 +22,7 @@ from multidrop.drives import MODELS
 def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     """The family called `text`: one of MODELS, or "path/to/file.py:Class".
 
-    A relative path begins at `relative_to`, or at the working directory.
+    A relative path begins at `relative_to`, or at the working directory. The file is run, once a process.
     Raises ValueError, also for whatever the file itself does wrong.
     """
     if text in MODELS:
@@ -66,6 +71,7 @@ def _load_once(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path} cannot be loaded as Python")
+    logging.getLogger(__name__).info("%s is run as Python: a model of one's own is a program", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     try:

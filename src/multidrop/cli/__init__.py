@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -16,6 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Refused, Unsupported
+from multidrop.printable import printable
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
@@ -70,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"multidrop {version('multidrop')}")
         return DONE
-    with _sigterm_as_interrupt():
+    with _sigterm_as_interrupt(), _telling_what_is_run():
         return _guarded(words[0], words[1:])
 
 
@@ -128,7 +130,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _say(sentences: str, status: int) -> int:
     for sentence in sentences.splitlines():
-        print(f"multidrop: {sentence}", file=sys.stderr)
+        print(f"multidrop: {printable(sentence)}", file=sys.stderr)
     return status
 
 
@@ -136,6 +138,27 @@ def _abandon_output() -> None:
     """Nothing more can be written to stdout: keep the interpreter from trying when it ends."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class _OnStderr(logging.Handler):
+    """Says what is logged as all else is said."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        _say(record.getMessage(), DONE)
+
+
+@contextmanager
+def _telling_what_is_run() -> Iterator[None]:
+    """Say which files with models of the user's own are run, which they are for every command."""
+    logger, handler = logging.getLogger("multidrop.models"), _OnStderr()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 @contextmanager

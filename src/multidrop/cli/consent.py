@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from multidrop.errors import Refused
+from multidrop.printable import printable
 
 
 def ask(question: str, arguments: argparse.Namespace) -> None:
@@ -14,6 +15,6 @@ def ask(question: str, arguments: argparse.Namespace) -> None:
         return
     if not sys.stdin.isatty():
         raise Refused(f"{question} There is no terminal to ask on: add --yes if it is meant")
-    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise Refused("nothing was sent")

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.torn import tell_torn
 from multidrop.recording import FORMATS, convert, open_reader
 
@@ -19,5 +20,5 @@ def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     rows = convert(arguments.source, arguments.target)
     tell_torn(arguments.source, rows, open_reader(arguments.source).torn)
-    print(f"{rows} rows in {arguments.target}")
+    say(f"{rows} rows in {arguments.target}")
     return 0

@@ -12,6 +12,7 @@ from typing import Any
 from multidrop.capture import Capture, Decoding
 from multidrop.cli.overheard import replay, summary
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.plant import Plant, load_plant
 from multidrop.recording import open_writer
@@ -34,13 +35,13 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             counts = dict(replay(capture, plant, as_json=arguments.json))
         if capture.torn:
-            print(
+            say(
                 f"multidrop: {capture.path} is cut: its last {capture.torn} bytes are no whole packet, "
                 "and were left out",
                 file=sys.stderr,
             )
     into = f"{counts['rows']} rows in {arguments.out}: " if arguments.out else ""
-    print(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
+    say(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
     return 0
 
 

@@ -22,6 +22,7 @@ from multidrop.cli.findings import (
     round_trip_finding,
     rs485_finding,
 )
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.core import Exchange, Framing, Message, Respondent, build_request
 from multidrop.drive import Drive
@@ -56,9 +57,9 @@ def run(arguments: argparse.Namespace) -> int:
     settings = drive.settings if drive else _line_settings(arguments)
     findings = list(_findings(arguments.port, drive, settings))
     if arguments.json:
-        print(json.dumps({"port": arguments.port, "findings": [asdict(it) for it in findings]}, indent=2))
+        say(json.dumps({"port": arguments.port, "findings": [asdict(it) for it in findings]}, indent=2))
     else:
-        print("\n".join(_text(findings)))
+        say("\n".join(_text(findings)))
     return 1 if any(it.is_failure for it in findings) else 0
 
 

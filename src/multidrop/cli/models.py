@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import aligned
 from multidrop.drive import VERBS, Drive, Framing, Option
@@ -28,10 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
         families = list(MODELS.values())
-        print(json.dumps([_summary(it) for it in families], indent=2) if arguments.json else _list(families))
+        say(json.dumps([_summary(it) for it in families], indent=2) if arguments.json else _list(families))
     else:
         family = find_model(arguments.model)
-        print(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
+        say(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
     return 0
 
 

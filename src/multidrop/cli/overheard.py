@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from multidrop.capture import Capture, CaptureWriter, Overheard, Pairing, Side
 from multidrop.capture.meaning import Meanings, line_of
 from multidrop.capture.text import Teller
+from multidrop.cli.saying import say
 from multidrop.core import Heard, Kind, Span, Splitter
 from multidrop.plant import Line, Plant
 
@@ -51,9 +52,9 @@ class Ear:
     def _print(self, told: Iterable[Overheard]) -> None:
         for it in told:
             if self._as_json:
-                print(json.dumps({"line": self.name} | self._teller.json(it)))
+                say(json.dumps({"line": self.name} | self._teller.json(it)))
             else:
-                print(self._teller.text(it))
+                say(self._teller.text(it))
         sys.stdout.flush()
 
 

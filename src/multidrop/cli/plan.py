@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import Row, aligned
 from multidrop.plant import Line, load_plant
@@ -32,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     plans = [_plan(line) for line in load_plant(arguments.plant).lines]
     if arguments.json:
-        print(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
+        say(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
     else:
-        print("\n\n".join("\n".join(_text(plan)) for plan in plans))
+        say("\n\n".join("\n".join(_text(plan)) for plan in plans))
     return 0 if all(plan.prediction.fits for plan in plans) else 1
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from multidrop.cli.extra import need
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.torn import tell_torn
 
 SUFFIXES = (".png", ".html")
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         out.write_bytes(png(figure))
     else:
         out.write_text(plot_page(look, figure), "utf-8")
-    print(out)
+    say(out)
     if left:
-        print(f"not shown: {'; '.join(left)} (choose with --register)")
+        say(f"not shown: {'; '.join(left)} (choose with --register)")
     return 0

@@ -16,6 +16,7 @@ from multidrop.cli.comparison import compared, comparison_text
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.live import LiveTable
 from multidrop.cli.overwriting import check_capture, refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.tapping import Tapping, tapping_text
 from multidrop.cli.target import add_json_argument, duration
 from multidrop.cli.values import aligned
@@ -93,7 +94,7 @@ def conclude(plant: Plant, told: Mapping[str, Any], arguments: argparse.Namespac
     summary = {**told, "recording": str(arguments.out) if arguments.out else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compared(line, summary["lines"][line.name])
-    print(json.dumps(summary, indent=2) if arguments.json else _text(summary))
+    say(json.dumps(summary, indent=2) if arguments.json else _text(summary))
     return 0 if summary["samples"] else 1
 
 

@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument, add_target_arguments, drive_of
 from multidrop.cli.values import aligned, as_json, as_row
 from multidrop.drive import Drive
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         bus.attach(drive)
         values = _read(bus, drive, wanted)
     refused = [answer for answer in values.values() if isinstance(answer, DriveRefused)]
-    print(_json(drive, values) if arguments.json else _text(drive, values))
+    say(_json(drive, values) if arguments.json else _text(drive, values))
     return 1 if refused else 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from multidrop.cli.extra import need
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.torn import tell_torn
 
 
@@ -28,5 +29,5 @@ def run(arguments: argparse.Namespace) -> int:
     look = load(arguments.recording)
     tell_torn(look.path, look.rows, look.torn)
     out.write_text(report_page(look), "utf-8")
-    print(out)
+    say(out)
     return 0

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from multidrop.cli.overwriting import check_writable
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
@@ -76,11 +77,11 @@ def run(arguments: argparse.Namespace) -> int:
     plant = _write(arguments.out, arguments.port, found, families)
     told = {"port": arguments.port, "seconds": round(time.monotonic() - begun, 3), "finished": finished}
     if arguments.json:
-        print(json.dumps(told | _as_json(found) | {"plant": plant}, indent=2))
+        say(json.dumps(told | _as_json(found) | {"plant": plant}, indent=2))
     else:
-        print(_summary(found, told["seconds"], arguments.addresses))
+        say(_summary(found, told["seconds"], arguments.addresses))
         if plant:
-            print(f"{plant} is ready: multidrop poll {plant}")
+            say(f"{plant} is ready: multidrop poll {plant}")
     if not finished:
         raise KeyboardInterrupt
     return 0 if any(isinstance(it, Found) for it in found) else 1
@@ -124,7 +125,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
         if said and sys.stderr.isatty():
             print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
         if not silent:
-            print(sentence(finding), flush=True)
+            say(sentence(finding), flush=True)
         yield finding
     if said and sys.stderr.isatty():
         print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
@@ -137,7 +138,7 @@ def _tell(progress: Progress, said: str, stream: TextIO) -> str:
         text = f"{setting}, address {progress.address}; {_duration(progress.left)} left"
         print(f"{_CLEAR_LINE}{text}", end="", file=stream, flush=True)
     elif setting != said:
-        print(f"{setting}; {_duration(progress.left)} left", file=stream, flush=True)
+        say(f"{setting}; {_duration(progress.left)} left", file=stream, flush=True)
     return setting
 
 

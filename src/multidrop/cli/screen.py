@@ -13,6 +13,7 @@ from typing import Any
 from rich.text import Text
 
 from multidrop.cli.watched import CURRENT, FREQUENCY, Watched, WatchedPlant
+from multidrop.printable import printable
 from multidrop.register import Register
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
@@ -84,7 +85,7 @@ def page(
 
 def _title(plant: WatchedPlant, width: int, now_ns: int) -> Text:
     clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
-    text = f" multidrop monitor  {plant.plant.path.name}"[: width - len(clock)]
+    text = f" multidrop monitor  {printable(plant.plant.path.name)}"[: width - len(clock)]
     return Text(text.ljust(width - len(clock)) + clock, style="reverse")
 
 
@@ -199,6 +200,7 @@ def _first_seen(chosen: int, count: int, room: int) -> int:
 
 
 def _cut(text: str, width: int) -> str:
+    text = printable(text)
     return text if len(text) <= width else text[: max(0, width - 1)] + "~"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from multidrop.cli.saying import say
 from multidrop.plant import Line, load_plant
 from multidrop.sim import HostileWire, Simulator, Wire, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
@@ -45,4 +46,4 @@ def _wire(line: Line, directory: Path, faults: Faults, unpaced: bool) -> Wire:
 
 def _announce(simulator: Simulator) -> None:
     for wire in simulator.wires:
-        print(f"ready {wire.name} {wire.path}", flush=True)
+        say(f"ready {wire.name} {wire.path}", flush=True)

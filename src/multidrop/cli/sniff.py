@@ -15,6 +15,7 @@ from multidrop.cli.interruption import Interruption
 from multidrop.cli.listening import Listener
 from multidrop.cli.overheard import Ear, replay, summary
 from multidrop.cli.overwriting import check_capture
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument, duration
 from multidrop.plant import Line, Plant, load_plant
 from multidrop.timing import Settings
@@ -54,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
             ear = Ear(line.name if line else _name(arguments.port), line, as_json=arguments.json, out=out)
             _listen(listener, ear, arguments.seconds)
             counts = ear.pairing.counts()
-    print(json.dumps({"summary": counts}) if arguments.json else summary(counts))
+    say(json.dumps({"summary": counts}) if arguments.json else summary(counts))
     return 0
 
 
@@ -77,7 +78,7 @@ def _settings(arguments: argparse.Namespace, line: Line | None) -> Settings:
 
 
 def _listen(listener: Listener, ear: Ear, seconds: float | None) -> None:
-    print(f"listening on {listener.port}, Ctrl-C ends", file=sys.stderr, flush=True)
+    say(f"listening on {listener.port}, Ctrl-C ends", file=sys.stderr, flush=True)
     begun = heard_at = time.monotonic()
     with Interruption() as interruption:
         while not interruption.came:

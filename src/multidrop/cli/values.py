@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from enum import Flag, IntEnum
 from typing import Any, TypeVar
 
+from multidrop.cli.saying import say
 from multidrop.register import Register
 
 Row = Sequence[str]
@@ -34,7 +35,7 @@ def taken(register: Register[T], value: T) -> T:
     nearest = register.decode(register.encode(value))
     if nearest != value:
         steps = f"{register.name} has steps of {register.step:g} {register.unit}".rstrip()
-        print(f"multidrop: {steps}: {value!r} is taken as {register.format(nearest)}", file=sys.stderr)
+        say(f"multidrop: {steps}: {value!r} is taken as {register.format(nearest)}", file=sys.stderr)
     return nearest
 
 

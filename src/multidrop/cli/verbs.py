@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from multidrop.bus import Bus
 from multidrop.cli.consent import ask
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument, add_target_arguments, add_writing_arguments, drive_of
 from multidrop.cli.values import as_json, taken
 from multidrop.drive import Direction, Drive, Script, State, Write
@@ -64,14 +65,14 @@ def run(arguments: argparse.Namespace) -> int:
         record = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
         if setpoint:
             record["setpoint"] = {"register": setpoint.register.name} | as_json(*setpoint)
-        print(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
+        say(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
-        print(state)
-        print(f"watchdog: {watchdog}")
+        say(state)
+        say(f"watchdog: {watchdog}")
     else:
         at = f" at {setpoint}" if setpoint else ""
         told = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
-        print(told + (f"; watchdog: {watchdog}" if watchdog else ""))
+        say(told + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
 
 

@@ -7,6 +7,7 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
+from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
 from multidrop.cli.values import aligned
 from multidrop.ledger import BUDGET, CYCLES, Ledger, Wear, default_path
@@ -26,12 +27,12 @@ def run(arguments: argparse.Namespace) -> int:
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:
-        print(json.dumps([_facts(it) for it in found], indent=2))
+        say(json.dumps([_facts(it) for it in found], indent=2))
     elif not found:
-        print(f"{ledger.path}: no register that may be in EEPROM was written yet")
+        say(f"{ledger.path}: no register that may be in EEPROM was written yet")
     else:
-        print("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
-        print(f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears.")
+        say("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
+        say(f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears.")
     return 0
 
 

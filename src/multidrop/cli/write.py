@@ -8,6 +8,7 @@ import sys
 
 from multidrop.bus import Bus
 from multidrop.cli.consent import ask
+from multidrop.cli.saying import say
 from multidrop.cli.target import (
     add_json_argument,
     add_target_arguments,
@@ -40,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         held = outcome.asked if outcome.held is None else outcome.held
         told = {"drive": drive.name, "register": register.name} | as_json(register, held)
-        print(json.dumps(told | {"outcome": outcome.effect.value}, indent=2))
+        say(json.dumps(told | {"outcome": outcome.effect.value}, indent=2))
     else:
-        print(outcome, file=sys.stdout if outcome.effect is Effect.DONE else sys.stderr)
+        say(outcome, file=sys.stdout if outcome.effect is Effect.DONE else sys.stderr)
     return 0 if outcome.effect is Effect.DONE else 1

@@ -12,8 +12,7 @@ from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import UNASKED, Framing, Message, build_request
 from multidrop.look.recorded import Array, Look, Series
-from multidrop.look.style import COLOURS, TEXT, days, line_style, new_figure, tell_time, time_edges
-from multidrop.printable import printable
+from multidrop.look.style import COLOURS, TEXT, days, label, line_style, new_figure, tell_time, time_edges
 from multidrop.timing import Settings
 
 MOST_REASONS = 6  # in a picture; the rest are one
@@ -73,7 +72,7 @@ def draw_delays(found: Sequence[Delays]) -> Figure:
         whis=(1, 99),
         widths=0.6,
         patch_artist=True,
-        tick_labels=[printable(it.drive) for it in found],
+        tick_labels=[label(it.drive) for it in found],
         boxprops={"facecolor": "#CFE3F1", "edgecolor": COLOURS[0]},
         medianprops={"color": COLOURS[1], "linewidth": 1.6},
         whiskerprops={"color": COLOURS[0]},
@@ -97,7 +96,7 @@ def draw_rates(look: Look) -> Figure:
     middles = days(((edges[1:] + edges[:-1]) / 2).astype(np.int64))
     for number, drive in enumerate(look.drives):
         counts = sum(_counted(it.time[~it.missed], edges) for it in look.of(drive))
-        rates.plot(middles, counts / width, linewidth=1.3, label=printable(drive), **line_style(number))
+        rates.plot(middles, counts / width, linewidth=1.3, label=label(drive), **line_style(number))
     rates.set_title("values a second", loc="left", fontsize=10)
     rates.set_ylim(bottom=0)
     reasons = [reason for reason, _ in _reasons(look.series).most_common()]
@@ -113,7 +112,7 @@ def draw_rates(look: Look) -> Figure:
         misses.stackplot(
             middles,
             list(stacked.values()),
-            labels=list(map(printable, stacked)),
+            labels=list(map(label, stacked)),
             colors=_SHADES,
             step="mid",
             linewidth=0,
@@ -186,7 +185,7 @@ def draw_miss_shares(look: Look) -> Figure | None:
     for number, (drive, found) in enumerate(shares.items()):
         if found:
             axes.plot(
-                *found, marker="o", markersize=4, linewidth=1.3, label=printable(drive), **line_style(number)
+                *found, marker="o", markersize=4, linewidth=1.3, label=label(drive), **line_style(number)
             )
     axes.set_ylim(bottom=0, top=max(0.01, axes.get_ylim()[1]))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))

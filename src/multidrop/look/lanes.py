@@ -16,8 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from multidrop.look.recorded import Array, Look, Series
-from multidrop.look.style import COLOURS, TEXT, days, line_style
-from multidrop.printable import printable
+from multidrop.look.style import COLOURS, TEXT, days, label, line_style
 
 HATCHES = ("", "////", "....")  # the colours once more, and again
 MOST_LANES = 64  # in one panel
@@ -32,8 +31,8 @@ class Lane:
     """What one drive's register, or one bit of it, was from when to when."""
 
     drive: str
-    label: str
-    is_bit: bool  # its label says all: it is on or off
+    title: str
+    is_bit: bool  # its title says all: it is on or off
     time: Array  # of its rows, ns UTC
     missed: Array
     state: tuple[str, ...]  # of each run of rows that are alike
@@ -70,7 +69,7 @@ def _lanes(series: Series) -> Iterable[Lane]:
     ]
 
 
-def _lane(series: Series, label: str, value: Array, name_of: Callable[[float], str]) -> Lane:
+def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
     """Cut the rows into runs of one value; a state lasts until the next row, whatever that says."""
     time = series.time
     differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
@@ -81,7 +80,7 @@ def _lane(series: Series, label: str, value: Array, name_of: Callable[[float], s
     told = np.array([bool(state) for state in states])
     return Lane(
         series.drive,
-        printable(label),
+        title,
         series.is_bits,
         time,
         series.missed,
@@ -110,7 +109,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Look) -> None:
             bars = list(zip(days(begin), widths / 86400e9, strict=True))
             axes.broken_barh(bars, (row - 0.36, 0.72), linewidth=0, **styles.get(name, bit_style))
             if not lane.is_bit:
-                text = printable(name).lower()
+                text = label(name).lower()
                 fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
                 told.update([name] if len(fitting) else [])
                 for at in days(fitting):
@@ -118,9 +117,9 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Look) -> None:
         _mark_misses(axes, lane, row, span)
     untold = [name for name in names if name not in told]
     if untold:
-        handles = [Patch(label=printable(name).lower(), **styles[name]) for name in untold]
+        handles = [Patch(label=label(name).lower(), **styles[name]) for name in untold]
         axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, frameon=False)
-    axes.set_yticks(range(len(lanes)), [lane.label for lane in lanes], fontsize=8)
+    axes.set_yticks(range(len(lanes)), [label(lane.title) for lane in lanes], fontsize=8)
     axes.set_ylim(len(lanes) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
 

@@ -74,7 +74,8 @@ def _about(look: Look) -> str:
         f"From {begin:%Y-%m-%d %H:%M:%S} UTC, {_duration(look.seconds)}; "
         f"{_count(len(look.drives), 'drive')}; {_count(values, 'value')}, {_count(misses, 'miss', 'misses')}"
     )
-    return f'<p class="about">{_escape(text + (f"; plant {plant}" if plant else ""))}</p>'
+    of_plant = _escape(f"; plant {plant}") if plant else ""
+    return f'<p class="about">{text}{of_plant}</p>'
 
 
 def _count(number: int, one: str, many: str = "") -> str:

@@ -17,6 +17,7 @@ from multidrop.recording import open_reader
 
 RAW = "raw count"  # the unit where no document states the scale
 LARGEST = 1e150  # of what can be drawn: axes reckon with differences and products
+LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: beyond that no date is reckoned with
 LARGEST_COUNT = 2**53  # that a column of values can hold exactly
 Array = NDArray[Any]
 
@@ -89,7 +90,7 @@ class Series:
         time, value = self.time[there], self.value[there]
         if not len(time):
             return []
-        changes = np.flatnonzero(np.diff(value)) + 1
+        changes = np.flatnonzero(value[1:] != value[:-1]) + 1
         begins = [0, *changes.tolist()]
         ends = [*changes.tolist(), len(time) - 1]
         return [
@@ -179,6 +180,8 @@ def load(path: str | Path) -> Look:
     drive, register, status, time, value, uncertainty = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
+    if not 0 <= time.min() <= time.max() < LATEST_NS:
+        raise ValueError(f"{path} cannot be drawn: there are rows from before 1970 or after 2200")
     metadata = {**reader.metadata, "drives": _described(reader.metadata.get("drives"))}
     statuses = tuple(names["status"])
     series = []

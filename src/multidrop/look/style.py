@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from multidrop.look.recorded import Array
+from multidrop.printable import printable
 
 # Okabe and Ito's, without black and yellow; then the same once more, dashed.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
@@ -27,6 +28,12 @@ WIDTH = 11.0  # inches
 DPI = 110
 
 _DATES: Any = dates  # it has no types
+
+
+def label(text: str) -> str:
+    """A name as a picture shows it: no mathematics, and never left out of a legend."""
+    shown = printable(text).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def line_style(number: int) -> dict[str, Any]:

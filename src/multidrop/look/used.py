@@ -12,8 +12,7 @@ from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import Framing, Message, reply_length
 from multidrop.look.recorded import Array, Look
-from multidrop.look.style import days, line_style, new_figure, tell_time, time_edges
-from multidrop.printable import printable
+from multidrop.look.style import days, label, line_style, new_figure, tell_time, time_edges
 
 _LINE_FIGURES = ("utilisation", "cycle_ms")
 _DRIVE_FIGURES = ("exchanges_per_second", "silence_ms", "character_ms")
@@ -132,10 +131,10 @@ def draw_used(found: Sequence[Used], look: Look) -> Figure:
     for number, it in enumerate(found):
         share = np.histogram(it.time, edges, weights=it.needed)[0] / width
         colour = line_style(number)["color"]
-        axes.plot(middles, share, linewidth=1.3, color=colour, label=printable(it.line))
+        axes.plot(middles, share, linewidth=1.3, color=colour, label=label(it.line))
         planned = min(it.planned["utilisation"], 1.0)
-        label = f"{printable(it.line)}, planned"
-        axes.axhline(planned, linewidth=1.0, linestyle="dashed", color=colour, label=label)
+        dashed = label(f"{it.line}, planned")
+        axes.axhline(planned, linewidth=1.0, linestyle="dashed", color=colour, label=dashed)
     axes.set_ylim(0, 1.08)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_ylabel("utilisation")

@@ -13,8 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from multidrop.look.lanes import draw_lanes, lanes_inches, lanes_of, name_bar
 from multidrop.look.recorded import RAW, Array, Look, Series
-from multidrop.look.style import FAULT, GRID, TEXT, day, days, line_style, new_figure, tell_time
-from multidrop.printable import printable
+from multidrop.look.style import FAULT, GRID, TEXT, day, days, label, line_style, new_figure, tell_time
 
 FIRST = (  # shown before others when there are more than fit
     "output_frequency",
@@ -68,7 +67,7 @@ def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) 
     ):
         if panel[2]:
             note = f" ({hidden} more lanes: choose with --drive)" if hidden else ""
-            one.set_title(f"{_title(panel)}{note}", loc="left", fontsize=10)
+            one.set_title(f"{label(_title(panel))}{note}", loc="left", fontsize=10)
             draw_lanes(one, lanes, look)
         else:
             _draw_panel(one, panel, series, look)
@@ -80,7 +79,7 @@ def plot(look: Look, drives: Sequence[str] = (), registers: Sequence[str] = ()) 
         it.drive for panel, series in zip(shown, contents, strict=True) for it in series if not panel[2]
     }
     handles = [
-        Line2D([], [], label=printable(name), **line_style(number))
+        Line2D([], [], label=label(name), **line_style(number))
         for number, name in enumerate(look.drives)
         if name in curves
     ]
@@ -115,13 +114,13 @@ def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
 
 
 def _title(panel: Panel) -> str:
-    return printable(f"{panel[0]}, {panel[1]}" if panel[1] else panel[0])
+    return f"{panel[0]}, {panel[1]}" if panel[1] else panel[0]
 
 
 def _draw_panel(axes: Axes, panel: Panel, series: Sequence[Series], look: Look) -> None:
     too_large = sum(int((np.isnan(it.drawable) & ~it.missed).sum()) for it in series)
     note = f" ({too_large} values of 1e150 and more are not drawn)" if too_large else ""
-    axes.set_title(f"{_title(panel)}{note}", loc="left", fontsize=10)
+    axes.set_title(f"{label(_title(panel))}{note}", loc="left", fontsize=10)
     for it in series:
         time, value = thinned(it.time, it.drawable)
         style = line_style(look.drives.index(it.drive))
@@ -175,8 +174,8 @@ def _draw_faults(axes: Axes, series: Sequence[Series], look: Look) -> None:
         for span in it.faults():
             begin, end = day(span.begin), day(span.end)
             axes.barh(row, end - begin, left=begin, height=0.7, color=FAULT, alpha=0.85)
-            name_bar(axes, printable(span.what).lower(), begin, row)
-    axes.set_yticks(range(len(series)), [printable(it.drive) for it in series], fontsize=8)
+            name_bar(axes, label(span.what).lower(), begin, row)
+    axes.set_yticks(range(len(series)), [label(it.drive) for it in series], fontsize=8)
     axes.set_ylim(len(series) - 0.5, -0.5)
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
 

@@ -22,6 +22,10 @@ All three have the same columns, and one row for every sample or miss:
 | `value`          | float64, or null   | in the register's unit                                     |
 | `status`         | utf8               | `ok`, or why there is no value: both others are then null  |
 
+In .csv a text that a spreadsheet would take for a formula, because it begins with `=`, `+`, `-`, `@`, a tab
+or the end of a line, has an apostrophe in front; so has one that begins with apostrophes and then one of
+these. The reader here takes one off.
+
 The metadata is one JSON object. It lies in the schema's metadata under the key `multidrop` (.arrows,
 .parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file; `planned`,
 for each line's name what it should reach (multidrop.forecast says how); and `drives`: for each drive's

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -19,6 +20,9 @@ from multidrop.recording.recorded import from_rows
 from multidrop.recording.whole import WholeFile
 
 HEADER = ",".join(Row._fields) + "\n"
+# A spreadsheet carries out a text that begins like this, but not with an apostrophe in front.
+FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
+SPARED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
 BATCH_ROWS = 1 << 14
 SECOND = 1_000_000_000
@@ -134,10 +138,10 @@ def _parse(cells: list[str]) -> Row:
         _read(time),
         int(monotonic_ns),
         int(uncertainty_ns) if uncertainty_ns else None,
-        drive,
-        register,
+        _text(drive),
+        _text(register),
         float(value) if value else None,
-        status,
+        _text(status),
     )
 
 
@@ -151,8 +155,19 @@ def _line(row: Row) -> str:
 
 @lru_cache(maxsize=4096)
 def _quote(text: str) -> str:
-    """As RFC 4180 has it: what holds a comma, a quote or the end of a line stands between quotes."""
+    """As RFC 4180 has it: what holds a comma, a quote or the end of a line stands between quotes.
+
+    A text that could be a formula gets an apostrophe in front, and so does one that has it already.
+    """
+    if FORMULA.match(text):
+        text = f"'{text}"
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
+
+
+@lru_cache(maxsize=4096)
+def _text(cell: str) -> str:
+    """The text that `_quote` was given."""
+    return cell[1:] if SPARED.match(cell) else cell
 
 
 def _spell(time_ns: int) -> str:
