@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import subprocess
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -576,3 +577,47 @@ def test_more_rows_than_a_batch_can_hold_are_more_batches(
     assert [len(batch) for batch in batches] == [65_500, 4_500]
     found = [(row.time, row.register, row.value, row.status) for batch in batches for row in batch]
     assert found == [(2 * n, f"holding_register_{at}", *end) for n in range(700) for at in range(100)]
+
+
+# ---- files that are large, or change under the reader ----
+
+
+@pytest.mark.parametrize("piece", [200, 256, 333, 512])
+def test_pieces_of_a_file_are_one_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
+) -> None:
+    path = write(tmp_path / "it.pcapng", RTU[:40])
+    path.write_bytes(path.read_bytes() + OTHER_BLOCK)
+    whole, torn = spans(path), rows(path)
+    monkeypatch.setattr("multidrop.capture.reader._PIECE", piece)
+    assert spans(path) == whole
+    assert rows(path) == torn
+    path.write_bytes(path.read_bytes()[:-3])
+    with Capture(path) as capture:
+        for _ in capture:
+            pass
+        assert capture.torn == len(OTHER_BLOCK) - 3
+
+
+OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # of statistics
+
+
+def test_a_capture_that_is_cut_short_while_it_is_read_is_a_sentence(tmp_path: Path) -> None:
+    """In a process of its own: where the file is mapped, the end of its bytes is the end of the process."""
+    path = write(tmp_path / "it.pcapng", RTU * 20)
+    code = (
+        "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"
+        "with Capture(sys.argv[1]) as capture:\n"
+        "    os.truncate(sys.argv[1], 64)\n"
+        "    try:\n"
+        "        for _ in capture: pass\n"
+        "    except CaptureError as cut:\n"
+        "        print(cut)\n"
+    )
+    size = path.stat().st_size
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    assert (done.returncode, done.stderr, done.stdout) == (
+        0,
+        "",
+        f"{path} was cut short while it was read: it had {size} bytes, and ends at byte 64 now\n",
+    )

@@ -1,10 +1,14 @@
-"""Reads captures: pcap and pcapng, ours and others', as bytes heard on lines."""
+"""Reads captures: pcap and pcapng, ours and others', as bytes heard on lines.
+
+A capture is read piece by piece: it may be larger than memory, and a piece that is not there any more
+(somebody cut the file short meanwhile) is a sentence, where a mapped file would end the process.
+"""
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Iterator
+from io import SEEK_END
 from pathlib import Path
 from types import TracebackType
 
@@ -22,7 +26,8 @@ _PCAP = {  # the first four bytes: whether big-endian, and ticks in a second
     b"\x4d\x3c\xb2\xa1": (False, 10**9),
     b"\xa1\xb2\x3c\x4d": (True, 10**9),
 }
-_PCAP_HEADER = 24
+_PCAP_HEADER, _PCAPNG_HEADER = 24, 28
+_PIECE = 1 << 20  # bytes that are looked at together, many times the largest packet
 _NO_SERIAL_LINE = {1: "Ethernet", 101: "IP", 105: "Wi-Fi", 113: "Linux cooked", 189: "USB", 220: "USB"}
 
 
@@ -42,13 +47,11 @@ class Capture:
         self.lines: list[str] = []
         self.torn = 0
         self._is_ours = False
-        with self.path.open("rb") as file:
-            if not self.path.stat().st_size:
-                raise CaptureError(f"{self.path} is not a capture: it is empty")
-            self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self._file = self.path.open("rb", buffering=0)
         self._order = "<"
         self._unpacker: Unpacker | None = None
         try:
+            self._size = self._file.seek(0, SEEK_END)  # what is appended later is not looked at
             self._begin()
         except BaseException:
             self.close()
@@ -59,8 +62,6 @@ class Capture:
         return self._unpacker.heard if self._unpacker else []
 
     def close(self) -> None:
-        if self._unpacker:
-            self._unpacker.close()
         self._file.close()
 
     def __enter__(self) -> Capture:
@@ -75,20 +76,22 @@ class Capture:
         self.close()
 
     def _begin(self) -> None:
-        magic = self._file[:4]
+        if not self._size:
+            raise CaptureError(f"{self.path} is not a capture: it is empty")
+        magic = self._piece(0, 4)
         if magic in _PCAP:
-            if len(self._file) < _PCAP_HEADER:
+            if self._size < _PCAP_HEADER:
                 raise CaptureError(f"{self.path} is not a capture: it ends within its header")
             is_big_endian, ticks_per_s = _PCAP[magic]
             self._order = ">" if is_big_endian else "<"
-            self._unpacker = Unpacker(self._file, _PCAP_HEADER, is_pcapng=False, is_big_endian=is_big_endian)
+            self._unpacker = Unpacker(_PCAP_HEADER, is_pcapng=False, is_big_endian=is_big_endian)
             link = self._read("I", 20)
             self._add(link & 0xFFFF, self.path.stem, ticks_per_s, 0)
         elif magic == struct.pack("<I", _SECTION):
-            if len(self._file) < 28:
+            if self._size < _PCAPNG_HEADER:
                 raise CaptureError(f"{self.path} is not a capture: it ends within its header")
             self._order = self._order_at(0)
-            self._unpacker = Unpacker(self._file, 0, is_pcapng=True, is_big_endian=self._order == ">")
+            self._unpacker = Unpacker(0, is_pcapng=True, is_big_endian=self._order == ">")
         else:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
@@ -96,32 +99,50 @@ class Capture:
         """Hear on; the caller takes from every `heard` what it can, each time and at the end."""
         unpacker = self._unpacker
         assert unpacker is not None
+        seen = unpacker.at  # so far the file was read
         while True:
             state = unpacker.unpack()
             if state is Unpacked.NONSENSE:
                 raise self._damaged(unpacker.at)
-            if state is Unpacked.OTHER_BLOCK and self._read_block(unpacker):
-                continue
-            if state is not Unpacked.FULL:
+            if state is Unpacked.OTHER_BLOCK:
+                if not self._read_block(unpacker):
+                    break
+            elif state is Unpacked.FULL:
+                yield
+            elif seen < self._size:
+                piece = self._piece(unpacker.at, _PIECE)
+                seen = unpacker.at + len(piece)
+                unpacker.look_at(piece, unpacker.at)
+            else:
                 break
-            yield
-        self.torn = len(self._file) - unpacker.at
+        self.torn = self._size - unpacker.at
         for heard in self.heard:
             heard.end(True)
         yield
+
+    def _piece(self, at: int, most: int) -> bytes:
+        """So many bytes of the file, or all that there are."""
+        self._file.seek(at)
+        piece = self._file.read(most)
+        if len(piece) < min(most, self._size - at):
+            raise CaptureError(
+                f"{self.path} was cut short while it was read: it had {self._size} bytes, "
+                f"and ends at byte {at + len(piece)} now"
+            )
+        return piece
 
     def _read_block(self, unpacker: Unpacker) -> bool:
         """Take in a block that is not a packet of the usual kind; False where the file is cut."""
         at = unpacker.at
         kind = self._read("I", at)
-        if kind == _SECTION and len(self._file) - at >= 28 and self._order_at(at) != self._order:
+        if kind == _SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
             raise CaptureError(f"{self.path}: byte {at}: sections of both byte orders cannot be read")
         size = self._read("I", at + 4)
         if size < 12 or size % 4:
             raise self._damaged(at)
-        if at + size > len(self._file):
+        if at + size > self._size:
             return False
-        body = self._file[at + 8 : at + size - 4]
+        body = self._piece(at + 8, min(size - 12, _PIECE)) if kind in (_SECTION, _INTERFACE) else b""
         if kind == _SECTION:
             if at and self.lines:
                 raise CaptureError(f"{self.path}: byte {at}: only the first section can be read")
@@ -177,13 +198,13 @@ class Capture:
 
     def _order_at(self, at: int) -> str:
         """The byte order of the section that begins there."""
-        magic = self._file[at + 8 : at + 12]
+        magic = self._piece(at + 8, 4)
         if magic not in (b"\x1a\x2b\x3c\x4d", b"\x4d\x3c\x2b\x1a"):
             raise self._damaged(at)
         return ">" if magic == b"\x1a\x2b\x3c\x4d" else "<"
 
     def _read(self, format: str, at: int) -> int:
-        number: int = struct.unpack_from(self._order + format, self._file, at)[0]
+        number: int = struct.unpack(self._order + format, self._piece(at, 4))[0]
         return number
 
     def _damaged(self, at: int) -> CaptureError:

@@ -140,36 +140,31 @@ class Unpacked(IntEnum):
 
 
 class Unpacker:
-    """Takes packets out of a capture file's bytes (struct md_capture); `at` is how far it is."""
+    """Takes packets out of a capture file's bytes (struct md_capture); `at` is how far in the file it is."""
 
     MOST_CHANNELS = 64
 
-    def __init__(self, capture: Any, at: int, *, is_pcapng: bool, is_big_endian: bool) -> None:
-        self._bytes = ffi.from_buffer("uint8_t[]", capture)
+    def __init__(self, at: int, *, is_pcapng: bool, is_big_endian: bool) -> None:
         self._channels = ffi.new("struct md_channel[]", self.MOST_CHANNELS)
         self.heard: list[Heard] = []
         self._c = ffi.new(
             "struct md_capture *",
-            {
-                "bytes": self._bytes,
-                "len": len(self._bytes),
-                "at": at,
-                "is_pcapng": is_pcapng,
-                "is_big_endian": is_big_endian,
-                "channels": self._channels,
-            },
+            {"is_pcapng": is_pcapng, "is_big_endian": is_big_endian, "channels": self._channels},
         )
+        self.look_at(b"", at)
 
-    def close(self) -> None:
-        ffi.release(self._bytes)
+    def look_at(self, piece: bytes, at: int) -> None:
+        """Go on with these bytes of the file, which begin at its byte `at`."""
+        self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
+        self._c.bytes, self._c.len, self._c.at = self._piece, len(piece), 0
 
     @property
     def at(self) -> int:
-        return int(self._c.at)
+        return self._begin + int(self._c.at)
 
     @at.setter
     def at(self, at: int) -> None:
-        self._c.at = at
+        self._c.at = at - self._begin
 
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
         """The next interface of the file: its link type, whose sent what, and its clock."""
