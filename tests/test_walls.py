@@ -25,7 +25,7 @@ OUTSIDE = {
 }
 # from the ground up; a file imports only from its own floor and those below it
 FLOORS = [
-    {"errors", "mistakes", "audit", "ledger", "forks", "parting", "printable"},
+    {"errors", "mistakes", "audit", "ledger", "forks", "parting", "printable", "interpreter"},
     {"core", "register", "timing"},
     {"script", "state", "bridge"},
     {

@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from multidrop.interpreter import refuse_other_interpreters
+
 if TYPE_CHECKING:
     from multidrop.audit import read_audit as read_audit
     from multidrop.batch import Batch as Batch
@@ -52,6 +54,8 @@ if TYPE_CHECKING:
     from multidrop.statistics import Diagnostics as Diagnostics
     from multidrop.statistics import LineStatistics as LineStatistics
     from multidrop.statistics import Statistics as Statistics
+
+refuse_other_interpreters()
 
 # Every public name and the module that it comes from, which is loaded when the name is first used.
 _HOMES = {

@@ -1,0 +1,27 @@
+"""One interpreter of a process is served, the main one."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_MODULES = ("_interpreters", "_xxsubinterpreters")  # from Python 3.13 on; before
+
+
+def refuse_other_interpreters() -> None:
+    """Raise ImportError in a sub-interpreter.
+
+    The compiled module keeps its engine, its types and its callbacks for the whole process: those of an
+    interpreter that ends would stay behind, and be called.
+    """
+    for name in _MODULES:
+        try:
+            interpreters: Any = import_module(name)
+        except ImportError:
+            continue
+        if interpreters.get_current() != interpreters.get_main():
+            raise ImportError(
+                "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "
+                "use it there, or in a process of its own"
+            )
+        return
