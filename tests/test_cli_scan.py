@@ -104,6 +104,8 @@ def test_a_serial_server_is_asked_at_its_own_baud_rate(run: Run, port: str) -> N
     ("words", "sentence"),
     [
         (("--addresses", "0-5"), "'0-5' is not addresses from 1 to 247"),
+        (("--addresses", "1-" + "9" * 400), "is not addresses from 1 to 247"),
+        (("--addresses", "1-99999999999"), "'1-99999999999' is not addresses from 1 to 247"),
         (("--addresses", "one"), "'one' is not addresses from 1 to 247"),
         (("--baudrates", "fast"), "'fast' is not baud rates such as 9600,19200"),
         (("--baudrates", "300"), "baud rate 300 is none that these families have"),

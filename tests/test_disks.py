@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager
+import sqlite3
+from contextlib import AbstractContextManager, closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from disks import full_at, read_only_directory
 from halls import one
 
 from multidrop.audit import AuditLog, read_audit
+from multidrop.cli import main
 from multidrop.drives import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.errors import Refused
 from multidrop.ledger import Cell, Ledger
@@ -180,3 +182,20 @@ def test_a_budget_of_a_drive_s_own_ledger_outlives_the_bus(
         _, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
         drive.set_frequency(10 + life)
     assert writes(Ledger(tmp_path / "wear.sqlite")) == 3
+
+
+@pytest.mark.parametrize(
+    "time", ["'yesterday'", "x'00'", "null", "9e999", "-1e308", "1e308", "1" + "0" * 400]
+)
+def test_a_ledger_with_a_time_that_is_none_keeps_the_write_back(tmp_path: Path, time: str) -> None:
+    ledger, cell = Ledger(tmp_path / "wear.sqlite"), Cell("/dev/ttyUSB0", 1, "toy", "acceleration_time")
+    assert ledger.enter(cell, 100.0, 60.0) == ""
+    with closing(sqlite3.connect(ledger.path)) as file:
+        file.execute(f"update writes set time = {time}")
+        file.commit()
+    why = "cannot be kept: it has a write of acceleration_time at a time that is none"
+    with pytest.raises(OSError, match=why):
+        ledger.enter(cell, 1000.0, 60.0)
+    assert main(["wear", "--ledger", str(ledger.path)]) == 1
+    with closing(sqlite3.connect(ledger.path)) as file:
+        assert file.execute("select count(*) from writes").fetchone() == (1,)

@@ -333,3 +333,9 @@ def test_nothing_answers_what_is_no_function(framing: Framing, function: int) ->
         ASCII: f":{(body + bytes([-sum(body) & 0xFF])).hex().upper()}\r\n".encode(),
     }
     assert parse_reply(framing, frames[framing], Message(1, function, 0, 1)) == (Result.BAD_FUNCTION, None)
+
+
+@pytest.mark.parametrize("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])
+def test_a_number_that_no_frame_has_room_for_is_a_mistake(odd: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="no frame can say this"):
+        build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from multidrop.batch import Row
 from multidrop.look import Look, load, plot, plot_page, png, report_page
 from multidrop.look.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
 from multidrop.look.lanes import MOST_LANES
+from multidrop.look.page import _about, _drives
 from multidrop.look.used import used
 from multidrop.look.values import MOST_PANELS, MOST_POINTS, thinned
 from multidrop.plant import load_plant
@@ -536,6 +538,84 @@ def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
 def test_a_single_row_has_a_report(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", [row(1, "pump", "output_frequency", 50.0)], pieces=1))
     assert "Report on it.arrows" in report_page(look)
+
+
+# ---- what makes no sense ----
+
+ODD: list[Any] = [None, True, -1, 1e308, 10**400, "", "x", [], [1], {}, {"a": {}}, {"FORWARD": 10**400}]
+
+
+def with_odd(about: Any, odd: Any) -> Iterator[Any]:
+    """The same metadata, with this in the place of each part of it in turn."""
+    yield odd
+    for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
+        if isinstance(part, dict | list):
+            for changed in with_odd(part, odd):
+                whole = about.copy()
+                whole[key] = changed
+                yield whole
+        else:
+            whole = about.copy()
+            whole[key] = odd
+            yield whole
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:12])
+def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
+    """All parts of it are read before a picture is drawn."""
+    about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
+    for number, metadata in enumerate(with_odd(about, odd)):
+        if not isinstance(metadata, dict):
+            continue  # is no recording
+        look = load(record(tmp_path / f"{number}.arrows", turns()[:30], metadata))
+        assert all(np.isfinite([it.utilisation, it.rate("pump"), it.cycle or 0]).all() for it in used(look))
+        assert {it.drive for it in delays(look)} == {"pump", "fan"}
+        assert len(_about(look) + "".join(_drives(look))) > 100
+        if metadata.get("planned") is odd or metadata.get("drives") is odd:
+            assert report_page(look)
+
+
+LARGEST_VALUES = [1e308, float("-inf"), 1e149]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", LARGEST_VALUES)
+@pytest.mark.parametrize("register", ["output_frequency", "fault", "output_current"])
+def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: float) -> None:
+    drive = "fan" if register == "output_current" else "pump"
+    rows = [row(at, drive, register, 1.0 if at % 2 else value) for at in range(40)]
+    rows += [row(at + 0.5, drive, register, None, "no reply") for at in range(40)]
+    rows += [row(40, drive, register, value), row(40.5, drive, register, -value)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    figure, _ = plot(look)
+    assert png(figure).startswith(PNG)
+    assert report_page(look)
+    title = figure.axes[-1].get_title(loc="left")
+    assert ("are not drawn" in title) == (abs(value) >= 1e150 and register != "fault")
+
+
+@pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
+def test_times_that_no_calendar_has_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
+    rows = [
+        row(0, "pump", "output_frequency", 1.0),
+        row(1, "pump", "output_frequency", 1.0)._replace(time=time),
+    ]
+    path = record(tmp_path / "it.arrows", rows)
+    for command in ("plot", "report"):
+        assert run(command, path) == (
+            2,
+            "",
+            f"multidrop: {path} cannot be drawn: there are rows from before 1970 or after 2200\n",
+        )
+
+
+def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Path) -> None:
+    path = record(tmp_path / "it.csv", turns())
+    (tmp_path / "it.csv.json").write_text("[" * 100_000)
+    for command in ("plot", "report"):
+        status, out, err = run(command, path)
+        assert (status, out) == (2, "")
+        assert "is not a recording: its metadata is nested too deeply" in err
 
 
 # ---- the commands ----

@@ -17,6 +17,7 @@ YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # writes of one register in a year
+LATEST = 6e10  # UTC in s: no date is later (nor, below 0, earlier)
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
 
 
@@ -119,5 +120,7 @@ def _wear(ledger: sqlite3.Connection, cell: Cell, now: float) -> Wear:
     (this_year,) = ledger.execute(
         f"select count(*) from writes where {where} and time > ?", (*_key(cell), now - YEAR)
     ).fetchone()
-    last = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone()
-    return Wear(cell, writes, this_year, last[0] if last else 0.0)
+    (last,) = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone() or (0.0,)
+    if not isinstance(last, float) or not abs(last) < LATEST:
+        raise sqlite3.DataError(f"it has a write of {cell.register} at a time that is none: {last!r}")
+    return Wear(cell, writes, this_year, last)

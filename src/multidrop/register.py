@@ -84,6 +84,9 @@ _LONG_WIRES = (
 )
 
 
+MOST_WHOLE = 1 << 64  # beyond whatever a register may hold, in its unit or not
+
+
 class Details(TypedDict):
     """What a declaration may say besides address and unit; all of it may be left out.
 
@@ -210,6 +213,8 @@ class Register(Generic[T]):
             return self._encode_name(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise TypeError(f"{self.name} takes a number, not {value!r}")
+        if isinstance(value, int) and abs(value) >= MOST_WHOLE:  # which floats may not be able to hold
+            raise ValueError(f"{self.name} takes a number of 32 bits, not one of {value.bit_length()}")
         if not math.isfinite(value):
             raise ValueError(f"{self.name} takes a finite number, not {value!r}")
         if self.span is not None and not self.span[0] <= value <= self.span[1]:

@@ -231,16 +231,16 @@ def _setting(it: Finding) -> dict[str, Any]:
 
 
 def _addresses(text: str) -> list[int]:
-    found: list[int] = []
+    spans: list[tuple[int, int]] = []
     try:
         for part in text.split(","):
             first, _, last = part.partition("-")
-            found += range(int(first), int(last or first) + 1)
+            spans.append((int(first), int(last or first)))
     except ValueError:
-        found = []
-    if not found or not all(1 <= address <= 247 for address in found):
+        spans = []
+    if not spans or not all(1 <= first <= last <= 247 for first, last in spans):
         raise argparse.ArgumentTypeError(f"{text!r} is not addresses from 1 to 247, such as 1-31 or 1,5,9")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(address for first, last in spans for address in range(first, last + 1)))
 
 
 def _baudrates(text: str) -> list[int]:

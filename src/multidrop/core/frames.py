@@ -37,18 +37,21 @@ class Message:
 def to_c(message: Message) -> Any:
     if len(message.data) > lib.MD_MOST_DATA:
         raise ValueError(f"{len(message.data)} data bytes do not fit a frame: {lib.MD_MOST_DATA} at most")
-    return ffi.new(
-        "struct md_message *",
-        {
-            "address": message.address,
-            "function": message.function,
-            "exception": message.exception,
-            "start": message.start,
-            "count": message.count,
-            "data_len": len(message.data),
-            "data": list(message.data),
-        },
-    )
+    try:
+        return ffi.new(
+            "struct md_message *",
+            {
+                "address": message.address,
+                "function": message.function,
+                "exception": message.exception,
+                "start": message.start,
+                "count": message.count,
+                "data_len": len(message.data),
+                "data": list(message.data),
+            },
+        )
+    except OverflowError as mistake:
+        raise ValueError(f"no frame can say this: {mistake}") from mistake
 
 
 def from_c(found: Any) -> Message:

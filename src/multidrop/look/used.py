@@ -70,6 +70,12 @@ def _figure(number: float) -> float:
     return float(number)
 
 
+def _word(number: int) -> int:
+    if not isinstance(number, int) or not 0 <= number <= 0xFFFF:
+        raise ValueError(number)
+    return number
+
+
 def _used(look: Look, line: str, planned: Mapping[str, Any]) -> Used:
     planned = _checked(planned)
     parts: list[tuple[Array, Array, Array]] = []
@@ -107,7 +113,7 @@ def _exchanges(look: Look, name: str, drive: Mapping[str, Any]) -> tuple[Array, 
     time, first, exchange = np.unique(times, return_index=True, return_inverse=True)
     uncertainty = np.concatenate([it.uncertainty[known] for it, known in read])[first]
     function, address, words = (
-        np.concatenate([np.full(known.sum(), it.meaning[key]) for it, known in read])
+        np.concatenate([np.full(known.sum(), _word(it.meaning[key])) for it, known in read])
         for key in ("function", "address", "words")
     )
     start, end = np.full(len(time), address.max()), np.zeros(len(time), np.int64)

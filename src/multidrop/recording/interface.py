@@ -101,6 +101,8 @@ def load(text: str | bytes, path: Path) -> Metadata:
         metadata = json.loads(text)
     except ValueError as mistake:
         raise not_a_recording(path, f"its metadata is not JSON: {mistake}") from mistake
+    except RecursionError as mistake:
+        raise not_a_recording(path, "its metadata is nested too deeply") from mistake
     if not isinstance(metadata, dict):
         raise not_a_recording(path, "its metadata is not a JSON object")
     return metadata
