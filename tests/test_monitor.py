@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import string
 import termios
+import threading
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
+from lines import PATIENCE
 from rich.console import Console
 from terminals import on_terminal
 from test_cli import Run, run
@@ -161,7 +163,14 @@ def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], 
     it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     it.tick(1.0, told(1, 1, 1.0, drives))
     for chosen in (0, drives - 1):
-        for at in (Position(chosen), Position(chosen, question="Stop?"), Position(chosen, message="m" * 300)):
+        failed = [f"drive-{number}: " + "why " * 40 for number in range(30)]
+        for at in (
+            Position(chosen),
+            Position(chosen, question="Stop?"),
+            Position(chosen, message="m" * 300),
+            Position(chosen, failures=failed),
+            Position(chosen, question="Leave?", failures=["x" * 5000]),
+        ):
             for lines in (
                 overview(it, at, size, NOW, BLOCKS),
                 page(it.drives[chosen], {}, at, size, NOW),
@@ -269,7 +278,8 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
     monitor: Any = _Monitor(plant, anyone, [], Console())
-    monitor._in_background = lambda what, work: work()
+    monitor._in_background = monitor._carry_out  # at once
+    monitor._side.read = lambda chosen: {}
     return monitor, poller
 
 
@@ -290,11 +300,89 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert poller.asked == asked
 
 
-def test_drives_that_do_not_stand_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def seen(monitor: Any) -> str:
+    """All that stands on the screen."""
+    return "\n".join(line.rstrip() for line in monitor._drawn().plain.split("\n"))
+
+
+def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    monitor._plant.tick(0.0, told(1, 1, 0.5))
+    for key in "Sy":
+        monitor._obey(key)
+    failure = "drive-2: failed after 0.2 s: no reply"
+    assert failure in seen(monitor)
+    assert "1 of 2 drives on hall-1 have stopped" in seen(monitor)
+    assert "a acknowledges what FAILED" in seen(monitor)
+    poller.stop_all = lambda: {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}  # type: ignore[method-assign]
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
+        monitor._obey(key)
+        assert failure in seen(monitor)
+    assert list(monitor.left_open()) == monitor._at.failures
+    monitor._obey("a")
+    assert failure not in seen(monitor)
+    assert "q quit" in seen(monitor)
+    assert list(monitor.left_open()) == []
+
+
+def test_all_lines_stand_in_what_a_stop_of_all_came_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
-    assert monitor._stop_all("hall-1") == (
-        "drive-2: failed after 0.2 s: no reply; 1 of 2 drives on hall-1 have stopped"
-    )
+    monitor._stood = {}
+    message = ""
+    for line in ("hall-1", "hall-2"):
+        message, _ = monitor._stop_all(line)
+    assert message == "1 of 2 drives on hall-1 have stopped; 1 of 2 drives on hall-2 have stopped"
+
+
+def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: WatchedPlant) -> None:
+    at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
+    shown: list[str] = []
+    for more in (24, 17, 10, 3, 0):
+        lines = texts(overview(watched, at, (80, 24), NOW, BLOCKS))
+        told = [line.strip(" !") for line in lines if line.startswith(" ! drive-")]
+        assert any(f"... and {more} more, after these" in line for line in lines) == bool(more)
+        shown += told
+        del at.failures[: at.failures_shown]
+    assert shown == [f"drive-{number}: no reply" for number in range(31)]
+
+
+@pytest.mark.parametrize("failure", [OSError("the ledger cannot be kept"), KeyError("odd"), RuntimeError()])
+def test_a_stop_that_fails_in_any_way_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    monitor._plant.tick(0.0, told(1, 1, 0.5))
+
+    def fail(*details: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(poller, "stop_all", fail)
+    monkeypatch.setattr(poller, "perform", fail)
+    for key in "Sysy":
+        monitor._obey(key)
+    words = str(failure) or "RuntimeError"
+    assert f"stopping all drives on hall-1 failed: {words}" in seen(monitor)
+    assert f"stopping drive-1 failed: {words}" in seen(monitor)
+
+
+def test_leaving_under_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    stands = threading.Event()
+    del monitor._in_background  # in a thread, as it is
+    monitor._stop = lambda chosen: (str(stands.wait(PATIENCE)), [])
+    for key in ("s", "y", "q", "n"):
+        monitor._obey(key)
+        assert not monitor._has_left
+    assert list(monitor.left_open()) == ["a stop was under way and is not waited for: look at the motors"]
+    for key in ("q", "y"):
+        monitor._obey(key)
+    assert monitor._has_left
+    stands.set()
+    for thread in monitor._stops:
+        thread.join()
+    assert list(monitor.left_open()) == []
 
 
 def test_page_keys_scroll_a_page_and_choose_in_the_overview(
@@ -337,6 +425,22 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
         assert termios.tcgetattr(terminal.slave) == terminal.before
 
 
+def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
+    """Not below it: a screen that scrolls is never still, and shows parts of two pictures."""
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        pictures = homes = 0
+        while pictures < 4:
+            terminal.press(b"\x1b[B")  # forgets what was written: within a picture, maybe
+            terminal.wait_for("q quit")
+            terminal.wait_for("multidrop monitor")
+            pictures += len(re.findall(rb".{5} multidrop monitor", terminal.written, re.DOTALL))
+            homes += len(re.findall(rb"\x1b\[H(?:\x1b\[[0-9;]*m)* multidrop monitor", terminal.written))
+        assert pictures == homes
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+
+
 def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         terminal.wait_for("pump-9 silent")
@@ -344,7 +448,12 @@ def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
         terminal.wait_for("pump-1 has stopped")
         terminal.press(b"\x1b[Bsy")
         terminal.wait_for("pump-9 does not answer: check its address")
+        terminal.press(b"\r\x1bsn")
+        terminal.wait_for("nothing was sent")
+        terminal.wait_for("pump-9 does not answer: check its address")
         terminal.press(b"q")
+        terminal.wait_for("multidrop: ")  # behind the screen, for whoever has left too soon
+        terminal.wait_for("pump-9 does not answer: check its address")
         assert terminal.process.wait(timeout=20) == 0
 
 
@@ -399,7 +508,8 @@ def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
         terminal.wait_for(">pump-1")
         terminal.wait_for("q quit")
         assert b"\x1b" not in terminal.written
-        assert len(terminal.text.partition("q quit")[0].splitlines()) == 23
+        picture = terminal.text[terminal.text.index(" multidrop monitor") :].partition("q quit")[0]
+        assert len(picture.splitlines()) == 23
         terminal.wait_for("pump-9 silent")
         terminal.press(b"q")
         assert terminal.process.wait(timeout=20) == 0

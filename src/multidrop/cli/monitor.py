@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from datetime import UTC, datetime
 from functools import partial
 from os import get_terminal_size
 from pathlib import Path
@@ -19,8 +20,8 @@ from multidrop.cli.extra import need
 from multidrop.cli.interruption import Interruption
 from multidrop.cli.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.overwriting import refuse_overwriting
+from multidrop.cli.saying import say
 from multidrop.cli.watched import Watched, WatchedPlant
-from multidrop.errors import BusError
 from multidrop.plant import Plant, load_plant
 from multidrop.poller import Poller
 from multidrop.recording import open_writer
@@ -61,7 +62,10 @@ def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None
         if out:
             takers.append(stack.enter_context(open_writer(out, plant.metadata())).write)
         with poller:
-            _Monitor(plant, poller, takers, console).show(interruption, seconds)
+            monitor = _Monitor(plant, poller, takers, console)
+            monitor.show(interruption, seconds)
+            for sentence in monitor.left_open():
+                say(f"multidrop: {sentence}", file=sys.stderr)
         while batch := poller.take():  # what came while it closed
             for take in takers:
                 take(batch)
@@ -98,13 +102,16 @@ class _Monitor:
         self._takers = [self._plant.add, *takers]
         self._at = Position()
         self._answer: Callable[[], None] | None = None  # what a y does
+        self._stops: list[threading.Thread] = []  # under way, or done
+        self._stood: dict[str, str] = {}  # what the last stop of all came to, by line
+        self._has_left = False
         self._side = SideReader(poller)
         self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
 
     def show(self, interruption: Interruption, seconds: float | None) -> None:
         begun = next_draw = next_tick = time.monotonic()
         with self._drawing() as (draw, every), keys() as wait_for_key:
-            while not interruption.came:
+            while not interruption.came and not self._has_left:
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
                     return
@@ -117,11 +124,19 @@ class _Monitor:
                     self._take()
                     draw(self._drawn())
                 key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
-                if key == "q":
-                    return
                 if key:
                     self._obey(key)
                     next_draw = 0.0
+
+    def left_open(self) -> Iterator[str]:
+        """What nobody has acknowledged, and whether a stop was under way."""
+        yield from self._at.failures
+        if self._is_stopping:
+            yield "a stop was under way and is not waited for: look at the motors"
+
+    @property
+    def _is_stopping(self) -> bool:
+        return any(thread.is_alive() for thread in self._stops)
 
     @contextmanager
     def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
@@ -129,8 +144,15 @@ class _Monitor:
         if self._console.is_dumb_terminal:
             yield self._console.print, SCROLL_S
             return
+        from rich.control import Control
+
         with self._console.screen(hide_cursor=True) as screen:
-            yield screen.update, DRAW_S
+
+            def draw(picture: Any) -> None:
+                self._console.control(Control.home())  # else it would be drawn below the last one
+                screen.update(picture)
+
+            yield draw, DRAW_S
 
     def _take(self) -> None:
         while batch := self._poller.take():
@@ -175,6 +197,8 @@ class _Monitor:
             ESCAPE: self._leave_page,
             "s": self._ask_to_stop,
             "S": self._ask_to_stop_all,
+            "a": self._acknowledge,
+            "q": self._leave,
         }
         if key in actions:
             actions[key]()
@@ -199,6 +223,20 @@ class _Monitor:
         if self._at.page:
             self._turn_page()
 
+    def _acknowledge(self) -> None:
+        """What was shown is seen; what had no room yet is shown next."""
+        del self._at.failures[: self._at.failures_shown]
+
+    def _leave(self) -> None:
+        if not self._is_stopping:
+            self._has_left = True
+            return
+        self._at.question = "A stop is under way. Leave all the same? y leaves, any other key does not"
+        self._answer = self._leave_all_the_same
+
+    def _leave_all_the_same(self) -> None:
+        self._has_left = True
+
     def _ask_to_stop(self) -> None:
         chosen = self._chosen
         self._at.question = f"Stop {chosen.name}? y stops it, any other key does not"
@@ -211,28 +249,32 @@ class _Monitor:
 
     def _stop_lines(self) -> None:
         """All lines at the same time: none waits for another's ramps."""
+        self._stood = {}
         for line in self._plant.plant.lines:
-            self._in_background("stopping all drives", partial(self._stop_all, line.name))
+            self._in_background(f"stopping all drives on {line.name}", partial(self._stop_all, line.name))
 
-    def _in_background(self, what: str, work: Callable[[], str]) -> None:
+    def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
         """A stop waits until the motor stands: meanwhile the screen goes on."""
         self._at.message = what
+        thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
+        self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
+        thread.start()
 
-        def carry_out() -> None:
-            try:
-                self._at.message = work()
-            except (BusError, ValueError) as failure:
-                self._at.message = str(failure)
+    def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
+        """Carry out a stop, and keep on the screen what failed until it is acknowledged."""
+        try:
+            self._at.message, failures = work()
+        except Exception as failure:  # whatever it is: who asked for a stop must see that it failed
+            failures = [f"{what} failed: {str(failure) or type(failure).__name__}"]
+        clock = datetime.now(UTC)
+        self._at.failures += [f"{clock:%H:%M:%S} {failure}" for failure in failures]
 
-        threading.Thread(target=carry_out, daemon=True).start()
-
-    def _stop(self, it: Watched) -> str:
+    def _stop(self, it: Watched) -> tuple[str, list[str]]:
         it.polled.drive.stop()
-        return f"{it.name} has stopped"
+        return f"{it.name} has stopped", []
 
-    def _stop_all(self, line: str) -> str:
-        """Those that are not seen to stand come first: they must not be cut off."""
+    def _stop_all(self, line: str) -> tuple[str, list[str]]:
         found = self._poller.bus(line).stop_all().values()
         doubtful = [str(it) for it in found if it.seen is not Seen.STOPPED]
-        stand = f"{len(found) - len(doubtful)} of {len(found)} drives on {line} have stopped"
-        return "; ".join([*doubtful, stand])
+        self._stood[line] = f"{len(found) - len(doubtful)} of {len(found)} drives on {line} have stopped"
+        return "; ".join(self._stood.values()), doubtful

@@ -5,8 +5,9 @@ What matters is in words and marks as well as in colours.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
@@ -20,6 +21,7 @@ LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE = 100  # has room for more columns
 OLD = 5.0  # s: an older value is marked
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
+ACKNOWLEDGE = "a acknowledges what FAILED   s stop   S stop all   q quit"
 HELP = "up/down choose   Enter registers   s stop   S stop all   q quit"
 PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter back   s stop   S stop all   q quit"
 
@@ -33,6 +35,8 @@ class Position:
     scrolled: int = 0  # lines of the page
     question: str = ""  # that waits for an answer
     message: str = ""
+    failures: list[str] = field(default_factory=list)  # of stops, until they are acknowledged
+    failures_shown: int = 0  # of them, as many as had room
 
 
 def overview(
@@ -43,7 +47,8 @@ def overview(
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
     top.append(Text(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
-    room = height - len(top) - 2
+    alarms = _alarms(at, size)
+    room = height - len(top) - len(alarms) - 2
     first = _first_seen(at.chosen, len(plant.drives), room)
     rows = [
         _drive(it, number == at.chosen, columns, width, now_ns, blocks)
@@ -51,7 +56,7 @@ def overview(
     ]
     hidden = len(plant.drives) - len(rows)
     note = f"{hidden} more drives: scroll" if hidden else ""
-    return [*top, *rows, *[Text()] * (room - len(rows)), *_foot(at, width, HELP, note)]
+    return [*top, *rows, *[Text()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
 
 
 def page(
@@ -73,11 +78,12 @@ def page(
     names = [*polled, *(name for name in names if name not in polled)]
     longest = max(map(len, names), default=0)
     rows = [_register(it, drive.register(name), others, longest, width, now_ns) for name in names]
-    room = height - len(top) - 2
+    alarms = _alarms(at, size)
+    room = height - len(top) - len(alarms) - 2
     at.scrolled = max(0, min(at.scrolled, len(rows) - room))
     seen = rows[at.scrolled : at.scrolled + room]
     note = f"registers {at.scrolled + 1} to {at.scrolled + len(seen)} of {len(rows)}"
-    return [*top, *seen, *[Text()] * (room - len(seen)), *_foot(at, width, PAGE_HELP, note)]
+    return [*top, *seen, *[Text()] * (room - len(seen)), *alarms, *_foot(at, width, PAGE_HELP, note)]
 
 
 # ---- its parts ----
@@ -188,10 +194,29 @@ def _register(
     return Text(_cut(text, width), style="yellow" if miss else "dim" if note == "not polled" else "")
 
 
+def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
+    """The failures that nobody has acknowledged, the oldest first, as far as there is room for them whole."""
+    width, height = size
+    most = max(2, (height - 8) // 2)
+    lines: list[str] = []
+    at.failures_shown = 0
+    failures = list(at.failures)  # a stop that ends meanwhile may bring more
+    for failure in failures:
+        wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
+        if lines and len(lines) + len(wrapped) > most - 1:
+            break
+        lines += wrapped[: most - 1]
+        at.failures_shown += 1
+    more = len(failures) - at.failures_shown
+    lines += [f"... and {more} more, after these are acknowledged"] if more else []
+    return [Text(f" ! {line}".ljust(width), style="bold white on red") for line in lines]
+
+
 def _foot(at: Position, width: int, help_text: str, note: str) -> list[Text]:
     if at.question:
         return [Text(), Text(_cut(f" {at.question}", width).ljust(width), style="bold reverse")]
     text = f" {at.message}" if at.message else f" {note}"
+    help_text = ACKNOWLEDGE if at.failures else help_text
     return [Text(_cut(text, width), style="bold"), Text(_cut(f" {help_text}", width), style="dim")]
 
 
