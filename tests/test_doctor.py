@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import threading
-from collections.abc import Iterator
+import tty
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_cli import Run, run
@@ -32,6 +35,7 @@ from multidrop.cli.findings import (
     round_trip_finding,
     rs485_finding,
 )
+from multidrop.core import Completion, Framing, Message, Result, build_reply
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import Simulator, Wire, simulated
@@ -41,6 +45,13 @@ __all__ = ["run"]  # a fixture
 
 USUAL = Settings(9600, "8N1")
 SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
+REFUSAL = bytes.fromhex("F7 83 04 61 1E")
+
+
+def heard(raw: bytes, result: int = Result.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
+    """What became of the request that nobody should answer."""
+    reply = Message(0xF7, 3, exception=exception)
+    return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)
 
 
 @pytest.fixture
@@ -153,13 +164,28 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
             "on: the driver switches the direction, and hears what it sends: multidrop takes the echo out",
             False,
         ),
-        (echo_finding(b"", SENT, USUAL), "none at 9600 8N1: nothing came back of what was sent", False),
         (
-            echo_finding(SENT, SENT, USUAL),
+            echo_finding(heard(b""), SENT, USUAL),
+            "none at 9600 8N1: nothing came back of what was sent",
+            False,
+        ),
+        (
+            echo_finding(heard(SENT), SENT, USUAL),
             "the adapter hears what it sends at 9600 8N1; multidrop takes it out",
             False,
         ),
-        (echo_finding(b"\x00\xff", SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+        (echo_finding(heard(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+        (
+            echo_finding(heard(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
+            "none at 9600 8N1; address 247, which should be nobody's, answers with exception 04",
+            True,
+        ),
+        (
+            echo_finding(heard(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
+            "the adapter hears what it sends at 9600 8N1; address 247, which should be nobody's, answers "
+            "with a value",
+            True,
+        ),
     ],
 )
 def test_each_is_a_sentence_and_advice_only_where_there_is_something_to_do(
@@ -171,14 +197,25 @@ def test_each_is_a_sentence_and_advice_only_where_there_is_something_to_do(
 
 def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
     drive = InvtCHE(1)
-    usual = round_trip_finding(drive, [0.005] * ROUNDS)
+    usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
     assert usual.what.endswith("after 5.0 ms at least, 5.0 in the middle, 5.0 at most")
     assert usual.advice == ""
-    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10)
+    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10, 17)
     assert "20.1 in the middle" in slow.what
-    assert slow.what.endswith("7 of 20 requests stayed without a good reply")
+    assert slow.what.endswith("4 of 17 requests stayed without a good reply")
     assert "usually takes 5.0 ms" in slow.advice
-    assert "did not answer once in 20 requests" in round_trip_finding(drive, []).what
+    assert "did not answer once in 4 requests" in round_trip_finding(drive, [], 4).what
+
+
+def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
+    told = round_trip_finding(InvtCHE(1), [0.0004, 0.0005, 0.0006], 3, 0.0094)
+    assert told.what.endswith(
+        "after 0.4 ms at least, 0.5 in the middle, 0.6 at most, from when its request was handed over "
+        "(a wire at 9600 8N1 alone takes 9.4 ms)"
+    )
+    assert told.advice == ""
+    assert round_trip_finding(InvtCHE(1), [0.0140], 1, 0.0094).advice == ""
+    assert "the adapter's or the network's" in round_trip_finding(InvtCHE(1), [0.0240], 1, 0.0094).advice
 
 
 # ---- the command ----
@@ -243,17 +280,87 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
 
 
+@pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)
+def test_no_delay_is_negative_where_nothing_tells_of_bits(run: Run, port: str) -> None:
+    """The far end answers at once: sooner than a wire could have brought the request."""
+    status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "1")
+    told = " ".join(out.split())
+    assert status == 0
+    found = re.search(
+        r"invt-che@1 begins to answer after (\S+) ms at least, (\S+) in the middle, (\S+) at", told
+    )
+    assert found
+    least, median, most = map(float, found.groups())
+    assert 0 <= least <= median <= most
+    assert "from when its request was handed over (a wire at 9600 8N1 alone takes 9.4 ms)" in told
+
+
 def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> None:
     status, out, _ = run("doctor", port, "--baudrate", "19200", "--format", "8E1")
     assert status == 0
     assert "none at 19200 8E1: nothing came back" in out
 
 
-def test_a_drive_that_is_not_there_is_told(run: Run, port: str) -> None:
-    status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "9")
-    assert status == 1
+class FarEnd:
+    """A line of which every request is noted, and answered or not."""
+
+    def __init__(self, answer: Callable[[bytes], bytes]) -> None:
+        self.requests: list[bytes] = []
+        self._answer = answer
+        self._fd, slave = os.openpty()
+        tty.setraw(slave)
+        self.path = os.ttyname(slave)
+        self._slave = slave
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        received = b""
+        while (piece := os.read(self._fd, 4096)) != b"end":
+            received += piece
+            while len(received) >= 8:
+                request, received = received[:8], received[8:]
+                self.requests.append(request)
+                os.write(self._fd, self._answer(request))
+
+    def close(self) -> None:
+        os.write(self._slave, b"end")
+        self._thread.join()
+        os.close(self._fd)
+        os.close(self._slave)
+
+
+@pytest.fixture
+def far_end() -> Iterator[Callable[[Callable[[bytes], bytes]], FarEnd]]:
+    made: list[FarEnd] = []
+
+    def make(answer: Callable[[bytes], bytes]) -> FarEnd:
+        made.append(FarEnd(answer))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, far_end: Any) -> None:
+    """As a server does that answers for every address."""
+    end = far_end(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
+    told = " ".join(run("doctor", end.path)[1].split())
+    assert "answers with exception 04" in told
+    assert "came unasked" not in told
+
+
+def test_only_what_was_sent_is_counted(run: Run, far_end: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A silent drive is not asked again while its late answer may come; that was no request."""
+    end = far_end(lambda request: b"")
+    monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
-    assert "invt-che@9 did not answer once in 20 requests -> check its address" in told
+    assert status == 1
+    sent = sum(request[0] == 9 for request in end.requests)
+    assert 1 <= sent < ROUNDS
+    assert f"invt-che@9 did not answer once in {sent} request{'s' * (sent != 1)} -> check its address" in told
 
 
 @pytest.mark.parametrize(

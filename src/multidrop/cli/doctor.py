@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import textwrap
+import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -24,7 +25,7 @@ from multidrop.cli.findings import (
 )
 from multidrop.cli.saying import say
 from multidrop.cli.target import add_json_argument
-from multidrop.core import Exchange, Framing, Message, Respondent, build_request
+from multidrop.core import Completion, Exchange, Framing, Message, Respondent, build_request
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.line import Line
@@ -33,6 +34,9 @@ from multidrop.plan import blocks
 from multidrop.timing import Settings
 
 WIDTH = 80
+MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
+LOOK_S = 0.05  # between attempts to send what is held back
+_PSEUDO = "/dev/pts/"
 NOBODY = 247  # the address that the echo's request goes to
 SETTING_UP = (
     "while it has the port, multidrop locks it against programs that heed such locks, makes it raw, sets "
@@ -119,7 +123,7 @@ def _local(port: str) -> Iterator[Finding]:
 def _opened(port: str, device: str) -> Iterator[Finding]:
     """What there is to be said of a port that multidrop has open."""
     link = f", which is {device}" if device != port else ""
-    if device.startswith("/dev/pts/"):
+    if device.startswith(_PSEUDO):
         yield Finding("port", f"{port} is a pseudo-terminal{link}: a program is at its other end")
         yield Finding("set here", SETTING_UP)
         yield Finding(
@@ -157,12 +161,12 @@ def _echo(port: str, settings: Settings) -> Finding:
     )
     line = Line(port)
     try:
-        heard = line.carry_out(asked).raw
+        found = line.carry_out(asked)
     except LineError as failure:
         return Finding("echo", f"not tried: {failure.reason}")
     finally:
         line.close()
-    return echo_finding(heard, build_request(Framing.RTU, request), settings)
+    return echo_finding(found, build_request(Framing.RTU, request), settings)
 
 
 def _round_trip(port: str, drive: Drive | None) -> Finding:
@@ -177,14 +181,29 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
     with Bus(port) as bus:
         bus.attach(drive)
         made = exchange(drive, block.request(drive.address), bus.respondent(drive))
-        completions = [bus.line.carry_out(made) for _ in range(ROUNDS)]
-    request = len(build_request(drive.framing, made.request)) * drive.settings.character
-    delays = sorted(
-        (it.first_ns - it.sent_ns) / 1e9 - request - drive.settings.character
-        for it in completions
-        if it.result > 0
-    )
-    return round_trip_finding(drive, delays)
+        asked = list(_asked(bus.line, made))
+    # Request and first character: on a network and on a pseudo-terminal nobody knows how long they take.
+    wire = (len(build_request(drive.framing, made.request)) + 1) * drive.settings.character
+    tells_bits = "://" not in port and not str(Path(port).resolve()).startswith(_PSEUDO)
+    seen = [(it.first_ns - it.sent_ns) / 1e9 for it in asked if it.result > 0]
+    delays = sorted(max(0.0, it - wire) if tells_bits else it for it in seen)
+    return round_trip_finding(drive, delays, len(asked), 0.0 if tells_bits else wire)
+
+
+def _asked(line: Line, made: Exchange) -> Iterator[Completion]:
+    """What became of ROUNDS requests, or of those that could be sent within MOST_S.
+
+    What was held back, because the answer to an earlier one may still come, was never sent.
+    """
+    end = time.monotonic() + MOST_S
+    count = 0
+    while count < ROUNDS and (time.monotonic() < end or not count):
+        found = line.carry_out(made)
+        if found.sent_ns:
+            count += 1
+            yield found
+        else:
+            time.sleep(LOOK_S)
 
 
 def _text(findings: list[Finding]) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from multidrop.cli.adapter import Adapter, RS485Mode
+from multidrop.core import Completion
 from multidrop.drive import Drive
 from multidrop.timing import Settings
 
@@ -71,7 +72,11 @@ def rs485_finding(mode: RS485Mode | None) -> Finding:
     return Finding("RS-485 mode", f"on: the driver switches the direction{hears}")
 
 
-def echo_finding(heard: bytes, sent: bytes, settings: Settings) -> Finding:
+def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
+    """`found` is what became of a request that nobody should answer; `sent` its bytes."""
+    if found.result > 0:
+        return _answered_finding(found, sent, settings)
+    heard = found.raw
     if not heard:
         return Finding("echo", f"none at {settings}: nothing came back of what was sent")
     if heard == sent:
@@ -83,24 +88,45 @@ def echo_finding(heard: bytes, sent: bytes, settings: Settings) -> Finding:
     )
 
 
-def round_trip_finding(drive: Drive, delays: list[float]) -> Finding:
-    """`delays` are sorted, in s, from the request's last bit to the reply's first, as seen from here."""
+def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
+    """A reply to the request itself is no foreign traffic."""
+    reply = found.reply
+    how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
+    echo = "the adapter hears what it sends" if found.skipped == len(sent) else "none"
+    return Finding(
+        "echo",
+        f"{echo} at {settings}; address {reply.address}, which should be nobody's, answers {how}",
+        "either a drive has this address, or a server or gateway answers for drives that are not there: "
+        "then a drive that is missing seems to refuse",
+    )
+
+
+def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: float = 0.0) -> Finding:
+    """What so many requests that were sent came to.
+
+    `delays` are sorted, in s, from the request's last bit to the reply's first, as seen from here. Where
+    the port tells nothing of bits, as a network's, they begin when the request was handed over; `wire` is
+    then how long, in s, request and first character would be on a wire.
+    """
     if not delays:
         return Finding(
             "round trip",
-            f"{drive.name} did not answer once in {ROUNDS} requests",
+            f"{drive.name} did not answer once in {asked} request{'s' * (asked != 1)}",
             "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
             is_failure=True,
         )
     least, median, most = delays[0], delays[len(delays) // 2], delays[-1]
     figures = f"{least * 1e3:.1f} ms at least, {median * 1e3:.1f} in the middle, {most * 1e3:.1f} at most"
-    lost = f"; {ROUNDS - len(delays)} of {ROUNDS} requests stayed without a good reply"
-    what = f"{drive.name} begins to answer after {figures}{lost if len(delays) < ROUNDS else ''}"
-    if median - drive.response_delay > SLOW_S:
+    alone = f"a wire at {drive.settings} alone takes {wire * 1e3:.1f} ms"
+    since = f", from when its request was handed over ({alone})" if wire else ""
+    lost = f"; {asked - len(delays)} of {asked} requests stayed without a good reply"
+    what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
+    if median - wire - drive.response_delay > SLOW_S:
+        rest = "the adapter's or the network's" if wire else "the adapter's"
         return Finding(
             "round trip",
             what,
-            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest is the adapter's, "
+            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest is {rest}, "
             "or the drive's own parameter for the response delay",
         )
     return Finding("round trip", what)
