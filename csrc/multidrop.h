@@ -122,7 +122,7 @@ struct md_tally {
     uint64_t exchanges, answered, values; /* the first eight: counted at every exchange, and side by side */
     uint64_t sent;        /* requests that began to leave */
     uint64_t stray_bytes; /* bytes that were no part of a reply */
-    uint64_t ideal_ns;    /* what the answered exchanges had to take of the line */
+    uint64_t ideal_ns;    /* what the answered exchanges had to take of the line, and no more than they took */
     int64_t longest_ns;   /* response delay */
     uint64_t late;        /* answers that came after their time-out */
     uint64_t delays[128]; /* replies, by their response delay: bucket n is from md_delay_edge(n) to that of n + 1 */

@@ -245,6 +245,14 @@ def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
 
 
+def test_no_more_is_used_of_a_port_without_a_wire_than_there_is(tmp_path: Path) -> None:
+    """Requests follow each other by 2 ms, where a wire would take 32."""
+    rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
+    planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
+    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    assert 0.9 < line.utilisation <= 1.0 + 1e-9
+
+
 def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
     """In the first half the pump's two registers are read singly, each with a reply of 7 characters."""
     rows = [

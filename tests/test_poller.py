@@ -519,16 +519,33 @@ def test_what_is_under_way_at_the_end_is_waited_for(far_end: tuple[int, str], ev
 def test_what_is_not_answered_by_the_end_has_a_row(
     far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The request that is under way, the slot that waits behind it, and none that is not due yet."""
+    """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
     monkeypatch.setattr(poller_module, "PARTING_NS", 10_000_000)
     master, path = far_end
-    waiting = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
-    with Polling(line(path, patient(30.0), waiting)) as polling:
+    short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
+    waiting = polled(Patient(3, name="pump-3"), [Patient.fault], 60.0)
+    with Polling(line(path, patient(0.0001), short, waiting)) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
-    told = [(row.drive, row.value, row.status) for row in polling.rows]
-    assert told == [("pump-1", None, "poll ended"), ("pump-2", None, "poll ended")]
+    told = {(row.drive, row.value, row.status) for row in polling.rows}
+    assert told == {("pump-1", None, "poll ended"), ("pump-2", None, "poll ended")}
     assert all(row.monotonic_ns > 0 for row in polling.rows)
     polling.check_summary()
+
+
+@pytest.mark.parametrize("leaves", ["the poll", "the drive"])
+def test_a_slot_that_is_not_over_at_the_end_was_not_missed(far_end: tuple[int, str], leaves: str) -> None:
+    """As at the end of every healthy run: the next value is due already, or about to be."""
+    master, path = far_end
+    first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
+    second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
+    with Polling(line(path, first, second)) as polling:
+        assert os.read(master, 1024)  # the one; the other waits
+        if leaves == "the drive":
+            polling.poller.remove("line", "pump-2")
+        os.write(master, checksums.rtu("01 03 02 00 01"))
+    assert [(row.drive, row.status) for row in polling.rows] == [("pump-1", "ok")]
+    polling.check_summary()
+    assert polling.poller.summary()["misses"] == 0
 
 
 def test_motors_are_stopped_before_the_port_is_closed(port: str, pump: SimulatedDrive) -> None:

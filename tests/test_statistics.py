@@ -15,7 +15,7 @@ from line_driver import MS, LineDriver
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
 from multidrop._core import ffi, lib
-from test_learning import CHARACTER, READ, WRITE, answer, ask, drive, line
+from test_learning import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from toy import Toy
 
 import multidrop.line
@@ -75,6 +75,30 @@ def test_what_is_counted_is_the_drives_own_delay(line: LineDriver, drive: Respon
     found = Statistics(1.0, drive.tally()).delays
     assert found.longest == pytest.approx(0.015)
     assert found.p50 == pytest.approx(0.010, rel=1 / 16)
+
+
+@pytest.mark.parametrize("delay_ms", [0, 3, 20])
+def test_a_wire_is_used_for_what_its_settings_say(line: LineDriver, drive: Respondent, delay_ms: int) -> None:
+    for _ in range(10):
+        answer(line, drive, delay_ms * MS)
+    characters = (8 + 7) * CHARACTER
+    assert drive.tally().ideal_ns == pytest.approx(10 * (characters + delay_ms * MS + SILENCE), rel=0.1)
+
+
+def test_a_port_without_a_wire_is_not_used_for_longer_than_there_is(
+    line: LineDriver, drive: Respondent
+) -> None:
+    """The whole reply is there after 0.1 ms, where a wire takes 15 characters."""
+    begun = line.now
+    for _ in range(100):
+        ask(line, drive)
+        line.now += MS // 10
+        line.receive(reply())
+        line.wait_until_done()
+    line.now += 8 * CHARACTER  # the last request is reckoned to leave by then
+    found = Statistics((line.now - begun) / 1e9, drive.tally())
+    assert found.samples == 100
+    assert 0.9 < found.utilisation <= 1.0 + 1e-9
 
 
 # ---- the guide's counters ----

@@ -92,6 +92,11 @@ class Chosen:
     delay: float
 
 
+def over(slots: list[tuple[Asked, int]], ended_ns: int) -> list[tuple[Asked, int]]:
+    """Those that are over when polling ends: in a slot that lasts longer nothing was missed."""
+    return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]
+
+
 class PolledLine:
     """A line's bus, its schedule, and what is queued on it. `number` is what the core calls it by."""
 
@@ -169,8 +174,7 @@ class PolledLine:
         with self._lock:
             now = now_ns()
             jobs = [it for it in self.schedule.jobs if it.owner is drive]
-            slots = [(it, it.due_ns) for it in jobs if it.period_ns and it.due_ns <= now]
-            self._miss(slots, Result.POLL_ENDED)
+            self._miss(over([(it, it.due_ns) for it in jobs if it.period_ns], now), Result.POLL_ENDED)
             for job in jobs:
                 self.schedule.remove(job)
             self.schedule.forget(drive.address)
@@ -377,7 +381,7 @@ class PolledLine:
             self._forget_done(port)
             queued = [(it.job, it.due_ns) for it in self._queued if it.due_ns is not None]
             slots = [*queued, *self.schedule.pass_slots(ended_ns)]
-            self._miss([(job, due_ns) for job, due_ns in slots if due_ns <= ended_ns], Result.POLL_ENDED)
+            self._miss(over(slots, ended_ns), Result.POLL_ENDED)
         else:
             self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
         self._over_ns = now_ns()

@@ -87,7 +87,7 @@ class Poller:
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be.
 
-        What is under way is waited for, for a second at most; every slot that was due by now has a row.
+        What is under way is waited for, for a second at most; every slot that is over by now has a row.
         """
         if self._closing:
             return

@@ -119,7 +119,11 @@ class Statistics:
 
     @property
     def utilisation(self) -> float:
-        """The time that the answered exchanges had to take of the line, as a part of all time."""
+        """The time that the answered exchanges had to take of the line, as a part of all time.
+
+        Silence, request, response delay and reply, at the line's settings. A port that is faster than its
+        settings, such as a network's or a pseudo-terminal, needs no more than it took: never more than 1.
+        """
         return self.tally.ideal_ns / 1e9 / self.seconds
 
     @property
