@@ -91,6 +91,24 @@ def test_pandas_takes_it() -> None:
     assert list(frame["value"].dropna()) == [49.99, 0.3]
 
 
+def test_pandas_by_pyarrow_has_the_same_times() -> None:
+    """As before pandas 3.0."""
+    pytest.importorskip("pandas", reason="needs pandas")
+    frame = pa.table(example()).to_pandas()
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+
+
+@pytest.mark.parametrize("library", ["pandas", "numpy"])
+def test_what_would_take_times_for_numbers_is_told_what_to_take(library: str) -> None:
+    """pandas' constructor does not know Arrow's interface, and goes through rows one by one."""
+    taker = pytest.importorskip(library, reason=f"needs {library}")
+    take = taker.DataFrame if library == "pandas" else taker.asarray
+    with pytest.raises(TypeError, match=r"take them with pandas\.DataFrame\.from_arrow\(batch\)"):
+        take(example())
+    assert list(example()) == EXAMPLE
+
+
 def test_duckdb_takes_it() -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     batch = example()

@@ -2,7 +2,9 @@
 
 Any library that speaks the Arrow PyCapsule interface takes a batch as it is, and none of them is
 needed here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.DataFrame.from_arrow(batch)`,
-`duckdb.sql("from batch")`. For NumPy, with NaN for every miss:
+`duckdb.sql("from batch")`; where pandas is older than 3.0, `pyarrow.table(batch).to_pandas()`.
+`pandas.DataFrame(batch)` does not know the interface, and would go through the rows, whose times are whole
+numbers: that is refused. For NumPy, with NaN for every miss:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
 """
 
@@ -11,7 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from multidrop.core import STATUSES, Columns, Names, spell
 
@@ -42,6 +44,14 @@ class Rows(ABC):
     @abstractmethod
     def arrow(self) -> Any:
         """The rows as a nanoarrow array."""
+
+    def __array__(self, *how: object, **details: object) -> NoReturn:
+        """Refuse to be one array, which is what `pandas.DataFrame(batch)` asks for. Raises TypeError."""
+        raise TypeError(
+            "rows are columns of several types, not one array: take them with "
+            "pandas.DataFrame.from_arrow(batch), where pandas is older than 3.0 with "
+            "pyarrow.table(batch).to_pandas(), or with polars.DataFrame(batch)"
+        )
 
     def __arrow_c_schema__(self) -> Any:
         return schema().__arrow_c_schema__()
