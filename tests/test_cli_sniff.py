@@ -298,7 +298,8 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
         for number, (raw, side) in enumerate(frames):
             it.write(raw, side, number * 1_000_000, "hall-1")
     status, out, err = run("decode", path, *words)
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert not err or err.endswith("/meter.py is run as Python: a model of one's own is a program\n")
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import struct
+import subprocess
 from pathlib import Path
 
 import pytest
 from frames import PRINTED
+from terminals import MULTIDROP
 from test_capture import write
 from test_cli import Run, run
 from test_plot import record, row
@@ -155,3 +157,24 @@ def test_commands_print_through_what_spells_out() -> None:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     }
     assert found == ours
+
+
+@pytest.mark.parametrize("command", ["plan", "poll"])
+def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str) -> None:
+    """In a process of its own, as a file is run once in each."""
+    (tmp_path / "fan.py").write_text(
+        "from pathlib import Path\nfrom multidrop import Drive, reading\n"
+        f"Path({str(tmp_path / 'ran')!r}).touch()\n\n"
+        "class Fan(Drive):\n    speed = reading(1, 'rpm')\n"
+    )
+    plant = tmp_path / "hall.toml"
+    plant.write_text(
+        '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
+        + "".join(f'[[line.drive]]\nname = "fan-{n}"\nmodel = "fan.py:Fan"\naddress = {n}\n' for n in (1, 2))
+    )
+    done = subprocess.run([*MULTIDROP, command, str(plant)], capture_output=True, text=True)
+    assert (tmp_path / "ran").exists()
+    told, *rest = done.stderr.splitlines()
+    assert told == f"multidrop: {tmp_path}/fan.py is run as Python: a model of one's own is a program"
+    assert not any("is run as Python" in line for line in rest)
+    assert done.returncode == (0 if command == "plan" else 1)
