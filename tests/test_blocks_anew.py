@@ -10,6 +10,7 @@ from toy import Toy
 from worlds import S, World, WorldWire
 
 from multidrop.batch import Row
+from multidrop.polled_line import PolledLine
 from multidrop.register import HOLDING, reading
 from multidrop.sim import Faults, SimulatedDrive
 
@@ -81,3 +82,18 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
                 world.run(6.0)
                 seen.add(len(line._jobs))
     assert seen == {2, 3}
+
+
+def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where delays are those of the host alone, and never the same."""
+    drive = Wide(1, name="pump-1")
+    sim = SimulatedDrive(Wide(1), response_delay=SOON)
+    choose, chosen = PolledLine._choose, []
+    monkeypatch.setattr(PolledLine, "_choose", lambda *given: chosen.append(given) or choose(*given))
+    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
+        for sim.response_delay in (SOON / 20, 2 * SOON, SOON / 5, SOON):
+            assert asked_together(world.run(6.0)) == {False}
+        assert len(chosen) == 1
+        sim.response_delay = LATE
+        world.run(6.0)
+        assert len(chosen) == 2

@@ -1,5 +1,6 @@
 """Plans: never over a limit, never into what the document forbids, never dearer than brute force."""
 
+import math
 from collections.abc import Iterator
 from itertools import permutations
 
@@ -7,11 +8,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from multidrop.core import Framing, Message
+from multidrop.core import Framing, Message, build_request, reply_length
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
-from multidrop.plan import Block, blocks, duration, gap, in_order, planned, write_request
-from multidrop.register import COIL, HOLDING, INPUT, Register, Table, Wire, command, reading, setting
+from multidrop.plan import Block, blocks, duration, gap, in_order, plan, planned, sending, write_request
+from multidrop.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Register,
+    Table,
+    Wire,
+    command,
+    reading,
+    setting,
+)
 
 
 class Example(Drive):
@@ -111,7 +123,7 @@ def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[
             yield [registers[:end], *rest]
 
 
-def cheapest_of_all(drive: Drive, registers: list[Register[float]]) -> float:
+def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float | None = None) -> float:
     """By trying every way to cut the sorted registers of one table into requests."""
     table = registers[0].table
     limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
@@ -124,7 +136,7 @@ def cheapest_of_all(drive: Drive, registers: list[Register[float]]) -> float:
             legal = all(at in readable or at in gaps for at in range(start, end))
             if len(group) > 1 and (end - start > limit or not legal):
                 break
-            total += duration(drive, Block(table, start, end - start, tuple(group)))
+            total += duration(drive, Block(table, start, end - start, tuple(group)), delay)
         else:
             best = min(best, total)
     return best
@@ -166,6 +178,70 @@ def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing
     )
     total = sum(duration(drive, block) for block in found)
     assert total == pytest.approx(cheapest_of_all(drive, list(registers.values())))
+
+
+class Scattered(Drive):
+    """Registers with gaps of many lengths between them, all of which may be read."""
+
+    framings = (Framing.RTU, Framing.ASCII)
+    most_registers = {HOLDING: 90}
+    readable_gaps = {HOLDING: range(2000)}
+    addresses_of = (0, 1, 9, 40, 41, 60, 61, 62, 90, 140)
+    r0, r1, r2, r3, r4, r5, r6, r7, r8, r9 = (reading(address) for address in addresses_of)
+
+
+@settings(max_examples=200)
+@given(
+    st.sets(st.sampled_from(list(Scattered.registers.values())), min_size=1, max_size=8),
+    st.sampled_from([1200, 9600, 38400, 115200]),
+    st.sampled_from([Framing.RTU, Framing.ASCII]),
+    st.floats(0, 0.2),
+    st.floats(0, 1),
+)
+def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
+    wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
+) -> None:
+    drive = Scattered(1, baudrate=baudrate, framing=framing)
+    registers = sorted(wanted, key=lambda register: register.address)
+    found = plan(drive, [(register, None) for register in registers], delay)
+
+    def excess(at: float) -> float:
+        """Seconds by which another plan is quicker at this response delay."""
+        own = sum(duration(drive, one.block, at) for one in found.planned)
+        return own - cheapest_of_all(drive, registers, at)
+
+    assert found.suits(delay)
+    most = min(found.most, 10.0)
+    for inside in (found.least, found.least + part * (most - found.least), most):
+        assert excess(inside) == pytest.approx(0, abs=1e-9)
+    for outside in (found.least - 1e-4, found.most + 1e-4):
+        if 0 <= outside < math.inf:
+            assert not found.suits(outside)
+            assert excess(outside) > 1e-6
+
+
+def test_a_plan_of_several_rates_suits_the_delays_that_suit_each() -> None:
+    drive = Scattered(1, baudrate=9600)
+    rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
+    apart = [plan(drive, [(it, every) for it in registers], 0.02) for every, registers in rates.items()]
+    together = plan(drive, [(it, every) for every, registers in rates.items() for it in registers], 0.02)
+    assert len({(one.least, one.most) for one in apart}) == 2
+    assert together.least == max(one.least for one in apart)
+    assert together.most == min(one.most for one in apart)
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+@pytest.mark.parametrize("table", [HOLDING, INPUT, COIL, DISCRETE])
+def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Table) -> None:
+    drive = Example(1)
+    drive.framing = framing
+    for count in range(1, 126):
+        block = Block(table, 0, count, ())
+        request = block.request(1)
+        if framing is Framing.DELIXI:
+            request = Message(1, 7, 0, data=bytes(4))
+        frames = len(build_request(framing, request)) + reply_length(framing, request)
+        assert sending(drive, block) == pytest.approx(frames * drive.settings.character)
 
 
 FORBIDDEN = {  # addresses of which the documents do not say that they can be read, within the tables

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
-from multidrop.core import Framing, Message, build_request, reply_length
+from multidrop.core import Framing, Message
 from multidrop.drive import Drive
 from multidrop.register import Carrier, Register, Table
 
@@ -43,6 +45,31 @@ class Planned:
     every: float | None = None
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Blocks that read a drive's registers, and the response delays, in s, at which none are quicker."""
+
+    planned: tuple[Planned, ...]
+    least: float  # response delay; with a shorter one more requests of fewer characters would be quicker
+    most: float  # with a longer one, fewer requests of more characters
+
+    def suits(self, delay: float, margin: float = 0.0) -> bool:
+        """Whether these blocks are the best at this response delay, or it is off by this part at most."""
+        return self.least * (1 - margin) <= delay <= self.most * (1 + margin)
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to read registers of a table: of all with as many requests the one of the fewest characters."""
+
+    characters: int  # of the requests and their replies
+    blocks: tuple[Block, ...]
+
+    @property
+    def requests(self) -> int:
+        return len(self.blocks)
+
+
 def silence(drive: Drive) -> float:
     """Seconds that are kept around its exchanges: a bit more, for the other side's second stop bit.
 
@@ -54,11 +81,19 @@ def silence(drive: Drive) -> float:
     return max(drive.needed_silence(), least) + settings.bit
 
 
+# Characters of a read's request and reply without its data, and of each byte of that.
+_FRAMES = {Framing.RTU: (8 + 5, 1), Framing.ASCII: (17 + 11, 2), Framing.DELIXI: (21 + 21, 0)}
+
+
+def _characters(framing: Framing, table: Table, count: int) -> int:
+    """Characters of the request that reads so many registers, and of its reply."""
+    around, each = _FRAMES[framing]
+    return around + each * ((count + 7) // 8 if table.carrier is Carrier.BIT else 2 * count)
+
+
 def sending(drive: Drive, block: Block) -> float:
     """Seconds in which characters of the request and of the reply are on the wire."""
-    request = block.request(drive.address)
-    characters = len(build_request(drive.framing, request)) + reply_length(drive.framing, request)
-    return characters * drive.settings.character
+    return _characters(drive.framing, block.table, block.count) * drive.settings.character
 
 
 def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
@@ -83,22 +118,47 @@ def kind(drive: Drive) -> tuple[float, str]:
     return silence(drive), str(drive.settings)
 
 
-def planned(
+def plan(
     drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
-) -> list[Planned]:
-    """The blocks that read these registers, each as often as is wanted, with this response delay.
+) -> Plan:
+    """The plan that reads these registers, each as often as is wanted, with this response delay.
 
     Registers of different rates never share a block: what is asked for more seldom would be read
-    more often than it is wanted.
+    more often than it is wanted. Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    return [
-        Planned(drive, block, every)
-        for every, registers in rates.items()
-        for block in blocks(drive, registers, delay)
-    ]
+    delay = drive.response_delay if delay is None else delay
+    found: list[Planned] = []
+    least, most = 0.0, math.inf
+    for every, registers in rates.items():
+        for ways in _tables(drive, registers):
+            way = min(ways, key=lambda way: _duration(drive, way, delay))
+            found += [Planned(drive, block, every) for block in way.blocks]
+            for other in ways:
+                if other.requests < way.requests:
+                    most = min(most, _even(drive, other, way))
+                elif other.requests > way.requests:
+                    least = max(least, _even(drive, way, other))
+    return Plan(tuple(found), least, most)
+
+
+def planned(
+    drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
+) -> list[Planned]:
+    """The blocks of that plan."""
+    return list(plan(drive, wanted, delay).planned)
+
+
+def _duration(drive: Drive, way: Way, delay: float) -> float:
+    return way.requests * (silence(drive) + delay) + way.characters * drive.settings.character
+
+
+def _even(drive: Drive, few: Way, many: Way) -> float:
+    """The response delay in s at which few requests take as long as many."""
+    saved = (few.characters - many.characters) * drive.settings.character
+    return saved / (many.requests - few.requests) - silence(drive)
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
@@ -128,7 +188,7 @@ def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tupl
 
 def alone(register: Register[Any]) -> Block:
     """The block that reads one register and nothing else."""
-    return _block(register.table, [register])
+    return Block(register.table, register.address, register.words, (register,))
 
 
 def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None = None) -> tuple[Block, ...]:
@@ -138,6 +198,19 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
     also across others that can be read, and across reserved addresses where the family's document
     allows that. Raises ValueError for a register that cannot be read.
     """
+    return tuple(it.block for it in plan(drive, ((register, None) for register in registers), delay).planned)
+
+
+def _tables(drive: Drive, registers: Iterable[Register[Any]]) -> list[tuple[Way, ...]]:
+    """For each table, the ways to read those of these registers that are in it."""
+    return [_ways(drive.framing, *neighbours) for neighbours in _neighbours(drive, registers)]
+
+
+Neighbours = tuple[Table, tuple[Register[Any], ...], tuple[bool, ...], int]
+
+
+def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[Neighbours]:
+    """For each table, its registers by address, whether all up to the next may be read, and the limit."""
     tables: dict[Table, list[Register[Any]]] = {}
     for register in dict.fromkeys(registers):
         if not register.readable:
@@ -145,50 +218,70 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
                 f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}"
             )
         tables.setdefault(register.table, []).append(register)
-    return tuple(
-        block for table, wanted in tables.items() for block in _cheapest(drive, table, wanted, delay)
-    )
+    found = []
+    for table, wanted in tables.items():
+        wanted.sort(key=lambda register: (register.address, register.words))
+        readable, gaps = _readable(drive, table, wanted), drive.readable_gaps.get(table, range(0))
+        joined = tuple(
+            all(at in readable or at in gaps for at in range(one.address, other.address))
+            for one, other in pairwise(wanted)
+        )
+        limit = drive.most_registers.get(table, 1)
+        found.append((table, tuple(wanted), joined, limit))
+    return found
 
 
 def runs(drive: Drive, registers: Iterable[Register[Any]]) -> list[Block]:
     """Return every request that may read neighbours among these registers, as far as the limits allow."""
-    tables: dict[Table, list[Register[Any]]] = {}
-    for register in registers:
-        tables.setdefault(register.table, []).append(register)
     found = []
-    for table, own in tables.items():
-        own = sorted(own, key=lambda register: (register.address, register.words))
-        readable = _readable(drive, table, own)
-        for begin in range(len(own)):
-            for end in range(begin + 1, len(own) + 1):
-                block = _block(table, own[begin:end])
-                if not _allowed(drive, block, readable):
+    for table, wanted, joined, limit in _neighbours(drive, registers):
+        for begin in range(len(wanted)):
+            start, stop = wanted[begin].address, 0
+            for end in range(begin + 1, len(wanted) + 1):
+                stop = max(stop, wanted[end - 1].address + wanted[end - 1].words)
+                if end - begin > 1 and (stop - start > limit or not joined[end - 2]):
                     break
-                found.append(block)
+                found.append(Block(table, start, stop - start, wanted[begin:end]))
     return found
 
 
-def _cheapest(drive: Drive, table: Table, registers: list[Register[Any]], delay: float | None) -> list[Block]:
-    """Least total duration by dynamic programming over where the last block begins."""
-    registers = sorted(registers, key=lambda register: (register.address, register.words))
-    readable = _readable(drive, table, registers)
-    best: list[tuple[float, list[Block]]] = [(0.0, [])]
+@lru_cache(maxsize=256)
+def _ways(
+    framing: Framing, table: Table, registers: tuple[Register[Any], ...], joined: tuple[bool, ...], limit: int
+) -> tuple[Way, ...]:
+    """All ways that are the quickest at some response delay, and maybe others; the fewest requests first.
+
+    By dynamic programming over where the last block begins. `joined` says of each register and the next one
+    whether all from the one to the other may be read, and `limit` how many one request may read. A block of
+    a single register is read whole, whatever the limit.
+    """
+    fronts: list[list[Way]] = [[Way(0, ())]]  # for the first so many registers
     for end in range(1, len(registers) + 1):
-        choices = []
+        fewest: dict[int, Way] = {}  # characters, by number of requests
+        stop = 0
         for begin in range(end - 1, -1, -1):
-            block = _block(table, registers[begin:end])
-            if not _allowed(drive, block, readable):
+            stop = max(stop, registers[begin].address + registers[begin].words)
+            start = registers[begin].address
+            if begin < end - 1 and (stop - start > limit or not joined[begin]):
                 break
-            cost, before = best[begin]
-            choices.append((cost + duration(drive, block, delay), [*before, block]))
-        best.append(min(choices, key=lambda choice: choice[0]))
-    return best[-1][1]
+            block = Block(table, start, stop - start, registers[begin:end])
+            own = _characters(framing, table, block.count)
+            for before in fronts[begin]:
+                known = fewest.get(before.requests + 1)
+                if known is None or before.characters + own < known.characters:
+                    way = Way(before.characters + own, (*before.blocks, block))
+                    fewest[way.requests] = way
+        fronts.append(_worthwhile(fewest))
+    return tuple(fronts[-1])
 
 
-def _block(table: Table, registers: list[Register[Any]]) -> Block:
-    start = registers[0].address
-    end = max(register.address + register.words for register in registers)
-    return Block(table, start, end - start, tuple(registers))
+def _worthwhile(ways: dict[int, Way]) -> list[Way]:
+    """Without those that need more requests and save no characters by it."""
+    kept: list[Way] = []
+    for requests in sorted(ways):
+        if not kept or ways[requests].characters < kept[-1].characters:
+            kept.append(ways[requests])
+    return kept
 
 
 def _readable(drive: Drive, table: Table, registers: Iterable[Register[Any]]) -> set[int]:
@@ -199,15 +292,6 @@ def _readable(drive: Drive, table: Table, registers: Iterable[Register[Any]]) ->
         if register.table == table and register.readable
         for address in range(register.address, register.address + register.words)
     }
-
-
-def _allowed(drive: Drive, block: Block, readable: set[int]) -> bool:
-    if len(block.registers) == 1:
-        return True  # a register is read whole, whatever the limit
-    if block.count > drive.most_registers.get(block.table, 1):
-        return False
-    gaps = drive.readable_gaps.get(block.table, range(0))
-    return all(it in readable or it in gaps for it in range(block.start, block.start + block.count))
 
 
 def write_request(drive: Drive, register: Register[Any], raw: int, address: int | None = None) -> Message:

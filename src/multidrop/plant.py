@@ -20,7 +20,7 @@ from multidrop.drives import MODELS
 from multidrop.forecast import forecast
 from multidrop.mistakes import Key, Place, read_document
 from multidrop.models import find_model
-from multidrop.plan import Planned, planned
+from multidrop.plan import Plan, Planned, plan
 from multidrop.register import Register
 from multidrop.timing import Settings
 
@@ -40,9 +40,9 @@ class PolledDrive:
     drive: Drive
     polls: tuple[Polled, ...]
 
-    def planned(self, delay: float | None = None) -> list[Planned]:
-        """In blocks; `delay` is the drive's response delay in s, where it was measured."""
-        return planned(self.drive, [(it.register, it.every) for it in self.polls], delay)
+    def plan(self, delay: float | None = None) -> Plan:
+        """The best blocks; `delay` is the drive's response delay in s, where it was measured."""
+        return plan(self.drive, [(poll.register, poll.every) for poll in self.polls], delay)
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Line:
     def planned(self, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
         """All that is polled on it, in blocks; `delays` are response delays in s that were measured."""
         known = delays or {}
-        return [one for polled in self.drives for one in polled.planned(known.get(polled.drive))]
+        return [one for polled in self.drives for one in polled.plan(known.get(polled.drive)).planned]
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from multidrop.errors import LineError
 from multidrop.exchanges import reading
 from multidrop.forks import tell_of_forks
 from multidrop.line import now_ns
-from multidrop.plan import Block, alone, in_order, kind, sending, silence
+from multidrop.plan import Block, Plan, alone, in_order, kind, sending, silence
 from multidrop.plant import PolledDrive
 from multidrop.rules import check_own
 from multidrop.schedule import Asking, Job, Schedule
@@ -41,7 +41,7 @@ from multidrop.statistics import Statistics
 AHEAD_NS = 300_000_000  # so far ahead the lines are planned
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
-OTHER_DELAY = 0.25  # of the response delay that blocks were chosen for: they are chosen anew
+MARGIN = 0.05  # of a response delay: so far beyond those that a plan suits, it is not worth another one
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
@@ -78,18 +78,15 @@ class Asked(Job):
     block: Block
     exchange: Exchange
     fields: core.Block
-
-    def expected_ns(self, response_delay: float) -> int:
-        """How long it takes from the end of the one before."""
-        return round((silence(self.owner) + sending(self.owner, self.block) + response_delay) * 1e9)
+    own_ns: int  # of silence and characters, to which the response delay comes
 
 
 @dataclass
 class Chosen:
-    """The jobs that read a drive in the least time, if its response delay, in s, is this."""
+    """The jobs that read a drive in the least time, and the plan that they carry out."""
 
     jobs: list[Asked]
-    delay: float
+    plan: Plan
 
 
 def over(slots: list[tuple[Asked, int]], ended_ns: int) -> list[tuple[Asked, int]]:
@@ -161,14 +158,16 @@ class PolledLine:
         if polled not in self._chosen:
             for poll in polled.polls:
                 check_own(drive, poll.register)
-            self._chosen[polled] = Chosen(self._choose(polled, drive.response_delay), drive.response_delay)
+            self._chosen[polled] = self._choose(polled, drive.response_delay)
         return self._chosen[polled].jobs
 
-    def _choose(self, polled: PolledDrive, delay: float) -> list[Asked]:
-        return [
-            self._job(it.drive, it.block, None if it.every is None else round(it.every * 1e9))
-            for it in polled.planned(delay)
+    def _choose(self, polled: PolledDrive, delay: float) -> Chosen:
+        plan = polled.plan(delay)
+        jobs = [
+            self._job(one.drive, one.block, None if one.every is None else round(one.every * 1e9))
+            for one in plan.planned
         ]
+        return Chosen(jobs, plan)
 
     def remove(self, drive: Drive) -> None:
         with self._lock:
@@ -192,18 +191,18 @@ class PolledLine:
     def _made(self, drive: Drive, block: Block, period_ns: int | None) -> Asked:
         fields = self._codes.fields(drive, block)
         respondent = self.bus.respondent(drive)
-        job = Asked(
+        own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
+        return Asked(
             drive=drive.address,
             kind=kind(drive),
             period_ns=period_ns,
-            duration_ns=0,
+            duration_ns=own_ns + round(drive.response_delay * 1e9),
             owner=drive,
             block=block,
             exchange=reading(drive, block, respondent, fields, period=(period_ns or 0) / 1e9),
             fields=fields,
+            own_ns=own_ns,
         )
-        job.duration_ns = job.expected_ns(drive.response_delay)
-        return job
 
     def start(self) -> None:
         with self._lock:
@@ -271,28 +270,30 @@ class PolledLine:
             )
 
     def _learn(self, now: int) -> None:
-        """How long exchanges take, by the drives' own response delays."""
+        """How long exchanges take, and which blocks are best, by the drives' own response delays."""
         self._learnt_ns = now
         delays = {drive: respondent.response_delay for drive, respondent in self._asked_of}
+        delays_ns = {drive: round((it or drive.response_delay) * 1e9) for drive, it in delays.items()}
         for job in self.schedule.jobs:
-            job.duration_ns = job.expected_ns(delays[job.owner] or job.owner.response_delay)
+            job.duration_ns = job.own_ns + delays_ns[job.owner]
         self._ahead_ns = sum(it.job.duration_ns for it in self._queued)
         for polled, chosen in self._chosen.items():
-            delay = delays.get(polled.drive) or chosen.delay
-            if abs(delay - chosen.delay) > OTHER_DELAY * chosen.delay:
+            delay = delays.get(polled.drive)
+            if delay and not chosen.plan.suits(delay, MARGIN):
                 self._choose_anew(polled, chosen, delay, now)
 
     def _choose_anew(self, polled: PolledDrive, chosen: Chosen, delay: float, now: int) -> None:
         """Unless some of its registers are refused, and are asked for in another way."""
         if not set(chosen.jobs) <= set(self.schedule.jobs):
             return
-        jobs = self._choose(polled, delay)
+        anew = self._choose(polled, delay)
+        jobs = anew.jobs
         for period_ns in {it.period_ns for it in jobs}:
             before = [it for it in chosen.jobs if it.period_ns == period_ns and it not in jobs]
             others = [it for it in jobs if it.period_ns == period_ns and it not in chosen.jobs]
             due_ns = min((it.due_ns for it in before if period_ns), default=now)
             self.schedule.replace(before, others, due_ns)
-        chosen.jobs, chosen.delay = jobs, delay
+        self._chosen[polled] = anew
 
     def _heed_refusals(self, now: int) -> None:
         """Registers that are refused together are asked for singly; a single one is set aside.
