@@ -15,7 +15,7 @@ import pyarrow
 import pyarrow.compute
 from jobs import REGISTERS, Job, expected
 from multidrop._core import lib
-from played import Played
+from played import Played, Unpaced
 
 from multidrop.batch import Batch, Row
 from multidrop.bus import Bus
@@ -90,11 +90,13 @@ def multidrop(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
 
 
 @contextmanager
-def reading(job: Job) -> Iterator[Callable[[int], object]]:
+def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
     """What reads all registers of the drive with an address, and raises what the library raises."""
+    family = Played if job.baudrate else Unpaced
+    registers = family.readings()
     with Bus(job.port, baudrate=job.port_baudrate) as bus:
-        drives = {address: bus.attach(Played, address) for address in range(1, job.drives + 1)}
-        yield lambda address: bus.read_many(drives[address], Played.readings())
+        drives = {address: bus.attach(family, address) for address in range(1, job.drives + 1)}
+        yield lambda address: bus.read_many(drives[address], registers)
 
 
 def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:

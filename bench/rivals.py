@@ -32,7 +32,16 @@ def multidrop(job: Job) -> Iterator[Poll]:
         yield poll
 
 
-# ---- rivals that are called for each exchange: how to open, how to read ----
+# ---- masters that are called for each exchange: how to open, how to read ----
+
+
+@contextmanager
+def reading_by_hand(job: Job) -> Iterator[Read]:
+    """`bus.read_many` in a loop, in place of multidrop's poller."""
+    import adapter
+
+    with adapter.reading(job) as read:
+        yield lambda address: [round(value) for value in read(address).values()]
 
 
 @contextmanager
@@ -154,10 +163,12 @@ IN_PYTHON = {
     "multidrop": multidrop,
     **{name: in_turn(reader) for name, reader in READERS.items()},
     "pymodbus-async": pymodbus_async,
+    "bus.read_many": in_turn(reading_by_hand),
 }
 MASTERS = (*IN_PYTHON, "libmodbus")
 
 INSTALL = {
+    "bus.read_many": "multidrop",
     "pymodbus": "pymodbus==3.16.1",
     "pymodbus-async": "pymodbus==3.16.1",
     "minimalmodbus": "minimalmodbus==2.1.1",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 from multidrop import core
@@ -16,6 +17,7 @@ from multidrop.register import Register
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly told to be unconfirmed costs more than the wait
+MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; those that were not read for longest go
 NO_ROWS = core.Block(0, [])  # of a command: a poll's summary counts the values of its rows alone
 
 
@@ -67,6 +69,24 @@ def reading(
     return exchange(drive, request, respondent, rows, period=period, teller=teller)
 
 
+class Prepared:
+    """What reads a drive's registers: made once, as long as all that it was made for is as it was."""
+
+    def __init__(self, drive: Drive, respondent: Respondent, made_for: tuple[object, ...]) -> None:
+        self.made_for = made_for
+
+        @lru_cache(MOST_PREPARED)
+        def best(registers: tuple[Register[Any], ...]) -> tuple[Block, ...]:
+            return blocks(drive, registers)
+
+        @lru_cache(MOST_PREPARED)
+        def read(block: Block) -> Exchange:
+            return reading(drive, block, respondent)
+
+        self.blocks = best
+        self.exchange = read
+
+
 class Exchanges:
     """What passes between a line and its drives, and what is learnt of each drive from it."""
 
@@ -75,6 +95,7 @@ class Exchanges:
         self._respondents: dict[Drive, Respondent] = {}
         self._known: dict[tuple[int, float, float], Respondent] = {}  # by address, also of those that left
         self._heard: dict[Drive, object] = {}  # the open port on which it answered last
+        self._prepared: dict[Drive, Prepared] = {}
 
     def add(self, drive: Drive) -> None:
         documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
@@ -97,6 +118,7 @@ class Exchanges:
     def remove(self, drive: Drive) -> None:
         del self._respondents[drive]
         self._heard.pop(drive, None)
+        self._prepared.pop(drive, None)
 
     @property
     def respondents(self) -> dict[Drive, Respondent]:
@@ -116,7 +138,7 @@ class Exchanges:
     def values(self, drive: Drive, registers: list[Register[Any]], attempts: int) -> dict[str, Any]:
         """Registers' values by name, each block asked for so many times until it is answered."""
         raw: dict[str, Any] = {}
-        for block in blocks(drive, registers):
+        for block in self._prepare(drive).blocks(tuple(registers)):
             reply = self._ask(drive, block, attempts)
             for register in block.registers:
                 raw[register.name] = register.decode(
@@ -124,8 +146,25 @@ class Exchanges:
                 )
         return {register.name: raw[register.name] for register in registers}
 
+    def _prepare(self, drive: Drive) -> Prepared:
+        """What is prepared for this drive, if nothing has changed since; else what will be from now on."""
+        respondent = self.respondent(drive)
+        made_for = (
+            respondent,
+            self.line.queue,
+            drive.address,
+            drive.framing,
+            drive.settings,
+            drive.agreed_silence,
+            drive.response_delay,
+        )
+        prepared = self._prepared.get(drive)
+        if prepared is None or prepared.made_for != made_for:
+            prepared = self._prepared[drive] = Prepared(drive, respondent, made_for)
+        return prepared
+
     def _ask(self, drive: Drive, block: Block, attempts: int) -> Message:
-        made = reading(drive, block, self.respondent(drive))
+        made = self._prepare(drive).exchange(block)
         for _ in range(attempts - 1):
             try:
                 return self._read(drive, self._carry_out(made))

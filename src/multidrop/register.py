@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
+from functools import cached_property
 from typing import Any, Generic, NotRequired, TypedDict, TypeVar, Unpack, cast, overload
 
 from multidrop.core import Wire
@@ -187,7 +188,7 @@ class Register(Generic[T]):
     def writable(self) -> bool:
         return self.access is not Access.READING and self.table.write is not None and not self.never
 
-    @property
+    @cached_property
     def scale(self) -> Fraction:
         """The step as an exact fraction, 1 where it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
