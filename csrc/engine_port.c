@@ -1,6 +1,7 @@
 /* One port, on the engine's thread: whose turn it is, and what is done until there is nothing to do but
  * to wait. An urgent exchange goes ahead of all, then comes what is queued and due, and else what is
- * repeated. What became of it goes to the client's inbox. */
+ * repeated. These two keep a share of the line beside urgent exchanges without end, but for those that
+ * insist. What became of it goes to the client's inbox. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -10,7 +11,9 @@
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
     HELD_UP_NS = 200000,      /* no write takes so long by itself */
-    MOST_SPINNING = 4         /* ports; with more of them the processor has better to do */
+    MOST_SPINNING = 4,        /* ports; with more of them the processor has better to do */
+    POLLED = 20,              /* one part in so many of a line that urgent exchanges keep busy */
+    MOST_OWED_NS = 50000000   /* of that, where there was nothing to poll */
 };
 static const int64_t RETRY_WRITE_NS = 1000000;
 
@@ -171,26 +174,59 @@ static int is_expired(const struct md_port *port, int64_t now_ns)
     return port->turn == WISHED && port->wishes->expires_ns && now_ns > port->wishes->expires_ns && port->line.tx_at == 0;
 }
 
-/* Take up what is to be done next, or say when; whether there is anything to carry out now. */
-static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
+/* Count what an exchange took of the line. */
+static void settle(struct md_port *port, int64_t took_ns)
 {
-    struct wish *wish = port->wishes;
-    if (wish && now_ns >= wish->not_before_ns) {
-        if (begin(port, WISHED, wish->exchange, wish->completion, now_ns) && is_expired(port, now_ns))
-            md_line_abandon(&port->line, MD_EXPIRED, 0);
-        return 1;
-    }
-    *wake_ns = wish ? wish->not_before_ns : MD_NEVER;
+    if (port->turn == WISHED)
+        port->owed_ns += took_ns / (POLLED - 1);
+    else if (port->owed_ns > 0)
+        port->owed_ns -= took_ns;
+    if (port->owed_ns > MOST_OWED_NS)
+        port->owed_ns = MOST_OWED_NS;
+}
+
+/* Whether one exchange of what is polled may hold up the wishes: never two in a row, and never a stop. */
+static int is_owed(const struct md_port *port)
+{
+    for (const struct wish *wish = port->wishes; wish; wish = wish->next)
+        if (wish->exchange->insists)
+            return 0;
+    return port->owed_ns > 0 && port->last == WISHED;
+}
+
+static void grant(struct md_port *port, struct wish *wish, int64_t now_ns)
+{
+    if (begin(port, WISHED, wish->exchange, wish->completion, now_ns) && is_expired(port, now_ns))
+        md_line_abandon(&port->line, MD_EXPIRED, 0);
+}
+
+/* Take up what is queued and due, or else repeated; whether there is any. */
+static int take_polled(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
+{
     if (port->ending)
         return 0;
     if (pending(port) && take_from_queue(port, wake_ns, now_ns))
         return 1;
-    if (port->round_len) {
-        if (begin(port, REPEATED, port->round[port->round_at], &port->completion, now_ns))
-            move_on(port);
+    if (!port->round_len)
+        return 0;
+    if (begin(port, REPEATED, port->round[port->round_at], &port->completion, now_ns))
+        move_on(port);
+    return 1;
+}
+
+/* Take up what is to be done next, or say when; whether there is anything to carry out now. */
+static int take_up(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
+{
+    struct wish *wish = port->wishes;
+    int is_wished = wish && now_ns >= wish->not_before_ns;
+    *wake_ns = wish ? wish->not_before_ns : MD_NEVER;
+    if ((!is_wished || is_owed(port)) && take_polled(port, wake_ns, now_ns))
+        return 1;
+    if (is_wished) {
+        grant(port, wish, now_ns);
         return 1;
     }
-    if (!pending(port)) {
+    if (!port->ending && !pending(port)) {
         atomic_store(&port->idle, 1);
         if (pending(port)) /* it came just now */
             *wake_ns = now_ns;
@@ -213,6 +249,7 @@ static void report(struct md_port *port)
 void md_port_finish(struct md_port *port)
 {
     enum turn turn = port->turn;
+    port->last = turn;
     port->turn = NOBODYS;
     if (port->progress.echo != (uint32_t)port->line.echo)
         md_put(&port->progress.echo, (uint32_t)port->line.echo);
@@ -274,6 +311,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
         }
         int want = md_line_want(line, now_ns);
         if (want == MD_DONE) {
+            settle(port, now_ns - line->completion->begun_ns);
             md_port_finish(port);
             continue;
         }

@@ -328,7 +328,8 @@ struct md_progress {
     int64_t switching_ns; /* that they took */
 };
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */
+/* Carry one out ahead of the queue and wait for it; beside many of these the queue keeps a 20th of the line, one
+ * exchange at a time, but none while one waits that insists. After `expires_ns` (0: never) it is not sent. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,7 @@ def read(
     format: str = "8N1",
     respondent: Respondent | None = None,
     period: float = 0.0,
+    insists: bool = False,
     teller: Exchange | None = None,
 ) -> Exchange:
     """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
@@ -66,6 +68,7 @@ def read(
         silence=1e-4,
         turnaround=1e-4,
         period=period,
+        insists=insists,
         block=ONE_VALUE,
         teller=teller,
     )
@@ -459,6 +462,46 @@ def test_a_stop_goes_ahead_of_all_but_what_came_before_it_for_its_own_drive(driv
         for thread in threads:
             thread.join(30)
     assert heard == [0, 1, 50, 99, 2, 51]
+
+
+def wait_until_it_sleeps(thread: threading.Thread) -> None:
+    """Wait until the thread is in the core: asleep at every look, while nobody holds the interpreter."""
+    stat = Path(f"/proc/self/task/{thread.native_id}/stat")
+    asleep = 0
+    while asleep < 20:
+        time.sleep(0.001)
+        asleep = asleep + 1 if stat.read_text().rpartition(")")[2].split()[0] == "S" else 0
+
+
+@pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
+def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
+    drive: Drive, insists: bool
+) -> None:
+    """One exchange at a time, and never two in a row."""
+    asked: list[str] = []
+    go_on = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        asked.append("urgent" if request.start else "polled")
+        if request.start == 9:
+            go_on.wait()
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        wanted = [read(it, timeout=60.0, insists=insists) for it in (9, 1, 2, 3, 4)]
+        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+        for thread in threads:
+            thread.start()
+            wait_until_it_sleeps(thread)
+            port.repeat([read(0, timeout=60.0)])
+        go_on.set()
+        for thread in threads:
+            thread.join()
+        port.repeat([])
+    beside = asked[: len(asked) - asked[::-1].index("urgent")]
+    assert beside.count("urgent") == 5
+    assert ("polled" in beside) is not insists
+    assert ("polled", "polled") not in pairwise(beside)
 
 
 def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
