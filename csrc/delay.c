@@ -27,7 +27,7 @@ static void learn(int64_t *ns, int64_t value)
 /* As TCP's retransmission time-out (RFC 6298). */
 static int64_t usual_timeout_ns(const struct md_drive *drive)
 {
-    int64_t usual_ns = 4 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);
+    int64_t usual_ns = 3 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);
     int64_t margin_ns = later(4 * learnt(&drive->deviation_ns), drive->least_timeout_ns / 4);
     if (delay_ns)
         usual_ns = later(delay_ns + margin_ns, drive->least_timeout_ns);
@@ -40,22 +40,17 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
-static int64_t hurried_timeout_ns(const struct md_drive *drive)
-{
-    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
-}
-
 int64_t md_timeout_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
     if (exchange->insists)
         return sooner(usual_timeout_ns(drive) << sooner(drive->failures, MOST_DOUBLINGS), drive->most_timeout_ns);
-    return later(hurried_timeout_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
+    return later(md_vain_ns(drive), later(learnt(&drive->patience_ns), exchange->timeout_ns));
 }
 
 int64_t md_window_ns(const struct md_exchange *exchange)
 {
-    return later(3 * hurried_timeout_ns(exchange->drive), exchange->drive->most_timeout_ns);
+    return later(3 * md_vain_ns(exchange->drive), exchange->drive->most_timeout_ns);
 }
 
 int64_t md_present_timeout_ns(const struct md_drive *drive)
@@ -65,8 +60,7 @@ int64_t md_present_timeout_ns(const struct md_drive *drive)
 
 int64_t md_vain_ns(const struct md_drive *drive)
 {
-    int64_t usual_ns = usual_timeout_ns(drive);
-    return usual_ns + (drive->most_timeout_ns - usual_ns) / RARELY;
+    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
 }
 
 static void smooth(struct md_drive *drive, int64_t delay_ns)

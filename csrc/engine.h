@@ -47,8 +47,8 @@ struct md_port {
     struct md_inbox *inbox;
     uint32_t number; /* there */
 
-    enum turn turn, last;   /* of now, and of the exchange that was carried out last */
-    int64_t owed_ns;        /* of the line, to what is polled beside urgent exchanges */
+    enum turn turn, last_turn; /* of now, and of the exchange that was carried out last */
+    int64_t owed_ns;           /* of the line, to what is polled beside urgent exchanges */
     struct md_before before;
     int blind;         /* nothing is worth reading before the port's waking time */
     int watched;       /* the waiter tells when it can be read */

@@ -179,7 +179,7 @@ static void settle(struct md_port *port, int64_t took_ns)
 {
     if (port->turn == WISHED)
         port->owed_ns += took_ns / (POLLED - 1);
-    else if (port->owed_ns > 0)
+    else if ((port->turn == QUEUED || port->turn == REPEATED) && port->owed_ns > 0)
         port->owed_ns -= took_ns;
     if (port->owed_ns > MOST_OWED_NS)
         port->owed_ns = MOST_OWED_NS;
@@ -191,7 +191,7 @@ static int is_owed(const struct md_port *port)
     for (const struct wish *wish = port->wishes; wish; wish = wish->next)
         if (wish->exchange->insists)
             return 0;
-    return port->owed_ns > 0 && port->last == WISHED;
+    return port->owed_ns > 0 && port->last_turn == WISHED;
 }
 
 static void grant(struct md_port *port, struct wish *wish, int64_t now_ns)
@@ -249,7 +249,7 @@ static void report(struct md_port *port)
 void md_port_finish(struct md_port *port)
 {
     enum turn turn = port->turn;
-    port->last = turn;
+    port->last_turn = turn;
     port->turn = NOBODYS;
     if (port->progress.echo != (uint32_t)port->line.echo)
         md_put(&port->progress.echo, (uint32_t)port->line.echo);

@@ -245,7 +245,7 @@ void md_line_abandon(struct md_line *line, int result, int error);
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
 int64_t md_timeout_ns(const struct md_exchange *exchange); /* how long its reply is waited for */
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* the same, of a read, and not of the next only */
-int64_t md_vain_ns(const struct md_drive *drive); /* the same of a drive that stays silent, on average */
+int64_t md_vain_ns(const struct md_drive *drive); /* the same of its next one, if it stays silent */
 /* It was answered after so long, at most so long where the reply was whole when first looked at; what to
  * take for its delay. */
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
@@ -328,8 +328,8 @@ struct md_progress {
     int64_t switching_ns; /* that they took */
 };
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Carry one out ahead of the queue and wait for it; beside many of these the queue keeps a 20th of the line, one
- * exchange at a time, but none while one waits that insists. After `expires_ns` (0: never) it is not sent. */
+/* Carry one out ahead of the queue and wait for it; after `expires_ns` (0: never) it is not sent. Beside many
+ * of these the queue keeps a 20th of the line, one exchange at a time, but none while one waits that insists. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
 

@@ -638,3 +638,54 @@ def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
     made.forget(1)
     made.add(again := job(1), 0)
     assert again in [it for it, _ in take(made, 1, 20)]
+
+
+# ---- drives that have never answered ----
+
+
+def meet(*jobs: Job) -> Schedule[Job]:
+    made = schedule(*jobs)
+    for drive in {it.drive for it in jobs}:
+        made.meet(drive)
+    return made
+
+
+def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
+    made.conclude(asked)
+    made.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
+
+
+def test_a_new_drive_is_asked_one_question_until_its_outcome_is_known() -> None:
+    made = meet(one := job(1), two := job(1), job(2, period_ms=50), job(2))
+    assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
+    assert take(made, 10, 1000) == []
+    assert made.cycle(10 * MS) == []
+    made.conclude(one)  # its answer was damaged, perhaps: it has not answered yet
+    assert [asked for asked, _ in take(made, 20, 1000)] == [two]
+    answer(made, two, 30)
+    assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
+
+
+def test_no_slot_of_a_new_drive_is_lost_doubled_or_asked_early() -> None:
+    made = meet(fast := job(1, period_ms=20), slow := job(1, period_ms=50), job(2, period_ms=1000))
+    assert {asked.drive for asked, _ in take(made, 0, 300, most=2)} == {1, 2}
+    assert take(made, 1, 300) == []
+    answer(made, fast, 2)
+    slots = [(slow, 0), (fast, 20), (fast, 40), (slow, 50), (fast, 60), (fast, 80)]
+    assert take(made, 2, 90) == slots
+    assert (fast.skipped, slow.skipped) == (0, 0)
+
+
+def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
+    made = meet(dead := job(1), living := job(2))
+    assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
+    answer(made, living, 1)
+    made.conclude(dead)
+    made.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=0, has_answered=False)
+    rest_ms = FIRST_REST_NS // MS
+    assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
+    assert made.unasked == [(dead, 60 * MS)]
+    assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
+    assert made.cycle((60 + rest_ms) * MS) == []
+    answer(made, dead, 60 + rest_ms)
+    assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}

@@ -10,6 +10,7 @@ from multidrop.drives import InvtCHE
 from multidrop.sim import Faults, simulated
 
 DRIVES = 31
+FIRST, LATER = 8, 52  # s, for which the rates are promised
 
 
 @pytest.mark.story
@@ -36,3 +37,29 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
         while not gone <= back:
             assert world.now <= revived + back_s * S
             back |= {row.drive for row in world.run(0.5) if row.value is not None}
+
+
+@pytest.mark.story
+@pytest.mark.parametrize(("count", "dead"), [(16, 1), (16, 5), (31, 10)])
+@pytest.mark.parametrize("every", [None, 0.5], ids=["in turn", "at a rate"])
+def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
+    count: int, dead: int, every: float | None
+) -> None:
+    """Every third one, so that most of the living come after one of them."""
+    gone = {3 * number + 1 for number in range(dead)}
+
+    def answered(addresses: list[int]) -> list[int]:
+        """In the first seconds, and later."""
+        drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in addresses]
+        sims = [simulated(drive) for drive in drives]
+        for sim in sims:
+            sim.deaf_until = float("inf") if sim.drive.address in gone else 0.0
+        world = World(WorldWire(sims, Faults()), [polled(it, it.readings()[:1], every) for it in drives])
+        with world:
+            return [sum(row.value is not None for row in world.run(span)) for span in (FIRST, LATER)]
+
+    every_drive = list(range(1, count + 1))
+    first, later = answered(every_drive)
+    without_first, without_later = answered([address for address in every_drive if address not in gone])
+    assert first >= 0.9 * without_first
+    assert later >= 0.98 * without_later

@@ -119,7 +119,7 @@ class PolledLine:
         self._learnt_ns = 0
         self.switching = declared.switching  # s; in the end as measured
         self._asked_of: list[tuple[Drive, Respondent]] = []
-        self._seen: list[tuple[int, int]] = []  # of each of them: failures in a row, late until
+        self._seen: list[tuple[int, int, bool]] = []  # of each: failures in a row, late until, has answered
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         self._cycle: list[Asked] = []  # what the core repeats
@@ -148,9 +148,15 @@ class PolledLine:
                 raise
             if jobs:
                 self._asked_of.append((drive, self.bus.respondent(drive)))
-            for job in jobs if self._is_started else []:
-                self.schedule.add(job, now_ns())
+            if self._is_started:
+                self._schedule(drive, jobs, now_ns())
         self._inbox.call(self._number)
+
+    def _schedule(self, drive: Drive, jobs: list[Asked], due_ns: int) -> None:
+        for job in jobs:
+            self.schedule.add(job, due_ns)
+        if jobs and not self.bus.respondent(drive).has_answered:
+            self.schedule.meet(drive.address)
 
     def _jobs_of(self, polled: PolledDrive) -> list[Asked]:
         """A drive that comes back has the jobs that it had."""
@@ -210,8 +216,7 @@ class PolledLine:
             self.bus.reset_statistics()
             chosen = {polled.drive: it.jobs for polled, it in self._chosen.items()}
             for drive in in_order(self.bus.drives, self.switching):
-                for job in chosen[drive]:
-                    self.schedule.add(job, self.started_ns)
+                self._schedule(drive, chosen[drive], self.started_ns)
             self._is_started = True
 
     def is_steady(self, now: int) -> bool:
@@ -242,7 +247,9 @@ class PolledLine:
     def _forget_done(self, port: Port) -> None:
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
-            self._ahead_ns -= self._queued.popleft().job.duration_ns
+            job = self._queued.popleft().job
+            self._ahead_ns -= job.duration_ns
+            self.schedule.conclude(job)
         self._done = done
 
     def _lose(self, port: Port, now: int) -> None:
@@ -251,6 +258,8 @@ class PolledLine:
         self._forget_done(port)
         slots = [(it.job, now if it.due_ns is None else min(it.due_ns, now)) for it in self._queued]
         self._miss(slots, Result.LINE_LOST)
+        for asking in self._queued:
+            self.schedule.conclude(asking.job)
         self._queued.clear()
         self._cycle = []
         self._ahead_ns = 0
@@ -260,13 +269,20 @@ class PolledLine:
     def _observe(self, now: int) -> None:
         if now - self._learnt_ns >= LEARN_NS:
             self._learn(now)
-        seen = [(respondent.failures, respondent.late_until_ns) for _, respondent in self._asked_of]
+        seen = [(it.failures, it.late_until_ns, it.has_answered) for _, it in self._asked_of]
         if seen == self._seen:
             return
         self._seen = seen
-        for (drive, respondent), (failures, late_until_ns) in zip(self._asked_of, seen, strict=True):
+        for (drive, respondent), (failures, late_until_ns, has_answered) in zip(
+            self._asked_of, seen, strict=True
+        ):
             self.schedule.observe(
-                drive.address, failures, now, late_until_ns=late_until_ns, cost_ns=respondent.vain_ns
+                drive.address,
+                failures,
+                now,
+                late_until_ns=late_until_ns,
+                cost_ns=respondent.vain_ns,
+                has_answered=has_answered,
             )
 
     def _learn(self, now: int) -> None:

@@ -8,7 +8,8 @@ line has caught up, the job goes first that was not asked for longest, so that e
 Jobs without a period fill what is left, each once in a round, and have a share of the line even where
 nothing is left. A drive that stays silent is rested for longer and longer; in the others' spare time,
 or that share, it is asked its shortest question, and all silent drives together cost a small part of
-the line. With its first answer it is back.
+the line. With its first answer it is back. A drive that has never answered is asked one question, and no
+other until the outcome of that is known; if there was no answer, it is rested at once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Generic, NamedTuple, TypeVar
 SILENT_AFTER = 2  # failures in a row
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
-SILENT_SHARE = 0.02  # of the line, for asking silent drives
+SILENT_SHARE = 0.015  # of the line, for asking silent drives
 TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
 CREDIT_NS = 50_000_000  # of it, that they use up in advance
 
@@ -61,6 +62,8 @@ class Asking(NamedTuple, Generic[J]):
 
 @dataclass
 class _Health:
+    is_new: bool = False  # it has never answered
+    is_asked: bool = False  # what becomes of its question is not known yet; only where it is new
     failures: int = 0
     late_until_ns: int = 0
     rest_ns: int = 0
@@ -122,6 +125,15 @@ class Schedule(Generic[J]):
         """A drive of which no job is left."""
         self._health.pop(drive, None)
 
+    def meet(self, drive: int) -> None:
+        """Ask this drive one question at a time until it answers: it may not be there."""
+        self._health[drive].is_new = self._ill = True
+
+    def conclude(self, job: J) -> None:
+        """Know that a question is over, whatever became of it."""
+        if job.drive in self._health:
+            self._health[job.drive].is_asked = False
+
     def _await(self, job: J) -> None:
         heapq.heappush(self._waiting, (job.due_ns, job.number, job))
 
@@ -156,7 +168,14 @@ class Schedule(Generic[J]):
             taken.append(self._ask(job, at))
             at += self._duration_ns(job)
             self._kind = job.kind
+        self._put_off()
         return taken
+
+    def _put_off(self) -> None:
+        """Keep slots of drives whose first answer is waited for: some of them begin later than now."""
+        for job in [it for it in self._begun if self._health[it.drive].is_asked]:
+            self._begun.remove(job)
+            self._await(job)
 
     def _begin_slots(self, by_ns: int) -> None:
         """Slots of drives at rest pass."""
@@ -181,16 +200,20 @@ class Schedule(Generic[J]):
         if not self._begun:
             self._is_late = False
             return None
+        begun = [job for job in self._begun if not self._health[job.drive].is_asked]
+        if not begun:
+            return None
         if self._is_late:
-            return min(self._begun, key=lambda job: (job.asked_ns, job.number))
-        first = min(self._begun, key=lambda job: (job.end_ns, job.number))
-        if at_ns + sum(job.duration_ns for job in self._begun) > first.end_ns:
+            return min(begun, key=lambda job: (job.asked_ns, job.number))
+        first = min(begun, key=lambda job: (job.end_ns, job.number))
+        if at_ns + sum(job.duration_ns for job in begun) > first.end_ns:
             return first
-        return min(self._begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
+        return min(begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
     def _ask(self, job: J, at_ns: int) -> Asking[J]:
         """The job is asked at this time; where it has slots, in one of them. Those over are left out."""
         health = self._health[job.drive]
+        health.is_asked = health.is_new
         if job.period_ns is None or health.rest_ns:  # or asked whether it answers
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Asking(job, health.late_until_ns, None)
@@ -210,9 +233,10 @@ class Schedule(Generic[J]):
             return probe
         for step in range(len(self._turn)):
             number = (self._next + step) % len(self._turn)
-            if not self._is_asleep(self._turn[number], at_ns):
+            job = self._turn[number]
+            if not self._is_asleep(job, at_ns) and not self._health[job.drive].is_asked:
                 self._next = (number + 1) % len(self._turn)
-                return self._turn[number]
+                return job
         self._owed_ns = -CREDIT_NS
         return None
 
@@ -239,8 +263,17 @@ class Schedule(Generic[J]):
         health = self._health[job.drive]
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
-    def observe(self, drive: int, failures: int, now_ns: int, *, late_until_ns: int, cost_ns: int) -> None:
-        """How often in a row a drive has not answered by now, and what asking it in vain costs.
+    def observe(
+        self,
+        drive: int,
+        failures: int,
+        now_ns: int,
+        *,
+        late_until_ns: int,
+        cost_ns: int,
+        has_answered: bool = True,
+    ) -> None:
+        """How often in a row a drive has not answered by now, and what asking it in vain costs next.
 
         Until `late_until_ns` its answer to an earlier question may come, so it is asked nothing, even
         if it has answered since. When that has come, late as it is, the drive can be asked at once.
@@ -249,18 +282,19 @@ class Schedule(Generic[J]):
         has_answered_late = late_until_ns < health.late_until_ns
         has_changed = failures != health.failures
         health.failures, health.late_until_ns, health.cost_ns = failures, late_until_ns, cost_ns
+        health.is_new &= not has_answered
         if has_changed and failures:
             self._rest(drive, now_ns)
         elif has_changed:
             health.rest_ns = health.asleep_until_ns = 0
         elif has_answered_late:
             health.asleep_until_ns = now_ns
-        self._ill = any(it.failures for it in self._health.values())
+        self._ill = any(it.failures or it.is_new for it in self._health.values())
         self._late_until_ns = max(it.late_until_ns for it in self._health.values())
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self._health[drive]
-        if health.failures >= SILENT_AFTER:
+        if health.failures >= (1 if health.is_new else SILENT_AFTER):
             health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
         rest_ns = max(health.rest_ns, self._fair_rest_ns()) if health.rest_ns else 0
         health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)

@@ -38,6 +38,11 @@ class Respondent:
         return int(self.c.tally.exchanges)
 
     @property
+    def has_answered(self) -> bool:
+        """Whether a reply of it was ever good, a refusal included."""
+        return bool(self.c.tally.answered)
+
+    @property
     def failures(self) -> int:
         """Exchanges in a row without an answer."""
         return int(self.c.failures)
@@ -72,7 +77,7 @@ class Respondent:
 
     @property
     def vain_ns(self) -> int:
-        """How long it is waited for while it stays silent, on average."""
+        """How long its next answer is waited for, if it stays silent."""
         return int(lib.md_vain_ns(self.c))
 
     def tally(self) -> Tally:
