@@ -1,6 +1,6 @@
 """What faults cost on a paced line: stray bytes, silent drives, requests that are refused.
 
-31 drives at 38400. A rate is held against that of the same plant without the fault, measured right
+Drives at 38400, 31 of them unless it is said. A rate is held against that of the same plant without the fault, measured right
 before it: without the stray bytes, or without the silent drives. All figures are medians. `python
 faults.py MASTER JOB` is the process of one master whose requests are refused.
 """
@@ -39,12 +39,12 @@ def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: A
     return line.report["answered"] / max(line.report["seconds"], 1e-9), own["exchanges"] / max(asked, 1)
 
 
-def cases(silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+def cases(drives: int, silent: list[int]) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Each fault's name, how many drives there are without it, and what the line is told."""
-    yield "00 before every reply", DRIVES, {"stray": True}
+    yield "00 before every reply", drives, {"stray": True}
     for dead in silent:
-        living = DRIVES - dead
-        yield f"{dead} silent", living, {"silent": ",".join(map(str, range(living + 1, DRIVES + 1)))}
+        living = drives - dead
+        yield f"{dead} silent", living, {"silent": ",".join(map(str, range(living + 1, drives + 1)))}
 
 
 def cost(
@@ -53,7 +53,7 @@ def cost(
     slices = []
     for _ in range(arguments.slices):
         without, _ = measured(master, drives, arguments)
-        rate, read = measured(master, DRIVES, arguments, **fault)
+        rate, read = measured(master, arguments.drives, arguments, **fault)
         slices.append((without, rate, rate / without, read))
     without, rate, kept, read = (median(column) for column in zip(*slices, strict=True))
     return master, case, f"{without:.1f}", f"{rate:.1f}", f"{kept:.1%}", f"{read:.1%}"
@@ -97,18 +97,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     known = list(rivals.MASTERS)
     parser.add_argument("--masters", nargs="+", choices=known, default=known[:3])
-    parser.add_argument("--silent", type=int, nargs="+", default=[0, 1, 5, 10], help="how many of 31")
+    parser.add_argument("--drives", type=int, default=DRIVES)
+    parser.add_argument("--silent", type=int, nargs="+", default=[0, 1, 5, 10], help="how many of them")
     parser.add_argument("--settle", type=float, default=10.0, help="seconds before anything is counted")
     parser.add_argument("--seconds", type=float, default=20.0, help="that are counted; 0: only refusals")
     parser.add_argument("--slices", type=int, default=3, help="pairs, without the fault and with it")
     arguments = parser.parse_args()
     rivals.insist_on([*arguments.masters, *READERS])
-    tables.heading(f"A paced line of {DRIVES} drives at {BAUDRATE}, 10 registers each, with faults.")
+    tables.heading(
+        f"A paced line of {arguments.drives} drives at {BAUDRATE}, 10 registers each, with faults."
+    )
 
     rows = [
         cost(master, case, arguments, drives, fault)
         for master in (arguments.masters if arguments.seconds else ())
-        for case, drives, fault in cases(arguments.silent)
+        for case, drives, fault in cases(arguments.drives, arguments.silent)
     ]
     if rows:
         tables.show(("master", "case", "without", "answers/s", "kept", "read"), rows)
