@@ -1,8 +1,8 @@
 """What faults cost on a paced line: stray bytes, silent drives, requests that are refused.
 
-Drives at 38400, 31 of them unless it is said. A rate is held against that of the same plant without the fault, measured right
-before it: without the stray bytes, or without the silent drives. All figures are medians. `python
-faults.py MASTER JOB` is the process of one master whose requests are refused.
+31 drives at 38400, or as many as is said. A rate is held against that of the same plant without the
+fault, measured right before it: without the stray bytes, or without the silent drives. All figures are
+medians. `python faults.py MASTER JOB` is the process of one master whose requests are refused.
 """
 
 from __future__ import annotations

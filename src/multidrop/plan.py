@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -133,7 +133,8 @@ def plan(
     found: list[Planned] = []
     least, most = 0.0, math.inf
     for every, registers in rates.items():
-        for ways in _tables(drive, registers):
+        for neighbours in _neighbours(drive, registers):
+            ways = _ways(drive.framing, neighbours)
             way = min(ways, key=lambda way: _duration(drive, way, delay))
             found += [Planned(drive, block, every) for block in way.blocks]
             for other in ways:
@@ -201,16 +202,28 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
     return tuple(it.block for it in plan(drive, ((register, None) for register in registers), delay).planned)
 
 
-def _tables(drive: Drive, registers: Iterable[Register[Any]]) -> list[tuple[Way, ...]]:
-    """For each table, the ways to read those of these registers that are in it."""
-    return [_ways(drive.framing, *neighbours) for neighbours in _neighbours(drive, registers)]
+@dataclass(frozen=True)
+class _Neighbours:
+    """Registers of a table by rising address, and which of them one request may read."""
+
+    table: Table
+    registers: tuple[Register[Any], ...]
+    joined: tuple[bool, ...]  # of each and the next one: all from the one to the other may be read
+    limit: int  # that one request may read; a single register is read whole all the same
+
+    def blocks(self, end: int) -> Iterator[tuple[int, Block]]:
+        """The blocks that end before the register of this number, each with that of its first one."""
+        stop = 0
+        for begin in range(end - 1, -1, -1):
+            start = self.registers[begin].address
+            stop = max(stop, start + self.registers[begin].words)
+            if begin < end - 1 and (stop - start > self.limit or not self.joined[begin]):
+                return
+            yield begin, Block(self.table, start, stop - start, self.registers[begin:end])
 
 
-Neighbours = tuple[Table, tuple[Register[Any], ...], tuple[bool, ...], int]
-
-
-def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[Neighbours]:
-    """For each table, its registers by address, whether all up to the next may be read, and the limit."""
+def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neighbours]:
+    """These registers, for each table."""
     tables: dict[Table, list[Register[Any]]] = {}
     for register in dict.fromkeys(registers):
         if not register.readable:
@@ -226,46 +239,31 @@ def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[Neighb
             all(at in readable or at in gaps for at in range(one.address, other.address))
             for one, other in pairwise(wanted)
         )
-        limit = drive.most_registers.get(table, 1)
-        found.append((table, tuple(wanted), joined, limit))
+        found.append(_Neighbours(table, tuple(wanted), joined, drive.most_registers.get(table, 1)))
     return found
 
 
 def runs(drive: Drive, registers: Iterable[Register[Any]]) -> list[Block]:
-    """Return every request that may read neighbours among these registers, as far as the limits allow."""
-    found = []
-    for table, wanted, joined, limit in _neighbours(drive, registers):
-        for begin in range(len(wanted)):
-            start, stop = wanted[begin].address, 0
-            for end in range(begin + 1, len(wanted) + 1):
-                stop = max(stop, wanted[end - 1].address + wanted[end - 1].words)
-                if end - begin > 1 and (stop - start > limit or not joined[end - 2]):
-                    break
-                found.append(Block(table, start, stop - start, wanted[begin:end]))
-    return found
+    """Return every request that may read neighbours among these registers."""
+    return [
+        block
+        for neighbours in _neighbours(drive, registers)
+        for end in range(1, len(neighbours.registers) + 1)
+        for _, block in neighbours.blocks(end)
+    ]
 
 
 @lru_cache(maxsize=256)
-def _ways(
-    framing: Framing, table: Table, registers: tuple[Register[Any], ...], joined: tuple[bool, ...], limit: int
-) -> tuple[Way, ...]:
+def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[Way, ...]:
     """All ways that are the quickest at some response delay, and maybe others; the fewest requests first.
 
-    By dynamic programming over where the last block begins. `joined` says of each register and the next one
-    whether all from the one to the other may be read, and `limit` how many one request may read. A block of
-    a single register is read whole, whatever the limit.
+    By dynamic programming over where the last block begins.
     """
     fronts: list[list[Way]] = [[Way(0, ())]]  # for the first so many registers
-    for end in range(1, len(registers) + 1):
+    for end in range(1, len(neighbours.registers) + 1):
         fewest: dict[int, Way] = {}  # characters, by number of requests
-        stop = 0
-        for begin in range(end - 1, -1, -1):
-            stop = max(stop, registers[begin].address + registers[begin].words)
-            start = registers[begin].address
-            if begin < end - 1 and (stop - start > limit or not joined[begin]):
-                break
-            block = Block(table, start, stop - start, registers[begin:end])
-            own = _characters(framing, table, block.count)
+        for begin, block in neighbours.blocks(end):
+            own = _characters(framing, block.table, block.count)
             for before in fronts[begin]:
                 known = fewest.get(before.requests + 1)
                 if known is None or before.characters + own < known.characters:
