@@ -577,3 +577,15 @@ def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
     poller.close()  # twice is no mistake
     assert len(rows_of(poller)) == poller.summary()["samples"]
     assert poller.take() is None
+
+
+def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
+    """Nothing was queued on it yet, whatever was carried out on the one before."""
+    sim = simulated(drive())
+    with World(WorldWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as world:
+        world.run(1.0)
+        (tended,) = world.poller._lines
+        assert tended._done
+        assert world.port
+        tended._lose(world.port, world.now)
+        tended.bus.line.reopen()

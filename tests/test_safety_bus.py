@@ -419,9 +419,10 @@ def test_noise_at_the_start_hides_a_look_and_no_more(monkeypatch: pytest.MonkeyP
     spoilt: list[Message] = []
 
     def loses(request: Message) -> bool:
-        if starts(hall, "invt-che") and len(spoilt) < 2 * READ_ATTEMPTS:
-            spoilt.append(request)
-        return bool(spoilt) and spoilt[-1] is request and not is_write(request)
+        if not starts(hall, "invt-che") or len(spoilt) == 2 * READ_ATTEMPTS:
+            return False
+        spoilt.append(request)
+        return not is_write(request)
 
     hall.loses = loses
     drive.start()

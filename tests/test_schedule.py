@@ -681,11 +681,26 @@ def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)
     made.conclude(dead)
-    made.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=0, has_answered=False)
-    rest_ms = FIRST_REST_NS // MS
+    made.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
+    rest_ms = 30_000  # in which that is the share of the silent
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
     assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
     assert made.cycle((60 + rest_ms) * MS) == []
     answer(made, dead, 60 + rest_ms)
     assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
+
+
+def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
+    """A reply may have been lost."""
+    lost, living = job(1), job(2)
+    for cost_ms, again in {300: {lost}, 500: set()}.items():
+        made = meet(lost, living)
+        take(made, 0, 100)
+        made.conclude(lost)
+        made.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
+        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # nobody knows of the other one yet
+        answer(made, living, 90)
+        assert lost not in {asked for asked, _ in take(made, 100, 90)}
+        assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
+        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # before the outcome is known

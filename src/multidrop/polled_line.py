@@ -245,6 +245,8 @@ class PolledLine:
         self._keep_busy(port, now)
 
     def _forget_done(self, port: Port) -> None:
+        if port is not self._port:  # it was opened since the line was tended: nothing is queued on it
+            return
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):
             job = self._queued.popleft().job

@@ -9,7 +9,8 @@ Jobs without a period fill what is left, each once in a round, and have a share 
 nothing is left. A drive that stays silent is rested for longer and longer; in the others' spare time,
 or that share, it is asked its shortest question, and all silent drives together cost a small part of
 the line. With its first answer it is back. A drive that has never answered is asked one question, and no
-other until the outcome of that is known; if there was no answer, it is rested at once.
+other until the outcome of that is known; if there was no answer, it is rested at once. Once all have
+been asked, and few did not answer, these are asked again.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ SILENT_AFTER = 2  # failures in a row
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # of the line, for asking silent drives
+SECOND_COST_NS = 400_000_000  # at most, of asking new drives again at once: a reply may have been lost
 TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
 CREDIT_NS = 50_000_000  # of it, that they use up in advance
 
@@ -253,7 +255,7 @@ class Schedule(Generic[J]):
     def _probe(self, at_ns: int) -> J | None:
         """The shortest question to a drive whose rest is over; then it rests until the outcome is known."""
         for drive, health in self._health.items():
-            if health.rest_ns and at_ns >= health.asleep_until_ns:
+            if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_asked:
                 health.asleep_until_ns = at_ns + health.rest_ns
                 own = (job for job in self.jobs if job.drive == drive)
                 return min(own, key=lambda job: job.duration_ns, default=None)
@@ -289,8 +291,18 @@ class Schedule(Generic[J]):
             health.rest_ns = health.asleep_until_ns = 0
         elif has_answered_late:
             health.asleep_until_ns = now_ns
+        if self._ill:
+            self._ask_again(now_ns)
         self._ill = any(it.failures or it.is_new for it in self._health.values())
         self._late_until_ns = max(it.late_until_ns for it in self._health.values())
+
+    def _ask_again(self, now_ns: int) -> None:
+        """Let new drives not rest after their first question, where all had theirs and few are silent."""
+        new = [it for it in self._health.values() if it.is_new]
+        silent = [it for it in new if it.failures == 1]
+        if all(it.failures for it in new) and sum(it.cost_ns for it in silent) <= SECOND_COST_NS:
+            for health in silent:
+                health.asleep_until_ns = max(now_ns, health.late_until_ns)
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self._health[drive]
