@@ -6,6 +6,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,15 +152,18 @@ class SerialServer:
         manager = rfc2217.PortManager(self.port, SimpleNamespace(write=client.sendall))
         back = threading.Thread(target=self._copy_back, args=(client, manager), daemon=True)
         back.start()
-        while received := client.recv(1024):
-            self._wire.sendall(b"".join(manager.filter(received)))
-        self._wire.shutdown(socket.SHUT_RDWR)
+        with suppress(OSError):  # whoever is connected may leave while it is spoken to
+            while received := client.recv(1024):
+                self._wire.sendall(b"".join(manager.filter(received)))
+        with suppress(OSError):
+            self._wire.shutdown(socket.SHUT_RDWR)
         back.join()
         client.close()
 
     def _copy_back(self, client: socket.socket, manager: rfc2217.PortManager) -> None:
-        while heard := self._wire.recv(1024):
-            client.sendall(b"".join(manager.escape(heard)))
+        with suppress(OSError):
+            while heard := self._wire.recv(1024):
+                client.sendall(b"".join(manager.escape(heard)))
 
     def close(self) -> None:
         self._thread.join()

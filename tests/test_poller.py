@@ -505,13 +505,21 @@ def far_end() -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
-def test_what_is_under_way_at_the_end_is_waited_for(far_end: tuple[int, str], every: float | None) -> None:
+def test_what_is_under_way_at_the_end_is_waited_for(
+    far_end: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     master, path = far_end
+    answers = [checksums.rtu("01 03 02 00 01")]
+
+    def answer(seconds: float) -> None:
+        while answers:
+            os.write(master, answers.pop())
+        time.sleep(seconds)
+
+    monkeypatch.setattr(poller_module, "PARTING_NS", round(PATIENCE * 1e9))
     with Polling(line(path, patient(every))) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
-        answer = threading.Timer(0.05, os.write, (master, checksums.rtu("01 03 02 00 01")))
-        answer.start()
-    answer.join()
+        monkeypatch.setattr(poller_module, "sleep", answer)  # when it waits for what is under way
     assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
     polling.check_summary()
 
