@@ -48,6 +48,11 @@ class Respondent:
         return int(self.c.failures)
 
     @property
+    def late(self) -> int:
+        """Answers that came after their time-out and were known for what they were."""
+        return int(self.c.tally.late)
+
+    @property
     def late_until_ns(self) -> int:
         """So long the answer to an earlier request may still come."""
         return int(self.c.late_until_ns)

@@ -86,7 +86,7 @@ class _Scan:
                 return
             came = completion.result != Result.NO_REPLY
             earlier = addresses[max(0, number - 1 - LATE) : number - 1]
-            late = [it for it in earlier if it in listeners and listeners[it].tally().late]
+            late = [it for it in earlier if it in listeners and listeners[it].late]
             for suspect in late:  # the core knew its answer as a late one
                 del listeners[suspect]
             late += _late(sweep, earlier, completion)
@@ -160,7 +160,7 @@ def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
 
 def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[int]:
     """Whose answer came after its time-out, in the place of another's."""
-    if completion.result > 0:
+    if completion.result > 0 or not completion.raw:
         return []
     found = []
     for address in earlier:

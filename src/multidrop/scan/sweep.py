@@ -5,15 +5,16 @@ A sweep asks one question of many addresses at one setting.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
 from multidrop.drive import Drive
 from multidrop.plan import Block, silence
-from multidrop.register import Access, Carrier, Register
+from multidrop.register import Access, Carrier, Register, Table
 from multidrop.timing import Settings
 
 Setting = tuple[Settings, Framing]
@@ -158,18 +159,25 @@ def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
     )
 
 
+@lru_cache
+def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
+    """The addresses that can be read of each table; asked for again and again."""
+    found: dict[Table, set[int]] = {}
+    for register in family.registers.values():
+        if register.readable:
+            found.setdefault(register.table, set()).add(register.address)
+    return found
+
+
 def _has(family: type[Drive], register: Register[Any]) -> bool:
-    return any(
-        it.readable and it.table == register.table and it.address == register.address
-        for it in family.registers.values()
-    )
+    return register.address in _addresses(family).get(register.table, ())
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
     """It has this register, or its own document has an exception for a register that it lacks."""
     if _has(family, register):
         return True
-    reads = any(it.readable and it.table == register.table for it in family.registers.values())
+    reads = register.table in _addresses(family)
     return reads and family.exceptions is not Drive.exceptions and _ILLEGAL_ADDRESS in family.exceptions
 
 
