@@ -1,5 +1,6 @@
 """What holds for all tests: none of them writes into the ledger of the user who runs them."""
 
+import os
 import signal
 from pathlib import Path
 
@@ -12,6 +13,11 @@ settings.load_profile("any machine")
 
 # A shell's background job ignores SIGINT, and so would the programs that it tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Twice as many as there are processors, because half of the tests wait for a line; 2 to 8."""
+    return min(2 * len(os.sched_getaffinity(0)), 8)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -28,6 +28,7 @@ def test_every_parser_has_inputs_that_were_kept() -> None:
     assert sum(path.stat().st_size for name in (*HARNESSES, *READERS) for path in kept(name)) < 300_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", HARNESSES)
 def test_the_core_takes_what_was_kept(tmp_path: Path, name: str) -> None:
     if shutil.which(CC) is None:

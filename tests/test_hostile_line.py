@@ -196,8 +196,15 @@ def resident_kb() -> int:
     return pages * os.sysconf("SC_PAGESIZE") // 1024
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", LINES)
+# Two lines for each fault, and three faults or more for each line; the rest takes long.
+EACH_ON_EACH = [
+    pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 4 else ())
+    for number, name in enumerate(LINES)
+    for nth, kind in enumerate(KINDS)
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), EACH_ON_EACH)
 def test_a_fault_and_its_end(name: str, kind: str) -> None:
     number = LINES[name]
     if VARIANTS[number][1] in NOT_TOLD.get(kind, ()):

@@ -28,7 +28,7 @@ VARIANTS = (  # family, framing, baud rate of the fast line
 )
 REASONS = {str(it) for it in Result} - {str(Result.INCOMPLETE)}
 
-REAL_SECONDS = 10.0
+REAL_SECONDS = 6.0
 EVERY = 1.0  # s, of what is polled at a rate
 
 FAST_SECONDS = 3.0

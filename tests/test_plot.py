@@ -135,6 +135,12 @@ def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
         {"no reply": 1},
         {"not asked: drive is silent": 1},
     ]
+
+
+def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "it.arrows", METADATA) as writer:
+        writer.write(example())
+    it = load(tmp_path / "it.arrows")
     assert png(plot(it)[0]).startswith(PNG)
     assert "насос" in report_page(it)
 
@@ -271,7 +277,10 @@ def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
 def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
     assert used(look) == []
-    assert "does not carry a plan" in report_page(look)
+
+
+def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
+    assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
 
 
 def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:

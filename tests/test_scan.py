@@ -265,6 +265,7 @@ class Everything(Echo, Junk):
 
 
 @pytest.mark.story
+@pytest.mark.long
 def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address() -> None:
     one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
     one["output_current"], twin["output_current"] = 41.1, 77.7

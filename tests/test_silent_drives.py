@@ -14,7 +14,10 @@ FIRST, LATER = 8, 52  # s, for which the rates are promised
 
 
 @pytest.mark.story
-@pytest.mark.parametrize(("dead", "back_s"), [(1, 5), (5, 25), (10, 45)])
+@pytest.mark.parametrize(
+    ("dead", "back_s"),
+    [pytest.param(1, 5, marks=pytest.mark.long), pytest.param(5, 25, marks=pytest.mark.long), (10, 45)],
+)
 def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]

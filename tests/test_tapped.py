@@ -141,7 +141,7 @@ class Mixed:
 def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
     capture = tmp_path_factory.mktemp("mixed") / "a.pcapng"
     drives = [polled(drive, drive.readings()[:4]) for drive in real_drives()]
-    return Mixed(drives, capture, *captured(capture, real_wires, drives, Counter(ok=200)))
+    return Mixed(drives, capture, *captured(capture, real_wires, drives, Counter(ok=100)))
 
 
 def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
@@ -184,7 +184,13 @@ def epoch(time_ns: int) -> str:
     return f"{time_ns // 10**9}.{time_ns % 10**9:09}"
 
 
-@pytest.mark.parametrize("make", [rough_wires, echoing_wires], ids=["rough", "echoing"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(rough_wires, id="rough", marks=pytest.mark.long),
+        pytest.param(echoing_wires, id="echoing"),
+    ],
+)
 def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(
     tmp_path: Path, make: Callable[[], list[Wire]]
 ) -> None:
