@@ -7,6 +7,11 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from multidrop import exchanges
+from multidrop.core import Respondent
+
+PATIENCE = 60.0  # s
+
 # A busy machine is slow, and nothing is wrong with it.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
@@ -22,6 +27,16 @@ def pytest_xdist_auto_num_workers() -> int:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--kills", type=int, default=20, help="how many clients test_crash.py kills")
+
+
+@pytest.fixture
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for every drive however busy the machine is; not for tests in which one is silent."""
+
+    def respondent(**timeouts: float) -> Respondent:
+        return Respondent(**{name: max(seconds, PATIENCE) for name, seconds in timeouts.items()})
+
+    monkeypatch.setattr(exchanges, "Respondent", respondent)
 
 
 @pytest.fixture(autouse=True)

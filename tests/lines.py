@@ -11,6 +11,8 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
+import pytest
+
 from multidrop.batch import Row
 from multidrop.drive import Drive
 from multidrop.plant import Line, Plant, Polled, PolledDrive
@@ -19,6 +21,7 @@ from multidrop.register import Register
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
 PATIENCE = 30.0  # s, for what comes at once but on a machine that has much else to do
+patient = pytest.mark.usefixtures("_patient")  # drives are waited for as long as it takes
 
 
 def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:

@@ -32,7 +32,7 @@ class Terminal:
         )
         self.written = b""
 
-    def wait_for(self, text: str, seconds: float = 20) -> None:
+    def wait_for(self, text: str, seconds: float = 60) -> None:
         end = time.monotonic() + seconds
         while text not in self.text:
             assert time.monotonic() < end, self.text[-3000:]

@@ -84,7 +84,7 @@ def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, n
         out.readline()
         assert link.is_symlink()
         process.send_signal(number)
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=60) == 0
     assert not link.is_symlink()
 
 
@@ -168,7 +168,7 @@ def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Pa
             assert process.poll() is None
         process.send_signal(number)
         text = printed.read()
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=60) == 0
     assert len(recorded(out)) == json.loads(text)["samples"] + json.loads(text)["misses"]
 
 
@@ -333,7 +333,7 @@ def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) 
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
         terminal.wait_for(">erman")
         terminal.wait_for("utilisation")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
     assert "delixi-native" in {row.drive for row in recorded(out)}
 
 
@@ -343,7 +343,7 @@ def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
         terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
         terminal.wait_for("output_frequency: no")  # of the other: no reply, or not asked
         terminal.wait_for("utilisation")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
         assert b"\x1b[3F\x1b[J" in terminal.written  # the table and its head, over themselves
 
 
@@ -351,6 +351,6 @@ def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
         terminal.wait_for("... and 3 drives more")
         terminal.wait_for("utilisation")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
         table = terminal.text.replace("\r\n", "\n").removeprefix(TOY_IS_RUN).partition("hall-1: ")[0]
         assert max(map(len, table.splitlines())) < 40

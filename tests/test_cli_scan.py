@@ -205,7 +205,7 @@ def test_on_a_terminal_progress_is_one_line(port: str) -> None:
     with on_terminal("scan", port, *BRISKLY) as terminal:
         terminal.wait_for("address 2; ")
         terminal.wait_for("3 drives found in ")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
         lines = terminal.text.splitlines()
     assert next(it for it in lines if "innovert-ibd" in it).startswith("address 2: ")
     assert terminal.written.count(b"\r\x1b[K") > 3

@@ -25,13 +25,6 @@ from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
 
 
-class Slow(Toy):
-    """Answers within a minute, if at all."""
-
-    response_delay = 15.0
-    response_timeout = 60.0
-
-
 def wire(port: str = "pty") -> Wire:
     drive = simulated(Toy(1))
     drive["output_current"] = 3.25
@@ -43,7 +36,7 @@ def descriptors() -> int:
 
 
 def read_and_write(bus: Bus) -> None:
-    toy = bus.attach(Toy, 1)
+    toy = bus.attach(PatientToy, 1)
     assert bus.read(toy, toy.output_current) == 3.25
     assert bus.write(toy, toy.frequency, 25.0) == 25.0
 
@@ -418,7 +411,7 @@ def test_closing_ends_what_waits_for_a_reply() -> None:
     failures: list[LineError] = []
     master, slave = os.openpty()
     bus = Bus(os.ttyname(slave))
-    slow = bus.attach(Slow, 1)
+    slow = bus.attach(PatientToy, 1)
 
     def wait() -> None:
         with pytest.raises(LineError) as caught:

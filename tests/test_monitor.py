@@ -421,7 +421,7 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
         terminal.press(b"n")
         terminal.wait_for("nothing was sent")
         terminal.press(b"q")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
         assert termios.tcgetattr(terminal.slave) == terminal.before
 
 
@@ -454,7 +454,7 @@ def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
         terminal.press(b"q")
         terminal.wait_for("multidrop: ")  # behind the screen, for whoever has left too soon
         terminal.wait_for("pump-9 does not answer: check its address")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
 
 
 def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
@@ -464,7 +464,7 @@ def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
         terminal.wait_for("TOY T1  address 9")
         terminal.wait_for("NoReply")
         terminal.press(b"q")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
 
 
 def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
@@ -472,12 +472,12 @@ def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
     with on_terminal("monitor", plant, "--out", out) as terminal:
         terminal.wait_for("pump-9 silent")
         terminal.press(b"q")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
     rows = [row for batch in open_reader(out) for row in batch]
     assert {row.drive for row in rows} == {"pump-1", "pump-9"}
     with on_terminal("monitor", plant, "--out", out) as terminal:
         terminal.wait_for("seen.arrows")  # it is there already
-        assert terminal.process.wait(timeout=20) == 2
+        assert terminal.process.wait(timeout=60) == 2
 
 
 def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
@@ -488,7 +488,7 @@ def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
     )
     with on_terminal("monitor", plant, "--out", out) as terminal:
         terminal.wait_for("there is no such port")
-        assert terminal.process.wait(timeout=20) == 1
+        assert terminal.process.wait(timeout=60) == 1
     assert not out.exists()
 
 
@@ -498,7 +498,7 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
         terminal.wait_for(">pump-1")
         terminal.wait_for("pump-9 silent")  # and the other has answered
         terminal.press(b"q")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
         assert not re.search(rb"\x1b\[[0-9;]*3[0-9]m", terminal.written)
         assert terminal.written.isascii()
 
@@ -512,13 +512,13 @@ def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
         assert len(picture.splitlines()) == 23
         terminal.wait_for("pump-9 silent")
         terminal.press(b"q")
-        assert terminal.process.wait(timeout=20) == 0
+        assert terminal.process.wait(timeout=60) == 0
 
 
 def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
     with on_terminal("monitor", plant, size=(40, 10)) as terminal:
         terminal.wait_for("too small: it has 40 x 10")
-        assert terminal.process.wait(timeout=20) == 2
+        assert terminal.process.wait(timeout=60) == 2
 
 
 def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None:

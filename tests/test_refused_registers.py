@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from lines import polled
-from toy import PatientToy, Toy
+from lines import patient, polled
+from toy import Toy
 from worlds import World, WorldWire
 
 from multidrop import polled_line
@@ -28,9 +28,10 @@ class Stubborn(SimulatedDrive):
         return super().read(function, start, count)
 
 
+@patient
 def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     with Simulator([Wire([Stubborn(Toy(1))], unpaced=True)]) as simulator:
-        drive = PatientToy(1, name="pump-1")
+        drive = Toy(1, name="pump-1")
         polls = tuple(Polled(drive.register(name), None) for name in POLLED)
         line = Line("hall-1", simulator.wires[0].path, None, None, (PolledDrive(drive, polls),))
         seen: dict[str, int] = {}

@@ -65,6 +65,7 @@ class Toy(Drive):
 
 
 class PatientToy(Toy):
-    """One that is waited for however busy the machine is."""
+    """One that is waited for however busy the machine is, and however soon it answered before."""
 
     response_timeout = 60.0
+    response_delay = 15.0  # a learnt time-out is never less than four of them

@@ -16,7 +16,7 @@ from multidrop.cli.monitor import is_possible, watch
 from multidrop.cli.overwriting import refuse_overwriting
 from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.drives import MODELS
-from multidrop.errors import Unconfirmed
+from multidrop.errors import BadReply, NoReply, NotDone, Unconfirmed
 from multidrop.plant import Line, load_plant
 from multidrop.recording import open_reader
 
@@ -83,7 +83,7 @@ def _start_motors(line: Line) -> None:
     with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
-            with suppress(Unconfirmed):  # the machine is busy: whether it turns is seen
+            with suppress(BadReply, NoReply, NotDone, Unconfirmed):  # the machine is busy: it is seen to turn
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
 
