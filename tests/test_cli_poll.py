@@ -14,6 +14,7 @@ from typing import IO
 
 import pytest
 from batches import METADATA, counting
+from lines import Faulty, line, polled
 from terminals import MULTIDROP, on_terminal
 from test_cli import TOY, Run, run
 from toy import Toy
@@ -21,10 +22,11 @@ from toy import Toy
 from multidrop.batch import Row
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.demo import DRIVES
+from multidrop.cli.demo import DRIVES, _start_motors
 from multidrop.core import Result
 from multidrop.errors import NoReply
 from multidrop.recording import open_reader, open_writer
+from multidrop.sim import Simulator, simulated
 
 __all__ = ["run"]  # a fixture
 
@@ -313,6 +315,13 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
     with Capture(capture) as found:
         assert sum(map(len, Decoding(found))) > 0
+
+
+def test_a_demo_goes_on_without_a_motor_that_does_not_answer() -> None:
+    """As on a machine that has much else to do."""
+    toy = Toy(1)
+    with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
+        _start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))
 
 
 def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:

@@ -83,7 +83,8 @@ def _start_motors(line: Line) -> None:
     with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
-            with suppress(BadReply, NoReply, NotDone, Unconfirmed):  # the machine is busy: it is seen to turn
+            # On a busy machine the simulated drive is too late: the demo shows whether its motor turns.
+            with suppress(BadReply, NoReply, NotDone, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
 
