@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from lines import polled
+from lines import polled, rows_of
+from toy import Toy
 from worlds import S, World, WorldWire
 
 from multidrop.drives import InvtCHE
@@ -11,6 +12,21 @@ from multidrop.sim import Faults, simulated
 
 DRIVES = 31
 FIRST, LATER = 8, 52  # s, for which the rates are promised
+
+
+def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
+    """The line is planned ahead; what is recorded is not."""
+    toy = Toy(1, name="pump-1")
+    silent = simulated(toy)
+    silent.deaf_until = float("inf")
+    with World(WorldWire([silent], Faults()), [polled(toy, [Toy.fault], 0.01)]) as world:
+        world.run(5)
+        for _ in range(100):
+            rows = world.run(0.05)
+            assert world.now - 0.02 * S <= rows[-1].monotonic_ns <= world.now
+            assert all(row.monotonic_ns <= world.now for row in rows)
+    assert all(row.monotonic_ns <= world.now for row in rows_of(world.poller))
+    assert world.poller.summary()["lines"]["line"]["misses"]["not asked: drive is silent"] > 400
 
 
 @pytest.mark.story

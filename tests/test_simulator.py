@@ -10,7 +10,7 @@ from test_sim_wire import Own
 
 from multidrop.sim import Simulator, Wire, serve, simulated
 
-PATIENCE = 10.0
+PATIENCE = 60.0
 
 
 def test_a_signal_ends_it_though_its_handler_is_not_called() -> None:

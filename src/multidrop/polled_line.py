@@ -347,9 +347,14 @@ class PolledLine:
                 port.repeat([job.exchange for job in self._cycle])
         if not self._cycle:
             self._top_up(port, now)
-        if self.schedule.unasked:
-            self._miss(self.schedule.unasked, Result.NOT_ASKED)
-            self.schedule.unasked = []
+        self._tell_unasked(now)
+
+    def _tell_unasked(self, now: int) -> None:
+        """Slots that passed unasked, which is planned ahead, have a row when they have come."""
+        unasked = self.schedule.unasked
+        if unasked:
+            self._miss([slot for slot in unasked if slot[1] <= now], Result.NOT_ASKED)
+            self.schedule.unasked = [slot for slot in unasked if slot[1] > now]
 
     def _top_up(self, port: Port, now: int) -> None:
         done_ns = max(now + self._ahead_ns, self._queued[-1].not_before_ns if self._queued else 0)
@@ -394,6 +399,7 @@ class PolledLine:
 
     def _close(self) -> None:
         ended_ns = self._ended_ns or now_ns()
+        self._tell_unasked(ended_ns)
         port = self.bus.line.queue
         if port:
             port.stop()
