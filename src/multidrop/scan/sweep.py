@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
@@ -159,14 +159,18 @@ def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
     )
 
 
-@lru_cache
+_known: WeakKeyDictionary[type[Drive], Mapping[Table, Collection[int]]] = WeakKeyDictionary()
+
+
 def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
-    """The addresses that can be read of each table; asked for again and again."""
-    found: dict[Table, set[int]] = {}
-    for register in family.registers.values():
-        if register.readable:
-            found.setdefault(register.table, set()).add(register.address)
-    return found
+    """The addresses that can be read of each table, found once for each family."""
+    if family not in _known:
+        found: dict[Table, set[int]] = {}
+        for register in family.registers.values():
+            if register.readable:
+                found.setdefault(register.table, set()).add(register.address)
+        _known[family] = found
+    return _known[family]
 
 
 def _has(family: type[Drive], register: Register[Any]) -> bool:
