@@ -704,3 +704,14 @@ def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
         assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
         assert lost not in {asked for asked, _ in take(made, 230, 20)}  # before the outcome is known
+
+
+def test_when_a_silent_drive_is_back_another_one_is_asked_and_no_more() -> None:
+    made = schedule(*(jobs := [job(drive) for drive in range(4)]))
+    for drive in (0, 1, 2):
+        made.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1000, 50)} == {jobs[3]}
+    made.observe(2, 0, 1100 * MS, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1100, 400)} == {jobs[0], jobs[2], jobs[3]}
+    made.observe(0, 3, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}

@@ -12,6 +12,7 @@ from multidrop.sim import Faults, simulated
 
 DRIVES = 31
 FIRST, LATER = 8, 52  # s, for which the rates are promised
+BACK = 45  # s, in which drives that were dead from the start are back, when all have power
 
 
 def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
@@ -75,7 +76,12 @@ def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
             sim.deaf_until = float("inf") if sim.drive.address in gone else 0.0
         world = World(WorldWire(sims, Faults()), [polled(it, it.readings()[:1], every) for it in drives])
         with world:
-            return [sum(row.value is not None for row in world.run(span)) for span in (FIRST, LATER)]
+            found = [sum(row.value is not None for row in world.run(span)) for span in (FIRST, LATER)]
+            for sim in sims:
+                sim.deaf_until = 0.0
+            back = {row.drive for row in world.run(BACK) if row.value is not None}
+            assert back == {it.name for it in drives}
+            return found
 
     every_drive = list(range(1, count + 1))
     first, later = answered(every_drive)

@@ -8,9 +8,9 @@ line has caught up, the job goes first that was not asked for longest, so that e
 Jobs without a period fill what is left, each once in a round, and have a share of the line even where
 nothing is left. A drive that stays silent is rested for longer and longer; in the others' spare time,
 or that share, it is asked its shortest question, and all silent drives together cost a small part of
-the line. With its first answer it is back. A drive that has never answered is asked one question, and no
-other until the outcome of that is known; if there was no answer, it is rested at once. Once all have
-been asked, and few did not answer, these are asked again.
+the line. With its first answer it is back, and another silent one is asked. A drive that has never
+answered is asked one question, and no other until the outcome of that is known; if there was no
+answer, it is rested at once. Once all have been asked, and few did not answer, these are asked again.
 """
 
 from __future__ import annotations
@@ -288,6 +288,8 @@ class Schedule(Generic[J]):
         if has_changed and failures:
             self._rest(drive, now_ns)
         elif has_changed:
+            if health.rest_ns:
+                self._wake_next(drive, now_ns)
             health.rest_ns = health.asleep_until_ns = 0
         elif has_answered_late:
             health.asleep_until_ns = now_ns
@@ -295,6 +297,13 @@ class Schedule(Generic[J]):
             self._ask_again(now_ns)
         self._ill = any(it.failures or it.is_new for it in self._health.values())
         self._late_until_ns = max(it.late_until_ns for it in self._health.values())
+
+    def _wake_next(self, drive: int, now_ns: int) -> None:
+        """Let one more drive rest no longer, because this one is back: both may have had no power."""
+        resting = [it for number, it in self._health.items() if it.rest_ns and number != drive]
+        if resting:
+            first = min(resting, key=lambda it: it.asleep_until_ns)
+            first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _ask_again(self, now_ns: int) -> None:
         """Let new drives not rest after their first question, where all had theirs and few are silent."""
