@@ -32,6 +32,7 @@ FLOORS = [
         "line",
         "schedule",
         "plan",
+        "proofs",
         "prediction",
         "forecast",
         "remedies",
