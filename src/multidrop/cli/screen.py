@@ -122,7 +122,7 @@ def _pace(it: Watched) -> str:
     if delays.replies:
         told.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
     if so_far.late_replies:
-        told.append(f"{so_far.late_replies} late (time-out now {_ms(so_far.timeout)} ms)")
+        told.append(f"{so_far.late_replies} late")
     if so_far.skipped_bytes:
         told.append(f"{so_far.skipped_bytes} bytes skipped")
     return "  ".join(told)
