@@ -278,8 +278,10 @@ static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t l
 
 /* Account for the earliest request that this answer fits. What fits no other, and nothing that was asked
  * since, tells how late it is. */
-static int take_of(struct md_drive *drive, const uint8_t *bytes, size_t len, int64_t now_ns, int is_surely_late, int *found)
+static int take_of(struct md_line *line, struct md_drive *drive, size_t at, int64_t now_ns, int is_surely_late, int *found)
 {
+    const uint8_t *bytes = line->rx + at;
+    size_t len = line->rx_len - at;
     struct md_owed *earliest = NULL;
     int length = 0, fits = 0;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
@@ -299,6 +301,7 @@ static int take_of(struct md_drive *drive, const uint8_t *bytes, size_t len, int
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (is_surely_late && fits == 1)
         md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
+    line->late_since_ns = is_same_question(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
     drop_earliest_time(earliest);
     if (earliest->times == 0)
         drop(drive, earliest);
@@ -317,7 +320,7 @@ int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_
             *link = drive->next_late;
             continue;
         }
-        int used = take_of(drive, line->rx + at, line->rx_len - at, now_ns, is_surely_late, &found);
+        int used = take_of(line, drive, at, now_ns, is_surely_late, &found);
         if (used > 0)
             return used;
         link = &drive->next_late;

@@ -21,6 +21,7 @@ enum state {
     ENDING     /* the time-out is over: looks once more, because it may be late to look at all */
 };
 
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* of a row's value */
 static const int64_t WORTH_WAITING = 250000; /* ns; before a shorter time a sleep costs more than a look */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
@@ -238,6 +239,28 @@ static void extend(struct md_line *line)
     line->begun_by_ns = line->give_up_ns;
 }
 
+/* It answers this question or an earlier one, and the other's answer may still come. A row may have it, with
+ * a time that leaves that open; whoever asks for a value by hand wants the present one: another question
+ * tells more. */
+static void end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns)
+{
+    struct md_completion *completion = line->completion;
+    const struct md_block *block = line->exchange->block;
+    int64_t request_ns = line->tx_len * line->exchange->character_ns;
+    int is_row = line->late_since_ns && block && block->count > 0 && now_ns - line->late_since_ns < OLDEST_IN_DOUBT;
+    md_late_expect(line, 0);
+    if (!is_row) {
+        recognise_late_answers(line, at + (size_t)used, now_ns);
+        finish(line, MD_LATE_ANSWER_DUE, line->rx, line->rx_len);
+        return;
+    }
+    md_copy_message(&completion->reply, reply);
+    completion->skipped -= (uint32_t)used;
+    completion->sent_ns = line->late_since_ns - request_ns;
+    md_tally_answer(&line->exchange->drive->tally, 0, request_ns + used * line->exchange->character_ns);
+    finish(line, used, line->rx + at, (size_t)used);
+}
+
 /* Look for the reply at every place where it may still begin. A late answer is looked for only where
  * what precedes it cannot be the reply's beginning: it may be the inside of the reply. */
 static void search(struct md_line *line, int64_t now_ns)
@@ -258,10 +281,8 @@ static void search(struct md_line *line, int64_t now_ns)
         }
         if (used > 0 && !exchange->insists && drive->owed_count && md_late_take(line, at, now_ns, 0) > 0) {
             extend(line);
-            if (md_is_read(exchange->framing, exchange->request.function)) { /* it says nothing; another question may */
-                md_late_expect(line, 0);
-                recognise_late_answers(line, at + (size_t)used, now_ns);
-                finish(line, MD_LATE_ANSWER_DUE, line->rx, line->rx_len);
+            if (md_is_read(exchange->framing, exchange->request.function)) {
+                end_in_doubt(line, at, used, &reply, now_ns);
                 return;
             }
             cut_out(line, at, (size_t)used);

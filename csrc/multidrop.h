@@ -214,6 +214,7 @@ struct md_line {
     int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
     int64_t ready_ns;   /* before then nothing is worth reading */
     struct md_drive *late; /* the first of those whose answers may still come */
+    int64_t late_since_ns; /* when what the last late answer answers was asked first; 0: another question */
     const struct md_exchange *exchange;
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
