@@ -773,3 +773,16 @@ def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: py
     with pytest.raises(NoReply):
         drive.start()
     assert first(hall, 0, STARTS["invt-che"]) is None
+
+
+def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each stop was sent before the first record is written."""
+    hall = Hall(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    for address in (1, 2):
+        hall.attach(InvtCHE(address))
+    stopped: list[int] = []
+    audit = hall.bus._writer.audit
+    assert audit is not None
+    monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(hall))))
+    hall.bus.stop_all()
+    assert stopped == [2, 2]

@@ -259,7 +259,7 @@ class Bus:
             try:
                 return self._writer.insist(drive, step)
             finally:
-                self._writer.count()
+                self._writer.catch_up()
         call = self._performer.call(drive)
         with call.noted():
             call.check(f"{register.name} = {register.format(value)}")
@@ -313,7 +313,10 @@ class Bus:
             self.introduce(it)
         if is_harmless(register, raw):
             self._performer.rise(self.drives)
-        self._writer.broadcast(drive, register, raw)
+        try:
+            self._writer.broadcast(drive, register, raw)
+        finally:
+            self._writer.catch_up()
         return {it.name: self._look(it) for it in self.drives}
 
     def _look(self, drive: Drive) -> State | BusError:
