@@ -10,6 +10,7 @@ from typing import Any
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Block
 from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
+from multidrop.core.latch import Permit
 from multidrop.core.results import EXCEPTION_STATUS, Result
 from multidrop.core.settings import settings_to_c
 from multidrop.core.tally import Tally, read_tally
@@ -98,10 +99,11 @@ class Exchange:
     `insists`: not to wait for an earlier answer, which may then pass for its own. `timeout`: at least so
     long its reply is waited for; 0 as learnt. `answer`: the one register of its reply lies between these.
     `block` is what rows are made of. `teller` goes first where nobody knows yet whether the adapter echoes:
-    unlike this one's, its reply is never a copy of its request.
+    unlike this one's, its reply is never a copy of its request. `permit` keeps it from being
+    sent once a stop was called.
     """
 
-    __slots__ = ("block", "c", "framing", "request", "respondent", "settings", "teller")
+    __slots__ = ("block", "c", "framing", "permit", "request", "respondent", "settings", "teller")
 
     def __init__(
         self,
@@ -120,6 +122,7 @@ class Exchange:
         answer: tuple[int, int] | None = None,
         block: Block | None = None,
         teller: Exchange | None = None,
+        permit: Permit | None = None,
     ) -> None:
         least, most = answer or (0, 0)
         build_request(framing, request)  # raises for what no frame can say
@@ -128,6 +131,7 @@ class Exchange:
         self.respondent = respondent
         self.block = block
         self.teller = teller
+        self.permit = permit
         self.settings = (baudrate, format)
         self.c: Any = ffi.new(
             "struct md_exchange *",
@@ -146,6 +150,8 @@ class Exchange:
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
                 "teller": teller.c if teller else ffi.NULL,
+                "stops": permit.latch.c if permit else ffi.NULL,
+                "stops_seen": permit.seen if permit else 0,
             },
         )
 
