@@ -12,7 +12,7 @@ import time
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 
 import pytest
@@ -39,7 +39,7 @@ pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is dep
 
 def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
     edges = [0, *sorted(at % (len(stream) + 1) for at in cuts), len(stream)]
-    return [stream[begin:end] for begin, end in zip(edges, edges[1:], strict=False)]
+    return [stream[begin:end] for begin, end in pairwise(edges)]
 
 
 def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:

@@ -126,5 +126,5 @@ def test_an_unknown_register_is_answered_with_its_neighbours() -> None:
 
 
 def test_an_address_outside_the_protocol_is_refused() -> None:
-    with pytest.raises(ValueError, match="FFFFH"):
-        reading(0x10000, "Hz")
+    with pytest.raises(ValueError, match=r"^Far\.frequency: address 10000H is outside 0 to FFFFH$"):
+        type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})

@@ -321,9 +321,15 @@ def test_a_drive_of_no_family_is_unknown() -> None:
     assert (it.address, it.models) == (7, ())
 
 
+class Unsure(Toy):
+    """It cannot tell its drives from others."""
+
+    identify = Drive.identify
+
+
 def test_a_family_of_one_s_own_is_found() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
-    families = [*FAMILIES, Toy]
+    families = [*FAMILIES, Unsure]
     findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
     assert drives(findings) == {(7, "toy", "19200 8N1", "rtu"), (2, "invt-che", "9600 8N1", "rtu")}
 

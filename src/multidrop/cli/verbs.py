@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     hz = getattr(arguments, "frequency", None)
     setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _ASKED:
+        drive.check_confirmed(arguments.command)
         ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
     with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus:
         bus.attach(drive)

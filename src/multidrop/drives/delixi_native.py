@@ -91,10 +91,21 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     )
     status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
     frequency = command(
-        0x0001, "Hz", step=0.01, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0001"
+        0x0001,
+        "Hz",
+        step=0.01,
+        table=SETPOINT,
+        kept=Kept.RAM,
+        moves=False,
+        place="part 3, section 5: K = 04, 0001",
     )
     pi_setpoint = command(
-        0x0007, step=0.1, table=SETPOINT, kept=Kept.RAM, place="part 3, section 5: K = 04, 0007"
+        0x0007,
+        step=0.1,
+        table=SETPOINT,
+        kept=Kept.RAM,
+        moves=False,
+        place="part 3, section 5: K = 04, 0007",
     )
     stored_frequency = setting(
         parameter(0, 2),
