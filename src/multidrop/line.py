@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 
 import serial
 
+from multidrop import port_identity
 from multidrop.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError, NoSuchPort
@@ -133,6 +134,7 @@ class Line:
 
     def __init__(self, port: str, echo: Echo = Echo.AUTO) -> None:
         self.port = port
+        self.identity = port  # what it is, however its name is spelt, once it is open
         self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
@@ -170,6 +172,7 @@ class Line:
             if isinstance(port, serial.Serial):
                 port.exclusive = True
             port.open()
+            self.identity = self._identify(port)
             self._core = self._drive(port)
             self._core.tell_echo(self._echo)
             if self._tap:
@@ -181,6 +184,14 @@ class Line:
         except PORT_FAILURES as failure:
             self.close()
             raise LineError(self.port, reason_of(failure)) from failure
+
+    def _identify(self, port: serial.SerialBase) -> str:
+        if connection := getattr(port, "_socket", None):
+            return port_identity.of_connection(connection)
+        try:
+            return port_identity.of_device(os.ttyname(port.fileno()))
+        except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
+            return port_identity.of_name(self.port)
 
     def _drive(self, port: serial.SerialBase) -> Port:
         if type(port).read is serial.Serial.read:

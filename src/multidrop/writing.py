@@ -111,11 +111,11 @@ class Writer:
 
     def _enter(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger; Refused when it may not be."""
-        cell = Cell(
-            self._exchanges.line.port, drive.address, drive.model or type(drive).__name__, register.name
-        )
+        line = self._exchanges.line
+        model = drive.model or type(drive).__name__
+        cell = Cell(line.identity, drive.address, model, register.name, line.port)
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
-        why = self._ledger.enter(cell, utc_ns() / 1e9, least)
+        why = self._ledger.at(line.identity).enter(cell, utc_ns() / 1e9, least)
         if why:
             way = "write it less often, or take a setpoint that is kept in RAM"
             if kept is Kept.UNKNOWN:
@@ -187,7 +187,7 @@ class Writer:
         self.log(drive, request, what, Effect.DONE)
         return reply.data
 
-    def broadcast(self, drive: Drive, register: Register[Any], raw: int) -> None:
+    def broadcast(self, drive: Drive, register: Register[Any], raw: float) -> None:
         """Write to all drives at once, by the table of one of them."""
         request = write_request(drive, register, raw, address=0)
         what = f"{register.name} = {register.format(register.decode(raw))}"
