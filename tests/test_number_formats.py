@@ -12,6 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from multidrop.cli.values import as_json, taken
+from multidrop.cli.watched import told
 from multidrop.core import Message
 from multidrop.drive import Drive
 from multidrop.errors import Refused
@@ -191,6 +192,11 @@ def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str
     assert as_json(Meter.f32, math.inf)["value"] is None
 
 
+@pytest.mark.parametrize(("value", "text"), [(12.345678, "12.345678 raw"), (1_234_567, "1234567 raw")])
+def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, text: str) -> None:
+    assert told(Meter.unscaled, value) == text
+
+
 # ---- what is common in devices ----
 
 
@@ -225,7 +231,7 @@ def test_a_single_register_of_a_table_that_is_written_several_at_once(attached: 
 def test_a_step_may_be_negative(attached: Any) -> None:
     hall, meter, sim = attached
     assert hall.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
-    assert Meter.downwards.format(Meter.downwards.decode(0)) == "0.0 V"
+    assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
     with pytest.raises(Refused, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
         hall.bus.write(meter, Meter.downwards, 5)
 

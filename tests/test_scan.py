@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 from line_driver import LineDriver
-from toy import Toy
+from toy import Toy, Unsure
 
 from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
 from multidrop.drive import Drive, Script, verb, write
@@ -319,12 +319,6 @@ def test_a_drive_of_no_family_is_unknown() -> None:
     (it,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
     assert isinstance(it, Found)
     assert (it.address, it.models) == (7, ())
-
-
-class Unsure(Toy):
-    """It cannot tell its drives from others."""
-
-    identify = Drive.identify
 
 
 def test_a_family_of_one_s_own_is_found() -> None:

@@ -73,3 +73,9 @@ class PatientToy(Toy):
     """One that is waited for however busy the machine is."""
 
     response_timeout = 60.0
+
+
+class Unsure(Toy):
+    """It cannot tell its drives from others."""
+
+    identify = Drive.identify
