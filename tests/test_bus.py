@@ -15,7 +15,7 @@ from toy import Fault, Toy
 from multidrop import exchanges
 from multidrop.bus import READ_ATTEMPTS, Bus, exchange
 from multidrop.core import Framing, Message
-from multidrop.drive import Drive
+from multidrop.drive import Drive, Script, verb
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.innovert_ibd import Control
 from multidrop.drives.invt_che import parameter
@@ -38,7 +38,12 @@ class Rig(Drive):
     gain = setting(0x10, step=0.01, span=(0, 10), kept=Kept.RAM)
     limit = setting(0x11, "A", step=0.1, span=(0, 50), kept=Kept.EEPROM)
     sealed = setting(0x12, never="it is the maker's", kept=Kept.RAM)
-    target = command(0x20, "rpm", span=(0, 3000))
+    target = command(0x20, "rpm", span=(0, 3000), moves=False)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Take it for a rig: there is nothing else on these lines."""
+        yield from ()
 
 
 class MyCHE(InvtCHE):

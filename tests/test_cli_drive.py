@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from motors import Heard
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
+from multidrop import ledger
 from multidrop.core import Message
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -284,9 +286,13 @@ def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "13", "--yes")
     assert (status, out) == (1, "")
     assert "is written once in 60 s at most" in err
+    assert "was written yet" in run("wear")[1]  # a simulated drive's EEPROM is none
+    assert not ledger.Ledger().enter(
+        ledger.Cell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
+    )
     head, row, *_ = run("wear")[1].splitlines()
     assert head.split() == ["PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS", "YEAR", "LEFT", "LAST"]
-    assert row.split()[:7] == [port, "1", "toy", "acceleration_time", "1", "1", "999"]
+    assert row.split()[:7] == ["/dev/ttyS7", "1", "toy", "acceleration_time", "1", "1", "999"]
     (wear,) = json.loads(run("wear", "--json")[1])
     assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
 

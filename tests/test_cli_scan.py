@@ -61,7 +61,17 @@ def test_json_is_one_object(run: Run, port: str) -> None:
 
 def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "found.toml"
-    words = (*BRISKLY, "--model", TOY, "--model", "invt-che", "--model", "innovert-ibd", "--out", out)
+    words = (
+        *BRISKLY,
+        "--model",
+        TOY.replace(":Toy", ":Unsure"),
+        "--model",
+        "invt-che",
+        "--model",
+        "innovert-ibd",
+        "--out",
+        out,
+    )
     assert run("scan", port, *words)[0] == 0
     (line,) = load_plant(out).lines
     assert line.port == port

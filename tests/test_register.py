@@ -126,12 +126,12 @@ def test_an_unknown_register_is_answered_with_its_neighbours() -> None:
 
 
 def test_an_address_outside_the_protocol_is_refused() -> None:
-    with pytest.raises(ValueError, match="FFFFH"):
-        reading(0x10000, "Hz")
+    with pytest.raises(ValueError, match=r"^Far\.frequency: address 10000H is outside 0 to FFFFH$"):
+        type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})
 
 
 @pytest.mark.parametrize("number", [10**400, -(10**400), 1 << 64])
 @pytest.mark.parametrize("name", ["current", "energy", "frequency", "choice", "unknown"])
 def test_a_number_that_no_float_can_hold_is_refused(name: str, number: int) -> None:
-    with pytest.raises(ValueError, match=rf"{name} takes a number of 32 bits, not one of \d+"):
+    with pytest.raises(ValueError, match=rf"^{name} "):
         Example.register(name).encode(number)

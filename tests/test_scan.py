@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 from line_driver import LineDriver
-from toy import Toy
+from toy import Toy, Unsure
 
 from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
 from multidrop.drive import Drive, Script, verb, write
@@ -324,7 +324,7 @@ def test_a_drive_of_no_family_is_unknown() -> None:
 
 def test_a_family_of_one_s_own_is_found() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
-    families = [*FAMILIES, Toy]
+    families = [*FAMILIES, Unsure]
     findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
     assert drives(findings) == {(7, "toy", "19200 8N1", "rtu"), (2, "invt-che", "9600 8N1", "rtu")}
 

@@ -39,7 +39,12 @@ class Toy(Drive):
     acceleration_time = setting(0x0A, "s", step=0.1, span=(0.1, 600), kept=Kept.EEPROM, while_running=False)
     sealed = setting(0x0B, never="it is the maker's")
     control = command(0x14, Status)
-    frequency = command(0x15, "Hz", step=0.01, span=(0, 50))
+    frequency = command(0x15, "Hz", step=0.01, span=(0, 50), moves=False)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Take it for a toy: there is nothing else on a test's line."""
+        yield from ()
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
@@ -69,3 +74,9 @@ class PatientToy(Toy):
 
     response_timeout = 60.0
     response_delay = 15.0  # a learnt time-out is never less than four of them
+
+
+class Unsure(Toy):
+    """It cannot tell its drives from others."""
+
+    identify = Drive.identify

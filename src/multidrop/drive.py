@@ -14,6 +14,7 @@ from numbers import Real
 from typing import Any, ClassVar, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 from multidrop.core import Framing
+from multidrop.declared import DeclarationError, mistakes
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 from multidrop.register import Access, Kept, Register, Table
 from multidrop.script import (
@@ -88,6 +89,7 @@ class Option:
 MOVING = ("start", "jog", "reset_fault", "set_frequency")
 # A stop goes to a silent drive too, again and again.
 STOPPING = ("stop", "coast", "emergency_stop")
+_CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
 # What a verb is given, its types, and in words: "reverse" is not Direction.REVERSE, and would go forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -120,6 +122,7 @@ class _BoundVerb(Generic[P, R]):
             )
         script = self.script(*args, **kwargs)
         if self.name in MOVING:
+            self.drive.check_confirmed(self.name)
             return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name)))
         return cast(R, self.drive.perform(script))
 
@@ -218,13 +221,45 @@ class Drive:
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
 
     def __init_subclass__(cls) -> None:
+        """Collect the registers; raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
         found: dict[str, Register[Any]] = {}
         for owner in reversed(cls.__mro__):
-            found.update({name: it for name, it in vars(owner).items() if isinstance(it, Register)})
+            for name, it in vars(owner).items():
+                if isinstance(it, Register):
+                    found[name] = it
+                else:
+                    found.pop(name, None)  # a subclass has something else of this name
         cls.registers = found
+        cls.options = cls._all_options()
+        if wrong := mistakes(found, _NAMES, cls.options):
+            raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
+
+    @classmethod
+    def _all_options(cls) -> Mapping[str, Option]:
+        """Those of the class, and where it commands a motor but has no `identify` its owner's word."""
+        commands = any(it.commands or it.access is Access.COMMAND for it in cls.registers.values())
+        verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
+        if cls.identify is not Drive.identify or not (commands or verbs):
+            return cls.options
+        return {"confirmed": _CONFIRMED, **cls.options}
+
+    def check_confirmed(self, what: str) -> None:
+        """Refused where the class cannot tell its drives from others, and nobody has said what it is.
+
+        The same address means different things to different makes, and may start their motor.
+        """
+        family = type(self)
+        if family.identify is Drive.identify and not self.option.get("confirmed"):
+            kind = self.title or family.__name__
+            raise Refused(
+                f"{what} is not sent to {self.name}: its class has no `identify` that could tell a {kind} "
+                "from another drive, to which the same may mean a start; look at its name plate, and declare "
+                "confirmed = 1",
+                rule="nobody has confirmed what it is",
+            )
 
     def __init__(
         self,
@@ -486,3 +521,10 @@ class Drive:
         """What the drive says of itself."""
         raise self._unsupported("state")
         yield
+
+
+# What a drive has besides registers.
+_NAMES = frozenset(
+    {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
+    | {"option", "ram", "commanded", "perform", "introduce"}
+)

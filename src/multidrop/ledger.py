@@ -1,5 +1,6 @@
 """Ledger: how often each register that a drive may keep in EEPROM was written, across restarts.
 
+A drive is known by its port, whatever that is called, and its address there.
 It is a file that several processes share. EEPROM bears some 10,000 writes, so a budget keeps them
 for ten years.
 """
@@ -10,8 +11,11 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+from multidrop.port_identity import of_name
+from multidrop.simulated_ports import is_simulated, ledger_of
 
 YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
@@ -23,12 +27,16 @@ LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be 
 
 @dataclass(frozen=True)
 class Cell:
-    """One register of one drive, as a ledger knows it."""
+    """One register of one drive, as a ledger knows it.
+
+    `port` is what the port is (see port_identity), `spelt` its name, by which it may have been entered once.
+    """
 
     port: str
     address: int
     model: str
     register: str
+    spelt: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,13 @@ class Ledger:
     def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
         self.path = Path(path) if path else default_path()
         self.budget = budget
+        self._is_the_user_s = not path
+
+    def at(self, port: str) -> Ledger:
+        """The ledger for this port: a simulated one never spends the user's own, but one of its own."""
+        if self._is_the_user_s and is_simulated(port):
+            return Ledger(ledger_of(port, self.path.parent), budget=self.budget)
+        return self
 
     def enter(self, cell: Cell, now: float, least_interval: float) -> str:
         """Count a write that is about to be sent; a reason why it must not be, and then it is not counted.
@@ -62,7 +77,7 @@ class Ledger:
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
-            wear = _wear(ledger, cell, now)
+            wear = _wear(ledger, cell, _names(ledger, cell), now)
             since = now - wear.last  # below 0: the clock was set back, and nobody knows how long it is
             if wear.writes and 0 <= since < least_interval:
                 return (
@@ -89,7 +104,10 @@ class Ledger:
             return []
         with self._opened() as ledger:
             rows = ledger.execute("select distinct port, address, model, register from writes").fetchall()
-            found = [_wear(ledger, Cell(*row), now) for row in rows]
+            names: dict[Cell, list[str]] = {}
+            for port, *place in rows:
+                names.setdefault(Cell(of_name(port), *place), []).append(port)
+            found = [_wear(ledger, cell, ports, now) for cell, ports in names.items()]
         return sorted(found, key=lambda it: (-it.this_year, it.cell.port, it.cell.address, it.cell.register))
 
     @contextmanager
@@ -117,15 +135,21 @@ def _key(cell: Cell) -> tuple[str, int, str, str]:
     return cell.port, cell.address, cell.model, cell.register
 
 
-def _wear(ledger: sqlite3.Connection, cell: Cell, now: float) -> Wear:
-    where = "port = ? and address = ? and model = ? and register = ?"
-    writes, latest = ledger.execute(
-        f"select count(*), max(rowid) from writes where {where}", _key(cell)
-    ).fetchone()
+def _names(ledger: sqlite3.Connection, cell: Cell) -> list[str]:
+    """All names under which the cell's port was entered."""
+    ports = [port for (port,) in ledger.execute("select distinct port from writes")]
+    return [port for port in ports if port in (cell.port, cell.spelt) or of_name(port) == cell.port]
+
+
+def _wear(ledger: sqlite3.Connection, cell: Cell, ports: list[str], now: float) -> Wear:
+    same_port = f"port in ({', '.join('?' * len(ports))})"
+    where = f"{same_port} and address = ? and model = ? and register = ?"
+    key = (*ports, *_key(cell)[1:])
+    writes, latest = ledger.execute(f"select count(*), max(rowid) from writes where {where}", key).fetchone()
     (this_year,) = ledger.execute(
-        f"select count(*) from writes where {where} and time > ?", (*_key(cell), now - YEAR)
+        f"select count(*) from writes where {where} and time > ?", (*key, now - YEAR)
     ).fetchone()
     (last,) = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone() or (0.0,)
     if not isinstance(last, float) or not abs(last) < LATEST:
         raise sqlite3.DataError(f"it has a write of {cell.register} at a time that is none: {last!r}")
-    return Wear(cell, writes, this_year, last)
+    return Wear(replace(cell, spelt=""), writes, this_year, last)

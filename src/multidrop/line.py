@@ -12,14 +12,17 @@ import struct
 import threading
 import time
 from contextlib import suppress
+from typing import cast
 from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.bridge import PORT_FAILURES, Bridge, set_up
+from multidrop import port_identity
+from multidrop.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
 from multidrop.errors import LineError, NoSuchPort
 from multidrop.forks import tell_of_forks
+from multidrop.rfc2217 import RFC2217Port
 
 __all__ = [
     "PORT_FAILURES",
@@ -40,7 +43,6 @@ def now_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 
-_MOST_STALL_MS = 1000  # of a network
 _ALL_SETTINGS = sum(REFUSALS)
 _BAUDRATE = min(REFUSALS)
 _NO_SETTINGS = -1
@@ -84,6 +86,10 @@ def unopened(port: str) -> serial.Serial:
     if needs_place:
         raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
     try:
+        if url.scheme == "rfc2217":
+            found = RFC2217Port()
+            found.port = port
+            return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
         return serial.serial_for_url(port, do_not_open=True)
     except ValueError as mistake:
         right = "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
@@ -128,6 +134,7 @@ class Line:
 
     def __init__(self, port: str, echo: Echo = Echo.AUTO) -> None:
         self.port = port
+        self.identity = port  # what it is, however its name is spelt, once it is open
         self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
@@ -165,6 +172,7 @@ class Line:
             if isinstance(port, serial.Serial):
                 port.exclusive = True
             port.open()
+            self.identity = self._identify(port)
             self._core = self._drive(port)
             self._core.tell_echo(self._echo)
             if self._tap:
@@ -177,21 +185,24 @@ class Line:
             self.close()
             raise LineError(self.port, reason_of(failure)) from failure
 
+    def _identify(self, port: serial.SerialBase) -> str:
+        if connection := getattr(port, "_socket", None):
+            return port_identity.of_connection(connection)
+        try:
+            return port_identity.of_device(os.ttyname(port.fileno()))
+        except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
+            return port_identity.of_name(self.port)
+
     def _drive(self, port: serial.SerialBase) -> Port:
         if type(port).read is serial.Serial.read:
             pseudo = os.ttyname(port.fileno()).startswith(("/dev/pts/", "/dev/ttys"))
             # A pty stays at 8 bits without parity whatever it is told.
             return Port(port.fileno(), _BAUDRATE if pseudo else _ALL_SETTINGS)
+        if connection := getattr(port, "_socket", None):
+            hand_on_nothing_late(connection)
         if self.port.startswith("socket://"):
-            fd = port.fileno()
-            os.set_blocking(fd, False)
-            with socket.socket(fileno=os.dup(fd)) as connection:
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                if hasattr(
-                    socket, "TCP_USER_TIMEOUT"
-                ):  # what waits longer never leaves: it may start a motor
-                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _MOST_STALL_MS)
-            return Port(fd, _NO_SETTINGS)
+            os.set_blocking(port.fileno(), False)
+            return Port(port.fileno(), _NO_SETTINGS)
         if self._settings:
             set_up(port, self._settings)
         self._bridge = Bridge(port)
@@ -217,8 +228,11 @@ class Line:
                 self._bridge.close()
                 self._bridge = None
             if self._serial:
+                connection = getattr(self._serial, "_socket", None)
                 with suppress(*PORT_FAILURES):
                     self._serial.close()
+                if connection:  # pyserial leaves one open that has ended already
+                    connection.close()
 
     def tap(self, tap: Tap) -> None:
         """Tell this tap, and no other any more, of all that goes over the line."""

@@ -7,12 +7,15 @@ only written. `Register[float]` has a unit and a step, `Register[E]` has the nam
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, field
+from decimal import Decimal
 from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
 from functools import cached_property
 from typing import Any, Generic, NotRequired, TypedDict, TypeVar, Unpack, cast, overload
 
+from multidrop import float32
 from multidrop.core import Wire
 
 __all__ = [
@@ -74,18 +77,9 @@ INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
 
-_LONG_WIRES = (
-    Wire.U32,
-    Wire.I32,
-    Wire.U32_SWAPPED,
-    Wire.I32_SWAPPED,
-    Wire.U32_EITHER,
-    Wire.F32,
-    Wire.F32_SWAPPED,
-)
-
-
-MOST_WHOLE = 1 << 64  # beyond whatever a register may hold, in its unit or not
+FLOAT_WIRES = (Wire.F32, Wire.F32_SWAPPED)
+_LONG_WIRES = (Wire.U32, Wire.I32, Wire.U32_SWAPPED, Wire.I32_SWAPPED, Wire.U32_EITHER, *FLOAT_WIRES)
+_LARGEST_FLOAT = float.fromhex("0x1.fffffep127")
 
 
 class Details(TypedDict):
@@ -101,6 +95,8 @@ class Details(TypedDict):
     default: value from the factory
     while_running: may be changed while the motor turns; None where not stated
     broadcast: the raw counts that are documented and harmless as a broadcast
+    moves: a write to it may start, stop or reset something, and is left to the verbs; if not stated, a
+        command does, and a setting does not unless it has `harmless`
     harmless: of a register that moves the motor, the raw counts that anyone may write at any time,
         and again when their answer is lost; all others are for verbs, which send them once
     never: why the library never writes it
@@ -121,6 +117,7 @@ class Details(TypedDict):
     default: NotRequired[float]
     while_running: NotRequired[bool]
     broadcast: NotRequired[tuple[int, ...]]
+    moves: NotRequired[bool]
     harmless: NotRequired[tuple[int, ...]]
     never: NotRequired[str]
     never_together: NotRequired[tuple[int, ...]]
@@ -148,6 +145,7 @@ class Register(Generic[T]):
     default: float | None = None
     while_running: bool | None = None
     broadcast: tuple[int, ...] = ()
+    moves: bool | None = None
     harmless: tuple[int, ...] | None = None
     never: str = ""
     never_together: tuple[int, ...] = ()
@@ -157,20 +155,19 @@ class Register(Generic[T]):
     name: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.address <= 0xFFFF:
-            raise ValueError(f"register address {self.address} is outside 0 to FFFFH")
-        if self.table.carrier is Carrier.BIT:
-            object.__setattr__(self, "wire", Wire.BIT)
-        elif self.table.carrier is not Carrier.WORD:
-            object.__setattr__(self, "wire", Wire.U32)
-        if self.access is not Access.READING and self.table.kept is not Kept.UNKNOWN:
-            if self.kept not in (Kept.UNKNOWN, self.table.kept):
-                table = f"{self.table.name!r} is kept in {self.table.kept.value}"
+        carrier = getattr(self.table, "carrier", Carrier.WORD)  # what is declared is checked with its class
+        if self.wire == Wire.U16 and carrier is not Carrier.WORD:
+            object.__setattr__(self, "wire", Wire.BIT if carrier is Carrier.BIT else Wire.U32)
+        table_kept = getattr(self.table, "kept", Kept.UNKNOWN)
+        if self.access is not Access.READING and table_kept is not Kept.UNKNOWN:
+            if self.kept not in (Kept.UNKNOWN, table_kept):
+                table = f"{self.table.name!r} is kept in {table_kept.value}"
                 raise ValueError(f"register {self.address:04X}H: a {table}, not in {self.kept.value}")
-            object.__setattr__(self, "kept", self.table.kept)
+            object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
-        object.__setattr__(self, "name", name)
+        if not self.name:  # a second name would take the first one away
+            object.__setattr__(self, "name", name)
 
     def __str__(self) -> str:
         return self.name
@@ -188,6 +185,18 @@ class Register(Generic[T]):
     def writable(self) -> bool:
         return self.access is not Access.READING and self.table.write is not None and not self.never
 
+    @property
+    def is_float(self) -> bool:
+        """Its raw count is a float32."""
+        return self.table.carrier is Carrier.WORD and self.wire in FLOAT_WIRES
+
+    @property
+    def commands(self) -> bool:
+        """A write to it may move the motor: that is left to verbs, but for what is `harmless`."""
+        if self.moves is None:
+            return self.access is Access.COMMAND or self.harmless is not None
+        return self.moves
+
     @cached_property
     def scale(self) -> Fraction:
         """The step as an exact fraction, 1 where it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
@@ -196,8 +205,8 @@ class Register(Generic[T]):
     @property
     def decimals(self) -> int:
         """Digits after the point that the step needs."""
-        text = f"{float(self.scale):.6f}".rstrip("0")
-        return len(text.partition(".")[2])
+        exponent = Decimal(f"{float(self.scale):.6g}").normalize().as_tuple().exponent
+        return max(0, -int(exponent))
 
     def decode(self, raw: float) -> T:
         """The value of a raw count."""
@@ -206,32 +215,56 @@ class Register(Generic[T]):
                 return self.values(int(raw))
             except ValueError:
                 return cast(T, int(raw))
-        return cast(T, raw * self.scale.numerator / self.scale.denominator)
+        return cast(T, raw * self.scale.numerator / self.scale.denominator + 0.0)  # 0 has no sign
 
-    def encode(self, value: T) -> int:
-        """The raw count of a value; ValueError outside the span, TypeError for what is no number."""
+    def encode(self, value: T) -> float:
+        """The raw count of a value: a whole number, or the nearest float32 where it holds one.
+
+        Raises ValueError outside the span, TypeError for what is no number.
+        """
         if self.values is not None:
             return self._encode_name(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise TypeError(f"{self.name} takes a number, not {value!r}")
-        if isinstance(value, int) and abs(value) >= MOST_WHOLE:  # which floats may not be able to hold
-            raise ValueError(f"{self.name} takes a number of 32 bits, not one of {value.bit_length()}")
-        if not math.isfinite(value):
+        if not abs(value) < math.inf:
             raise ValueError(f"{self.name} takes a finite number, not {value!r}")
         if self.span is not None and not self.span[0] <= value <= self.span[1]:
             low, high = self.span
-            raise ValueError(f"{self.name} = {value:g} is outside {low:g} to {high:g} {self.unit}".rstrip())
-        count = Fraction(str(value)) / self.scale
-        if count.denominator != 1 and self._counts:
-            raise ValueError(f"{self.name} takes a whole number, not {value:g}")
-        raw = round(count)
-        bottom, top = self._raw_span()
-        if not bottom <= raw <= top:
-            least, most = float(bottom * self.scale), float(top * self.scale)
             raise ValueError(
-                f"{self.name} = {value:g} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
+                f"{self.name} = {_short(value)} is outside {low:g} to {high:g} {self.unit}".rstrip()
+            )
+        bottom, top = self._raw_span()
+        try:
+            raw = self._raw(value)
+        except OverflowError:
+            raw = math.inf
+        if not bottom <= raw <= top:
+            least, most = sorted((float(bottom * self.scale), float(top * self.scale)))
+            raise ValueError(
+                f"{self.name} = {_short(value)} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
             )
         return raw
+
+    def _raw(self, value: float) -> float:
+        if abs(value) > sys.float_info.max:
+            raise OverflowError
+        count = Fraction(str(value)) / self.scale
+        if self.is_float:
+            return float32.nearest(count)
+        if count.denominator != 1 and self._counts:
+            raise ValueError(f"{self.name} takes a whole number, not {value:g}")
+        return round(count)
+
+    def takes(self, value: T) -> bool:
+        """A drive that holds this value may have been told to: it has its name, or is in its span."""
+        if self.values is not None:
+            return isinstance(value, self.values)
+        if self.span is None:
+            return True
+        low, high = self.span
+        if self.is_float:  # of which the ends may be none
+            low, high = (float(self.scale * Fraction(float32.nearest(end / self.scale))) for end in self.span)
+        return low <= value <= high
 
     @property
     def _counts(self) -> bool:
@@ -254,7 +287,11 @@ class Register(Generic[T]):
         choices = ", ".join(member.name for member in values)
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
 
-    def _raw_span(self) -> tuple[int, int]:
+    def _raw_span(self) -> tuple[Fraction, Fraction]:
+        low, high = self._whole_span() if not self.is_float else (-_LARGEST_FLOAT, _LARGEST_FLOAT)
+        return Fraction(low), Fraction(high)
+
+    def _whole_span(self) -> tuple[int, int]:
         if self.wire is Wire.BIT:
             return 0, 1
         bits = 16 if self.wire in (Wire.U16, Wire.I16) else 32
@@ -290,7 +327,13 @@ class Register(Generic[T]):
         if isinstance(value, IntEnum):
             return value.name
         unit = self.unit if self.step is not None else "(scale not stated)"
-        return f"{value:.{self.decimals}f} {unit}".rstrip()
+        number = float32.shortest(value, self.scale) if self.is_float else f"{value:.{self.decimals}f}"
+        return f"{number} {unit}".rstrip()
+
+
+def _short(value: float) -> str:
+    """A number in a sentence, also one that no float holds."""
+    return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
 @overload

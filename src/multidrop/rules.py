@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from multidrop.drive import VERBS, Condition, Drive, Script, read
 from multidrop.errors import Refused, Unsupported
-from multidrop.register import Access, Kept, Register
+from multidrop.register import Access, Carrier, Kept, Register
 
 T = TypeVar("T", bound=float)
 
@@ -25,7 +25,7 @@ def _refusal(register: Register[Any], rule: str, sentence: str) -> Refused:
     return Refused(sentence + where, register=register.name, rule=rule, place=place)
 
 
-def raw_count(drive: Drive, register: Register[T], value: T) -> int:
+def raw_count(drive: Drive, register: Register[T], value: T) -> float:
     """The raw count to be sent; Refused what its declaration forbids, TypeError for what is no value."""
     check_own(drive, register)
     if register.never:
@@ -53,14 +53,25 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
         raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
 
 
-def check_plain(drive: Drive, register: Register[Any], raw: int) -> None:
-    """Refused unless a plain write may do this: nothing but a verb moves a motor or resets a fault."""
-    if register.harmless is None or raw in register.harmless:
+def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
+    """Refused unless a plain write may do this: nothing but a verb moves a motor or resets a fault.
+
+    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    """
+    if is_harmless(register, raw):
+        return
+    if register.access is Access.COMMAND and not register.commands:
+        drive.check_confirmed(register.name)
+    if not register.commands:
         return
     verbs = [f"{name}()" for name in VERBS if name in _MOVING and _has(drive, name)]
     value = register.format(register.decode(raw))
-    rule = f"{value} commands the motor, which verbs alone do: use {', '.join(verbs)}"
-    raise refused(drive, register, rule)
+    way = f"which verbs alone do: use {', '.join(verbs)}"
+    if not verbs:
+        way = (
+            "and its class does not say that it is harmless: declare harmless = (…), moves = False, or a verb"
+        )
+    raise refused(drive, register, f"{value} commands the motor, {way}")
 
 
 _MOVING = ("start", "stop", "jog", "reset_fault")
@@ -70,7 +81,7 @@ def _has(drive: Drive, name: str) -> bool:
     return getattr(type(drive), name) is not getattr(Drive, name)
 
 
-def is_harmless(register: Register[Any], raw: int) -> bool:
+def is_harmless(register: Register[Any], raw: float) -> bool:
     """Whether it may be sent at any time, to a drive that does not answer too: a stop."""
     return register.harmless is not None and raw in register.harmless
 
@@ -109,6 +120,7 @@ def wears(drive: Drive, register: Register[Any]) -> Kept:
     """How a write to this register of this drive is kept: RAM is not worn, what is not stated may be."""
     if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
         return Kept.RAM
-    if register.kept is Kept.UNKNOWN and register.access is Access.COMMAND:
-        return Kept.RAM  # a command is no parameter
+    is_bit = register.table.carrier is Carrier.BIT
+    if register.kept is Kept.UNKNOWN and (register.access is Access.COMMAND or is_bit):
+        return Kept.RAM  # neither a command nor a coil is a parameter
     return register.kept

@@ -96,11 +96,11 @@ class Writer:
 
     def _count(self, cell: Cell) -> None:
         try:
-            self._ledger.note(cell, utc_ns() / 1e9)
+            self._ledger.at(cell.port).note(cell, utc_ns() / 1e9)
         except OSError as failure:
             logging.getLogger("multidrop").warning("a stop was not counted: %s", failure)
 
-    def _sent(self, drive: Drive, register: Register[Any], raw: int, call: Call | None) -> Outcome:
+    def _sent(self, drive: Drive, register: Register[Any], raw: float, call: Call | None) -> Outcome:
         """Send it once: for its call, or else insisting."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _what(register, asked)
@@ -173,7 +173,7 @@ class Writer:
         """Count a write in the ledger; Refused when it may not be."""
         cell = self._cell(drive, register)
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
-        why = self._ledger.enter(cell, utc_ns() / 1e9, least)
+        why = self._ledger.at(self._exchanges.line.identity).enter(cell, utc_ns() / 1e9, least)
         if why:
             way = "write it less often, or take a setpoint that is kept in RAM"
             if kept is Kept.UNKNOWN:
@@ -181,8 +181,9 @@ class Writer:
             raise refused(drive, register, f"{why}; {way}")
 
     def _cell(self, drive: Drive, register: Register[Any]) -> Cell:
+        line = self._exchanges.line
         model = drive.model or type(drive).__name__
-        return Cell(self._exchanges.line.port, drive.address, model, register.name)
+        return Cell(line.identity, drive.address, model, register.name, line.port)
 
     def _read(self, drive: Drive, register: Register[Any]) -> Any:
         return self._exchanges.values(drive, [register], READ_ATTEMPTS)[register.name]
@@ -265,7 +266,7 @@ class Writer:
         self.log(drive, request, what, Effect.DONE)
         return reply.data
 
-    def broadcast(self, drive: Drive, register: Register[Any], raw: int) -> None:
+    def broadcast(self, drive: Drive, register: Register[Any], raw: float) -> None:
         """Write to all drives at once, by the table of one of them."""
         request = write_request(drive, register, raw, address=0)
         what = f"{register.name} = {register.format(register.decode(raw))}"

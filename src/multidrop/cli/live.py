@@ -66,7 +66,8 @@ class LiveTable:
             elif register.values is not None:
                 shown.append(f"{register.name} {register.format(register.decode(row.value))}")
             elif register.step is None:
-                shown.append(f"{register.name} {row.value:g} raw")
+                number, _, _ = register.format(row.value).partition(" ")
+                shown.append(f"{register.name} {number} raw")
             else:
                 shown.append(f"{register.name} {register.format(row.value)}")
         return ", ".join(shown)

@@ -33,10 +33,18 @@ def taken(register: Register[T], value: T) -> T:
     Raises ValueError for what it cannot take at all.
     """
     nearest = register.decode(register.encode(value))
-    if nearest != value:
-        steps = f"{register.name} has steps of {register.step:g} {register.unit}".rstrip()
-        say(f"multidrop: {steps}: {value!r} is taken as {register.format(nearest)}", file=sys.stderr)
+    if nearest != value and not (register.is_float and register.parse(_number(register, nearest)) == value):
+        why = f"has steps of {register.step:g} {register.unit}".rstrip()
+        if register.is_float:
+            why = "holds single-precision numbers"
+        shown = register.format(nearest)
+        say(f"multidrop: {register.name} {why}: {value!r} is taken as {shown}", file=sys.stderr)
     return nearest
+
+
+def _number(register: Register[Any], value: float) -> str:
+    """The shown value without its unit."""
+    return register.format(value).partition(" ")[0]
 
 
 def as_row(register: Register[Any], value: Any) -> Row:
@@ -56,5 +64,6 @@ def as_json(register: Register[Any], value: Any) -> dict[str, Any]:
     if isinstance(value, IntEnum):
         return {"value": value.name, "raw": value.value}
     if register.values is not None or register.step is None:
-        return {"value": None, "raw": int(value)}
-    return {"value": None if math.isnan(value) else value, "unit": register.unit}
+        whole = math.isfinite(value) and value == int(value)
+        return {"value": None, "raw": int(value) if whole else value if math.isfinite(value) else None}
+    return {"value": value if math.isfinite(value) else None, "unit": register.unit}

@@ -66,6 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     hz = getattr(arguments, "frequency", None)
     setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _ASKED:
+        drive.check_confirmed(arguments.command)
         ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
     with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus, _told(arguments) as known:

@@ -129,5 +129,5 @@ def told(register: Register[Any], value: float) -> str:
     if register.values is not None:
         return register.format(register.decode(value))
     if register.step is None:
-        return f"{value:g} raw"
+        return f"{register.format(value).partition(' ')[0]} raw"
     return register.format(value)

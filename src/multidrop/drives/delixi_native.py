@@ -98,8 +98,21 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         place="part 3, section 5: K = 02",
     )
     status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
-    frequency = command(0x0001, "Hz", step=0.01, table=SETPOINT, place="part 3, section 5: K = 04, 0001")
-    pi_setpoint = command(0x0007, step=0.1, table=SETPOINT, place="part 3, section 5: K = 04, 0007")
+    frequency = command(
+        0x0001,
+        "Hz",
+        step=0.01,
+        table=SETPOINT,
+        moves=False,
+        place="part 3, section 5: K = 04, 0001",
+    )
+    pi_setpoint = command(
+        0x0007,
+        step=0.1,
+        table=SETPOINT,
+        moves=False,
+        place="part 3, section 5: K = 04, 0007",
+    )
     stored_frequency = setting(
         parameter(0, 2),
         "Hz",

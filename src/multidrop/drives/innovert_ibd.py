@@ -208,6 +208,7 @@ class InnovertIBD(Drive):
         step=0.01,
         span=(0, 400),
         at_most="maximum_frequency",
+        moves=False,
         broadcast=(0,),
         place="2001H, table 3",
         note="Used if Prb.01 = 5.",

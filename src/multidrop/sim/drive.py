@@ -11,15 +11,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-from multidrop.core import Framing, Message
+from multidrop.core import Framing, Message, raw_value
 from multidrop.drive import Drive
 from multidrop.register import Access, Carrier, Kept
 from multidrop.sim.dialect import DIALECTS, Reason, Refusal
-from multidrop.sim.memory import Cell, Memory, decode
+from multidrop.sim.memory import Cell, Memory, decode, pack
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
 MOST_CELLS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}  # in any reply
+_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # as many are written at once as are read
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
 
 
@@ -47,6 +48,17 @@ class Counters:
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
 
 
+def _most_cells(drive: Drive) -> dict[int, int]:
+    """Cells in one request, by the function code that reads them: never less than a register takes."""
+    most: dict[int, int] = {}
+    for table in dict.fromkeys(register.table for register in drive.registers.values()):
+        longest = max(it.words for it in drive.registers.values() if it.table == table)
+        limit = min(max(drive.most_registers.get(table, 1), longest), MOST_CELLS[table.carrier])
+        for code in {table.read, _COUNTED_AS.get(table.write or 0)} - {None}:
+            most[code or 0] = max(most.get(code or 0, 1), limit)
+    return most
+
+
 class SimulatedDrive:
     """A drive of any class: its registers hold what is written to them.
 
@@ -65,9 +77,7 @@ class SimulatedDrive:
         self.counters = Counters()
         self.now = 0.0  # of the last request
         self.deaf_until = 0.0  # it hears nothing before; inf: a dead drive
-        self.most = {  # cells in one request, by the function code that reads them
-            table.read: min(most, MOST_CELLS[table.carrier]) for table, most in drive.most_registers.items()
-        }
+        self.most = _most_cells(drive)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.drive.name}>"
@@ -97,14 +107,18 @@ class SimulatedDrive:
         register = cell.register
         if register is None or register.words > 1:
             return raw
-        value = decode(register, raw)
-        if register.values is not None:
-            known = isinstance(value, register.values)
-        else:
-            known = register.span is None or register.span[0] <= value <= register.span[1]
-        if not known:
+        if not register.takes(decode(register, raw)):
             raise Refusal(Reason.VALUE)
         return raw
+
+    def _accept_long(self, raws: Mapping[Cell, int]) -> None:
+        """Refuse a value of several words that is outside its span, where all of them are written."""
+        for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
+            cells = self.memory.of(register)
+            if all(cell in raws for cell in cells):
+                data = b"".join(pack(cell.table, raws[cell]) for cell in cells)
+                if not register.takes(register.decode(raw_value(data, 0, register.wire))):
+                    raise Refusal(Reason.VALUE)
 
     def changed(self, cell: Cell) -> None:
         """The cell was written, by the line or from outside: act on it."""
@@ -224,6 +238,7 @@ class SimulatedDrive:
             if cell is None:
                 raise Refusal(Reason.WRITE_ADDRESS)
             cells.append(cell)
+        self._accept_long(dict(zip(cells, raws, strict=True)))
         stored = [self.accept(cell, raw) for cell, raw in zip(cells, raws, strict=True)]
         for at, (cell, raw) in enumerate(zip(cells, stored, strict=True)):
             cell.raw = raw
@@ -240,5 +255,5 @@ class SimulatedDrive:
         if register is None or (function, address) in self.memory.aliases:
             return False
         if register.kept is Kept.UNKNOWN:
-            return register.access is Access.SETTING
+            return register.access is Access.SETTING and register.table.carrier is not Carrier.BIT
         return register.kept is Kept.EEPROM

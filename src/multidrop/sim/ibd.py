@@ -52,7 +52,7 @@ class SimulatedIBD(PoweredDrive):
     def accept(self, cell: Cell, raw: int) -> int:
         register = cell.register
         if register is not None and register.span is not None:
-            return min(raw, register.encode(register.span[1]))
+            return min(raw, int(register.encode(register.span[1])))
         return min(raw, LARGEST.get(cell.address, raw))
 
     def setpoint(self) -> float:

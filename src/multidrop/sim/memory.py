@@ -14,6 +14,7 @@ from typing import Any
 
 from multidrop.core import Framing, Wire, raw_value
 from multidrop.drive import Drive
+from multidrop.float32 import nearest_or_infinite
 from multidrop.register import Access, Carrier, Register, Table
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
@@ -59,9 +60,12 @@ class Memory:
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
-            cell.register = register
-            if table.read is not None:
-                self._read[table.read, cell.address] = cell if register.access is not Access.COMMAND else None
+            if cell.register is None or register.access is not Access.READING:  # what is written has a span
+                cell.register = register
+            if table.read is not None and register.access is Access.COMMAND:
+                self._read.setdefault((table.read, cell.address), None)  # unless a reading is there too
+            elif table.read is not None:
+                self._read[table.read, cell.address] = cell
             if register.access is Access.READING:
                 continue
             self.make_writable(table, [cell.address])
@@ -110,8 +114,9 @@ class Memory:
 
     def set(self, register: Register[Any], value: float) -> None:
         """Hold this value: rounded to the register's step, cut off where it does not fit."""
-        if register.wire in (Wire.F32, Wire.F32_SWAPPED):
-            raw = int.from_bytes(struct.pack(">f", value))
+        if register.is_float:
+            held = nearest_or_infinite(value / register.scale)
+            raw = int.from_bytes(struct.pack(">f", held))
         elif register.values is not None:
             raw = int(value)
         else:

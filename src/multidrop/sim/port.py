@@ -10,6 +10,9 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from multidrop.core import get_settings, set_settings
+from multidrop.ledger import default_path
+from multidrop.port_identity import of_address
+from multidrop.simulated_ports import SimulatedPort
 from multidrop.timing import Settings
 
 MOST_READ = 4096
@@ -49,11 +52,13 @@ class PtyPort:
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
         self._master, self._slave = os.openpty()
+        self._simulated: SimulatedPort | None = None
         self._link = link
         try:
             os.set_blocking(self._master, False)
             set_settings(self._slave, settings.baudrate, settings.format)
             self.path = os.ttyname(self._slave)
+            self._simulated = SimulatedPort(self.path, default_path().parent)
             if link is not None:
                 link.symlink_to(self.path)
                 self.path = str(link)
@@ -81,6 +86,8 @@ class PtyPort:
     def close(self) -> None:
         if self._link is not None:
             self._link.unlink(missing_ok=True)
+        if self._simulated is not None:
+            self._simulated.close()
         os.close(self._master)
         os.close(self._slave)
 
@@ -95,6 +102,9 @@ class TCPPort:
         self._listener = socket.create_server((parts.hostname, parts.port))
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
+        host, port, *_ = self._listener.getsockname()
+        near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+        self._simulated = SimulatedPort(of_address((near, port)), default_path().parent)
         self.path = f"socket://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
@@ -132,4 +142,5 @@ class TCPPort:
 
     def close(self) -> None:
         self._hang_up()
+        self._simulated.close()
         self._listener.close()

@@ -1,0 +1,47 @@
+"""Identities of ports: what a port is, however its name is spelt."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number
+_PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
+
+
+def of_device(path: str) -> str:
+    """The device's link by its serial number, where it has one, or else its own path without links."""
+    device = os.path.realpath(path)
+    try:
+        links = sorted(BY_ID.iterdir())
+    except OSError:
+        links = []
+    return next((str(link) for link in links if os.path.realpath(link) == device), device)
+
+
+def of_connection(connection: socket.socket) -> str:
+    """The address and port of the far end: 10.0.0.7:4001."""
+    return of_address(connection.getpeername())
+
+
+def of_address(address: tuple[str | int, ...]) -> str:
+    """A socket's address as one text, an IPv6 one in brackets."""
+    host, port, *_ = address
+    return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
+
+
+def of_name(name: str) -> str:
+    """What a name means now, as it was written down once: a path, a URL, or an identity."""
+    if "://" in name:
+        try:
+            url = urlsplit(name)
+            host, port = url.hostname, url.port
+        except ValueError:
+            return name
+        return of_address((host, port)) if host and port else name
+    if _PEER.fullmatch(name) and not Path(name).exists():
+        return name
+    return of_device(name)

@@ -1,0 +1,128 @@
+"""RFC2217Port: pyserial's client of a network's serial port (RFC 2217), bounded in memory and in time.
+
+pyserial keeps all that comes, however much that is, and waits for seconds until a stalled network takes
+a request. Here what comes too fast is lost, as on a serial line, and a request leaves at once or never.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import serial
+from serial import rfc2217
+
+MOST_RECEIVED = 4096  # bytes taken from the network at once
+MOST_CHUNKS = 64  # of them that wait to be read
+MOST_SUBOPTION = 256  # bytes: those of RFC 2217 are short, only its signature is a text
+LOCK_TIME = 0.1  # s, for another thread's answer to an option, which leaves at once too
+
+_IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
+_NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
+
+
+class Telnet:
+    """The data and the commands in a telnet stream (RFC 854), in whatever pieces the stream comes."""
+
+    def __init__(self) -> None:
+        self._command = b""  # begun and not yet whole
+        self._suboption: bytearray | None = None
+
+    def split(self, received: bytes) -> Iterator[tuple[bytes, bytes]]:
+        """Yield (b"", data), (command, option) and (SB, suboption), in the order in which they came."""
+        at = 0
+        while at < len(received):
+            if self._command:
+                self._command += received[at : at + 1]
+                at += 1
+                yield from self._obey()
+                continue
+            end = received.find(_IAC, at)
+            data = received[at : end if end >= 0 else len(received)]
+            yield from self._take(data)
+            at += len(data)
+            if end >= 0:
+                self._command = _IAC
+                at += 1
+
+    def _take(self, data: bytes) -> Iterator[tuple[bytes, bytes]]:
+        if self._suboption is None:
+            if data:
+                yield b"", data
+            return
+        self._suboption += data
+        if len(self._suboption) > MOST_SUBOPTION:
+            self._suboption = None
+
+    def _obey(self) -> Iterator[tuple[bytes, bytes]]:
+        kind, option = self._command[1:2], self._command[2:]
+        if kind in _NEGOTIATIONS and not option:
+            return
+        self._command = b""
+        if kind == _IAC:
+            yield from self._take(_IAC)
+        elif kind == _SB:
+            self._suboption = bytearray()
+        elif kind == _SE:
+            if self._suboption is not None:
+                yield _SB, bytes(self._suboption)
+            self._suboption = None
+        else:
+            yield kind, option
+
+
+class RFC2217Port(rfc2217.Serial):
+    """A network's serial port; `port` is rfc2217://host:port."""
+
+    # pyserial's own, of which its types know nothing
+    _socket: Any
+    _write_lock: Any
+    _read_buffer: Any
+    _telnet_process_subnegotiation: Any
+    _telnet_negotiate_option: Any
+
+    def _telnet_read_loop(self) -> None:
+        """Read the socket until it ends: pyserial's own thread runs this."""
+        self._read_buffer = queue.Queue(MOST_CHUNKS)
+        telnet = Telnet()
+        with suppress(OSError):
+            while self.is_open:
+                try:
+                    received = self._socket.recv(MOST_RECEIVED)
+                except TimeoutError:
+                    continue
+                if not received:
+                    break
+                for kind, content in telnet.split(received):
+                    self._act(kind, content)
+        with suppress(queue.Full):
+            self._read_buffer.put_nowait(None)
+
+    def _act(self, kind: bytes, content: bytes) -> None:
+        if not kind:
+            with suppress(queue.Full):
+                self._read_buffer.put_nowait(content)
+        elif kind == _SB:
+            self._telnet_process_subnegotiation(content)
+        elif kind in _NEGOTIATIONS:
+            self._telnet_negotiate_option(kind, content)
+
+    def write(self, data: Any) -> int:
+        """Send all of it at once; raises SerialException where the network does not take it."""
+        self._internal_raw_write(bytes(data).replace(_IAC, _IAC + _IAC))
+        return len(data)
+
+    def _internal_raw_write(self, data: bytes) -> None:
+        if not self.is_open or not self._write_lock.acquire(timeout=LOCK_TIME):
+            raise serial.SerialException("the network takes nothing")
+        try:
+            # its own send() would wait for as long as its time-out says
+            if os.write(self._socket.fileno(), data) < len(data):
+                raise serial.SerialException("the network takes nothing more")
+        except OSError as failure:
+            raise serial.SerialException(f"the connection failed: {failure}") from failure
+        finally:
+            self._write_lock.release()

@@ -1,0 +1,58 @@
+"""Ports of simulated drives: how a client knows them, whose writes wear no EEPROM.
+
+A simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)), which
+is gone when its process is, however that ends. Other systems have no such names: there a simulated
+drive's writes are counted as a real one's.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import quote
+
+_HAS_NAMES = sys.platform == "linux"
+
+
+def _name(identity: str) -> bytes:
+    return b"\0multidrop/simulated/%d/%s" % (os.getuid(), identity.encode()[-60:])
+
+
+def ledger_of(identity: str, directory: Path) -> Path:
+    """The file in which a simulated port's writes are counted, as long as its simulator runs."""
+    return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
+
+
+class SimulatedPort:
+    """A port that is known to be simulated until this is closed; its ledger begins anew."""
+
+    def __init__(self, identity: str, directory: Path) -> None:
+        self._ledger = ledger_of(identity, directory)
+        self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._forget_writes()
+        if _HAS_NAMES:
+            with suppress(OSError):  # another simulator's, on a port of the same name
+                self._holder.bind(_name(identity))
+
+    def _forget_writes(self) -> None:
+        with suppress(OSError):
+            self._ledger.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        self._holder.close()
+        self._forget_writes()
+
+
+def is_simulated(identity: str) -> bool:
+    """A simulator of this user has this port now."""
+    if not _HAS_NAMES:
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+        try:
+            asking.connect(_name(identity))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,77 @@
+"""A network's serial port that only listens: what it was told to send on its line is printed.
+
+Its TCP port is printed first. Then a line is the number of a connection and the bytes of the serial
+line, in hexadecimal. A connection that sends END ends it, when all that has come by then is printed.
+Usage: network_server.py {rfc2217,socket} ADDRESS
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import sys
+from types import SimpleNamespace
+
+from serial import rfc2217
+
+END = b"END"
+
+
+def manager(client: socket.socket) -> rfc2217.PortManager:
+    """The server's side of RFC 2217, with modem lines that never change."""
+    settings = {"baudrate": 9600, "bytesize": 8, "parity": "N", "stopbits": 1}
+    modem_lines = {"cts": True, "dsr": True, "ri": False, "cd": True}
+    flushes = dict.fromkeys(("reset_input_buffer", "reset_output_buffer"), lambda: None)
+    port = SimpleNamespace(**settings, **modem_lines, **flushes)
+    return rfc2217.PortManager(port, SimpleNamespace(write=client.sendall))
+
+
+class Server:
+    def __init__(self, kind: str, address: str) -> None:
+        self._kind = kind
+        self._listener = socket.create_server((address, 0))
+        self._clients: dict[socket.socket, tuple[int, rfc2217.PortManager | None]] = {}
+        self._accepted = 0
+        self.ends = False
+        print(self._listener.getsockname()[1], flush=True)
+
+    def listen(self, seconds: float | None) -> bool:
+        """Take what has come; False where nothing had."""
+        ready, _, _ = select.select([self._listener, *self._clients], [], [], seconds)
+        for each in ready:
+            if each is self._listener:
+                self._accept()
+            else:
+                self._hear(each)
+        return bool(ready)
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        self._accepted += 1
+        far = manager(client) if self._kind == "rfc2217" else None
+        self._clients[client] = self._accepted, far
+
+    def _hear(self, client: socket.socket) -> None:
+        number, far = self._clients[client]
+        try:
+            received = client.recv(1024)
+        except OSError:  # it was cut
+            received = b""
+        if not received or received == END:
+            self.ends = self.ends or received == END
+            del self._clients[client]
+            client.close()
+        elif heard := b"".join(far.filter(received)) if far else received:
+            print(number, heard.hex(), flush=True)
+
+
+def main() -> None:
+    server = Server(*sys.argv[1:])
+    while not server.ends:
+        server.listen(None)
+    while server.listen(0):
+        pass
+
+
+if __name__ == "__main__":
+    main()
