@@ -1,0 +1,374 @@
+"""A far end of our own: it splits, checks and answers frames by itself, and notes each with its time.
+
+Nothing in it is the library's: checksums are those of checksums.py, ports are the operating system's.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import checksums
+from far_drives import DELIXI, Asked, FarDrive
+from far_telnet import Telnet
+
+READS, WRITES = (1, 2, 3, 4), (5, 6, 15, 16)
+DELIXI_WRITES = (2, 4, 5, 6)
+LENGTHS = dict.fromkeys((*READS, 5, 6, 8), 8)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """One frame as it came; `what` is moves, stops, writes, reads or damaged."""
+
+    at: int  # ns, CLOCK_MONOTONIC, when it was read from the port
+    connection: int  # counted anew whenever the port came back
+    frame: bytes
+    what: str
+    asked: Asked | None
+
+    def __str__(self) -> str:
+        said = (
+            self.frame.decode("ascii", "replace").strip() if self.frame[:1] == b":" else self.frame.hex(" ")
+        )
+        return f"{self.at / 1e9:.4f} {self.what:8}{said}"
+
+
+def split(buffer: bytes) -> tuple[bytes, Asked | None, bytes]:
+    """The first frame, what it asks (None when its checksum is wrong), and the rest; no frame: b""."""
+    if buffer[:1] == b":":
+        end = buffer.find(b"\n") + 1
+        frame, rest = buffer[:end], buffer[end:]
+        return frame, _ascii(frame) if frame else None, rest
+    if len(buffer) < 8:
+        return b"", None, buffer
+    length = LENGTHS.get(buffer[1], 9 + buffer[6])
+    if len(buffer) < length:
+        return b"", None, buffer
+    frame, rest = buffer[:length], buffer[length:]
+    if checksums.rtu(frame[:-2]) != frame:
+        return frame, None, rest
+    return frame, _standard(frame[:-2]), rest
+
+
+def _ascii(frame: bytes) -> Asked | None:
+    body = frame[1:-4].decode("ascii", "replace")
+    with suppress(ValueError):
+        if frame == checksums.delixi(body):
+            octets = bytes.fromhex(body)
+            start, value = int.from_bytes(octets[2:4]), int.from_bytes(octets[4:])
+            return Asked(octets[0], octets[1], start, value)
+        if frame == checksums.ascii(body):
+            return _standard(bytes.fromhex(body))
+    return None
+
+
+def _standard(body: bytes) -> Asked:
+    value = body[7:9] if body[1] in (15, 16) else body[4:6]
+    return Asked(body[0], body[1], int.from_bytes(body[2:4]), int.from_bytes(value))
+
+
+def reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int = 0) -> bytes:
+    """The drive's reply to a request; writes are carried out before."""
+    if drive.kind.protocol == DELIXI:
+        return _delixi_reply(drive, asked, frame, exception)
+    head = f"{asked.address:02X}"
+    if exception:
+        body = f"{head}{asked.function | 0x80:02X}{exception:02X}"
+    elif asked.function in READS:
+        words = "".join(f"{drive.word(asked.start + at):04X}" for at in range(asked.value))
+        body = f"{head}{asked.function:02X}{2 * asked.value:02X}{words}"
+    elif asked.function in (15, 16):
+        body = f"{head}{asked.function:02X}{asked.start:04X}0001"
+    else:
+        return frame
+    return checksums.ascii(body) if frame[:1] == b":" else checksums.rtu(body)
+
+
+def _delixi_reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int) -> bytes:
+    head = f"{asked.address:02X}"
+    if exception:
+        return checksums.delixi(f"{head}{exception:02X}000000000000")
+    if asked.function == 3:
+        return checksums.delixi(f"{head}03{drive.state():04X}00000000")
+    if asked.function == 7:
+        return checksums.delixi(f"{head}07{asked.start:04X}{drive.word(asked.start):08X}")
+    return frame
+
+
+class FarLine:
+    """One port's far end, with its drives and its troubles.
+
+    A trouble befalls the next requests, one each, and is given by name: "mute" carries out and says
+    nothing, "deaf" does nothing, "late" answers when the next request has come, and a number answers
+    with that exception. `deaf_until` and `delay` (s) last.
+    """
+
+    def __init__(self, drives: Sequence[FarDrive]) -> None:
+        self.drives = {it.address: it for it in drives}
+        self.log: list[Heard] = []
+        self.troubles: list[str | int] = []
+        self.deaf_until = 0.0  # s, CLOCK_MONOTONIC
+        self.delay = 0.0
+        self.connection = 0
+        self.held = threading.Event()  # the request that `hold` waits for has come
+        self._hold_in = 0  # requests
+        self._is_holding = False
+        self._kept: list[bytes] = []  # replies, while it holds
+        self._late = b""
+        self._buffer = b""
+        self._last = 0.0  # s, when the latest bytes came
+
+    def hold(self, requests: int) -> None:
+        """Answer nothing from the request after so many on, until `release`."""
+        self.held.clear()
+        self._hold_in, self._is_holding = requests + 1, False
+
+    def release(self) -> list[bytes]:
+        """The replies that were held back."""
+        self._hold_in, self._is_holding = 0, False
+        kept, self._kept = self._kept, []
+        return kept
+
+    def reconnected(self) -> None:
+        self._buffer = self._late = b""
+        self.release()
+        self.connection += 1
+
+    def hear(self, received: bytes) -> list[bytes]:
+        """The replies to what came."""
+        now = time.monotonic()
+        if now - self._last > 0.05:  # the rest of what was cut short does not come any more
+            self._buffer = b""
+        self._last = now
+        self._buffer += received
+        replies = []
+        while self._buffer:
+            frame, asked, self._buffer = split(self._buffer)
+            if not frame:
+                break
+            replies += self._answer(frame, asked)
+        return replies
+
+    def _answer(self, frame: bytes, asked: Asked | None) -> list[bytes]:
+        drives = [] if asked is None else self._addressed(asked.address)
+        self.log.append(Heard(time.monotonic_ns(), self.connection, frame, _what(asked, drives), asked))
+        if asked is None or not drives:
+            return []
+        self._count()
+        trouble = self.troubles.pop(0) if self.troubles else ""
+        late, self._late = self._late, b""
+        if trouble == "deaf" or time.monotonic() < self.deaf_until:
+            return [late] if late else []
+        if not isinstance(trouble, int) and _is_write(drives[0], asked):
+            for drive in drives:
+                drive.write(asked)
+        said = reply(drives[0], asked, frame, trouble if isinstance(trouble, int) else 0)
+        if trouble == "late":
+            self._late, said = said, b""
+        if trouble == "mute" or asked.address == 0:
+            said = b""
+        said = late + said
+        if self._is_holding:
+            self._kept.append(said)
+            return []
+        return [said] if said else []
+
+    def _addressed(self, address: int) -> list[FarDrive]:
+        if address == 0:
+            return list(self.drives.values())
+        return [self.drives[address]] if address in self.drives else []
+
+    def _count(self) -> None:
+        if self._hold_in:
+            self._hold_in -= 1
+            if not self._hold_in:
+                self._is_holding = True
+                self.held.set()
+
+
+def _is_write(drive: FarDrive, asked: Asked) -> bool:
+    return asked.function in (DELIXI_WRITES if drive.kind.protocol == DELIXI else WRITES)
+
+
+def _what(asked: Asked | None, drives: Sequence[FarDrive]) -> str:
+    if asked is None:
+        return "damaged"
+    if not drives or not _is_write(drives[0], asked):
+        return "reads"
+    for what, judge in (("moves", drives[0].kind.moves), ("stops", drives[0].kind.stops)):
+        if judge(asked):
+            return what
+    return "writes"
+
+
+class FarEnd:
+    """Ports with their far ends, kept by one thread; `ports` are what a client opens.
+
+    A pty is opened under a link in `directory`, so that it can vanish and come back. Instead there may
+    be sockets that listen, one a line, on which Telnet's serial port option is spoken or nothing but bytes.
+    """
+
+    def __init__(
+        self,
+        lines: Sequence[FarLine],
+        directory: Path | None = None,
+        listening: Sequence[socket.socket] = (),
+        telnet: bool = False,
+    ) -> None:
+        self.lines = list(lines)
+        self._telnets: dict[FarLine, Telnet] = {}
+        self._is_telnet = telnet
+        self.ports: list[str] = []
+        self._links: list[Path] = []
+        self._slaves: dict[FarLine, int] = {}
+        self._masters: dict[FarLine, int] = {}
+        self._sockets: dict[FarLine, socket.socket] = {}
+        self._listening = list(listening)
+        self._delayed: list[tuple[float, FarLine, bytes]] = []
+        self._ready = selectors.DefaultSelector()
+        self._jobs: list[Callable[[], Any]] = []
+        self._wake, self._waker = os.pipe()
+        self._ready.register(self._wake, selectors.EVENT_READ, self._woken)
+        for number, line in enumerate(self.lines):
+            if directory:
+                self._links.append(directory / f"line-{number}")
+                self._plug_in(line)
+                self.ports.append(str(self._links[-1]))
+        for line, it in zip(self.lines, self._listening, strict=False):
+            self._listen(line, it)
+            host, port = it.getsockname()
+            self.ports.append(f"{'rfc2217' if telnet else 'socket'}://{host}:{port}")
+        self._thread = threading.Thread(target=self._run, name="far end", daemon=True)
+        self._done = False
+
+    def __enter__(self) -> FarEnd:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.do(lambda: setattr(self, "_done", True))
+        self._thread.join()
+        self._ready.close()
+        for link in self._links:
+            link.unlink(missing_ok=True)
+        for fd in (*self._masters.values(), *self._slaves.values(), self._wake, self._waker):
+            os.close(fd)
+        for connection in (*self._sockets.values(), *self._listening):
+            connection.close()
+
+    # ---- ports ----
+
+    def _plug_in(self, line: FarLine) -> None:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        link = self._links[self.lines.index(line)]
+        new = link.with_suffix(".new")
+        new.symlink_to(os.ttyname(slave))
+        new.rename(link)
+        self._masters[line], self._slaves[line] = master, slave
+        self._ready.register(master, selectors.EVENT_READ, lambda: self._read(line))
+
+    def _listen(self, line: FarLine, listening: socket.socket) -> None:
+        self._ready.register(listening, selectors.EVENT_READ, lambda: self._accept(line, listening))
+
+    def _accept(self, line: FarLine, listening: socket.socket) -> None:
+        if line in self._sockets:
+            self._hang_up(line)
+        connection, _ = listening.accept()
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._sockets[line] = connection
+        if self._is_telnet:
+            self._telnets[line] = Telnet()
+        line.reconnected()
+        self._ready.register(connection, selectors.EVENT_READ, lambda: self._read(line))
+
+    def _hang_up(self, line: FarLine) -> None:
+        connection = self._sockets.pop(line)
+        self._ready.unregister(connection)
+        connection.close()
+
+    def lose(self, line: FarLine) -> None:
+        """Take the port away, as when an adapter is unplugged."""
+
+        def unplug() -> None:
+            self._links[self.lines.index(line)].unlink()
+            master = self._masters.pop(line)
+            self._ready.unregister(master)
+            os.close(master)
+            os.close(self._slaves.pop(line))
+
+        self.do(unplug)
+
+    def bring_back(self, line: FarLine) -> None:
+        def plug_in() -> None:
+            line.reconnected()
+            self._plug_in(line)
+
+        self.do(plug_in)
+
+    # ---- the thread ----
+
+    def do(self, job: Callable[[], Any]) -> None:
+        """Have the far end's thread do this, and wait until it is done."""
+        done = threading.Event()
+        self._jobs.append(lambda: (job(), done.set()))
+        os.write(self._waker, b"\0")
+        done.wait()  # a signal's handler may end this wait, and the job is done all the same
+
+    def release(self, line: FarLine) -> None:
+        """Give the replies that were held back."""
+        self.do(lambda: [self._send(line, it) for it in line.release()])
+
+    def _woken(self) -> None:
+        os.read(self._wake, 1024)
+        while self._jobs:
+            self._jobs.pop(0)()
+
+    def _run(self) -> None:
+        while not self._done:
+            waits = [at - time.monotonic() for at, _, _ in self._delayed[:1]]
+            for key, _ in self._ready.select(max(0.0, waits[0]) if waits else None):
+                key.data()
+            while self._delayed and self._delayed[0][0] <= time.monotonic():
+                _, line, said = self._delayed.pop(0)
+                self._send(line, said)
+
+    def _read(self, line: FarLine) -> None:
+        try:
+            connection = self._sockets.get(line)
+            received = connection.recv(4096) if connection else os.read(self._masters[line], 4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            received = b""
+        if not received:
+            if line in self._sockets:
+                self._hang_up(line)
+            return
+        if line in self._telnets:
+            received, answer = self._telnets[line].decode(received)
+            self._sockets[line].send(answer)
+        for said in line.hear(received):
+            if line.delay:
+                self._delayed.append((time.monotonic() + line.delay, line, said))
+            else:
+                self._send(line, said)
+
+    def _send(self, line: FarLine, said: bytes) -> None:
+        with suppress(OSError, KeyError):
+            if line in self._sockets:
+                self._sockets[line].send(Telnet.encode(said) if self._is_telnet else said)
+            else:
+                os.write(self._masters[line], said)
