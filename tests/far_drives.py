@@ -158,6 +158,10 @@ class FarDrive:
         self.runs = True
         self._coils[0] = COIL_ON
 
+    def hold(self, address: int, value: int) -> None:
+        """Keep this value where it is read, whatever the family has there."""
+        self._memory[address] = value
+
     def word(self, address: int) -> int:
         turning = self.kind.turning.get(address) if self.turns else None
         return self._memory.get(address, 0) if turning is None else turning

@@ -120,6 +120,7 @@ class FarLine:
         self.deaf_until = 0.0  # s, CLOCK_MONOTONIC
         self.delay = 0.0
         self.connection = 0
+        self.mangle: Callable[[bytes], bytes] = lambda said: said  # what becomes of a reply on its way
         self.held = threading.Event()  # the request that `hold` waits for has come
         self._hold_in = 0  # requests
         self._is_holding = False
@@ -177,7 +178,7 @@ class FarLine:
             self._late, said = said, b""
         if trouble == "mute" or asked.address == 0:
             said = b""
-        said = late + said
+        said = self.mangle(late + said)
         if self._is_holding:
             self._kept.append(said)
             return []
