@@ -14,10 +14,14 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 import tables
+from far_drives import KINDS
 from stops_network import cut_networks
-from stops_victim import KINDS, Tally, Victim, victim
+from stops_victim import Tally, Victim, victim
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
@@ -187,7 +191,7 @@ ATTACKS: dict[str, tuple[Attack, float]] = {  # with the share of the rounds tha
     "a pause while it starts": (paused, 1),
     "a cut network": (cut_networks, 0.5),
 }
-HEAD = ("attack", "rounds", "stops asked", "left turning", "moved after", "not sent", "cut short")
+HEAD: tuple[str, ...] = ("attack", "rounds", "stops", "left turning", "moved after", "not sent", "cut short")
 HEAD += ("first p50 ms", "p99", "longest")
 
 

@@ -11,8 +11,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
-from stops_victim import KINDS, FarDrive, FarEnd, FarLine, Tally, Victim, victim
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+
+from far_drives import KINDS, FarDrive
+from far_end import FarEnd, FarLine
+from stops_victim import Tally, Victim, victim
 
 NEAR, FAR, PREFIX = "10.249.17.1", "10.249.17.2", 30
 MOST_STALL = 1.0  # s, that what is sent may be held up on an open connection, and arrive all the same
