@@ -87,8 +87,9 @@ static void close_ports(struct md_engine *engine)
         struct md_port *port = engine->ports[i];
         if (!port->closing)
             continue;
-        if (port->ending && port->turn != NOBODYS && port->turn != WISHED) {
-            md_line_abandon(&port->line, MD_POLL_ENDED, 0);
+        if (port->turn == WISHED || (port->ending && port->turn != NOBODYS)) {
+            /* its client is told whether it had begun to leave */
+            md_line_abandon(&port->line, port->turn == WISHED ? MD_LINE_LOST : MD_POLL_ENDED, 0);
             md_port_finish(port);
         }
         if (!port->progress.lost)
@@ -299,12 +300,9 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->progress;
 }
 
-/* Whether the one that came first also goes first. A stop goes ahead of what is for other drives, but not of
- * what came before it for its own: a start that was overtaken would undo it. */
-static int goes_first(const struct md_exchange *first, const struct md_exchange *then)
+void md_count_stop(uint32_t *stops)
 {
-    int one = first->request.address, other = then->request.address;
-    return !then->insists || first->insists || one == other || one == 0 || other == 0;
+    __atomic_fetch_add(stops, 1, __ATOMIC_SEQ_CST);
 }
 
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
@@ -321,7 +319,7 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
         if (*at && port->turn == WISHED) /* it is under way */
             at = &(*at)->next;
         for (struct wish **it = at; *it; it = &(*it)->next)
-            if (goes_first((*it)->exchange, exchange))
+            if (!exchange->insists || (*it)->exchange->insists) /* that one came first, and goes first */
                 at = &(*it)->next;
         wish.next = *at;
         *at = &wish;

@@ -176,7 +176,11 @@ static void move_on(struct md_port *port)
 /* Whether nobody wants any more what is under way, and nothing of it has left. */
 static int is_expired(const struct md_port *port, int64_t now_ns)
 {
-    return port->turn == WISHED && port->wishes->expires_ns && now_ns > port->wishes->expires_ns && port->line.tx_at == 0;
+    if (port->turn != WISHED || port->line.tx_at > 0)
+        return 0;
+    const struct wish *wish = port->wishes;
+    int is_overtaken = wish->exchange->stops && md_get(wish->exchange->stops) != wish->exchange->stops_seen;
+    return is_overtaken || (wish->expires_ns && now_ns > wish->expires_ns);
 }
 
 /* Take up what is to be done next, or say when; whether there is anything to carry out now. */
@@ -284,7 +288,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
         }
         if (want == MD_WRITE) {
             now_ns = apply_settings(port, &line->exchange->settings, now_ns);
-            if (md_line_want(line, now_ns) != MD_WRITE || pump_out(port, now_ns))
+            if (md_line_want(line, now_ns) != MD_WRITE || is_expired(port, now_ns) || pump_out(port, now_ns))
                 continue;
             wake_ns = now_ns + RETRY_WRITE_NS;
             break;

@@ -41,7 +41,7 @@ enum md_result {
     MD_LINE_LOST = -11,        /* the port failed: completion.error is the errno, 0 at its end */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     MD_LATE_ANSWER_DUE = -13,  /* not sent: an earlier answer would be mistaken for its reply */
-    MD_EXPIRED = -14,          /* not sent: its time was over before its turn came */
+    MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came, before its turn */
     /* of a value that was due (only seen in columns) */
     MD_NOT_ASKED = -15,        /* the drive is silent and was given a rest */
     MD_POLL_ENDED = -16,       /* before its answer was there, or its turn came */
@@ -162,6 +162,9 @@ struct md_exchange {
      * copy of its request. NULL: none does. */
     const struct md_exchange *teller;
     int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
+    /* The stops of its drive (md_count_stop): sent only while there are no more than that. NULL: sent anyway. */
+    const uint32_t *stops;
+    uint32_t stops_seen;
     struct md_message request;
 };
 
@@ -282,7 +285,10 @@ struct md_progress {
     int64_t switching_ns; /* that they took */
 };
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Carry one out ahead of the queue and wait for it. After `expires_ns` (0: never) it is not sent. */
+/* Count a stop: no urgent exchange that was made before it begins to leave any more. */
+void md_count_stop(uint32_t *stops);
+/* Carry one out ahead of the queue and wait for it; one that insists goes ahead of all that do not. After
+ * `expires_ns` (0: never), or once a stop was counted, it is not sent (MD_EXPIRED). */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
 

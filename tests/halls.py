@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from multidrop import acquaintance, bus, exchanges, writing
+from multidrop import acquaintance, bus, call, exchanges, performer, writing
 from multidrop.core import Completion, Exchange, Message, Result, build_reply, build_request, parse_reply
 from multidrop.drive import Drive
 from multidrop.sim import PoweredDrive, SimulatedDrive, simulated
@@ -41,9 +41,9 @@ class Hall:
         self.queue = object()  # the open port
         self.port = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, echo: self)
-        for module in (bus, exchanges, writing, acquaintance):
+        for module in (performer, exchanges, writing, acquaintance):
             monkeypatch.setattr(module, "sleep", self.sleep)
-        for module in (bus, exchanges, writing):
+        for module in (bus, call, exchanges, performer, writing):
             monkeypatch.setattr(module, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(writing, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
         self.bus = bus.Bus("hall", **details)
@@ -60,7 +60,8 @@ class Hall:
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         request = exchange.request
         self.seconds += self.queue_time
-        if expires_ns and self.seconds * 1e9 > expires_ns:
+        is_overtaken = exchange.permit is not None and not exchange.permit.is_good
+        if is_overtaken or (expires_ns and self.seconds * 1e9 > expires_ns):
             return self._completion(int(Result.EXPIRED))
         frame = build_request(exchange.framing, request)
         self.frames.append((request, text(frame)))

@@ -145,14 +145,14 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         begun, go_on = threading.Event(), threading.Event()
-        step = bus._step
+        step = bus._performer._do_stop
 
         def slow(*arguments: object) -> object:
             begun.set()
             assert go_on.wait(30)
             return step(*arguments)
 
-        monkeypatch.setattr(bus, "_step", slow)
+        monkeypatch.setattr(bus._performer, "_do_stop", slow)
         stopping = threading.Thread(target=bus.stop_all)
         stopping.start()
         assert begun.wait(30)

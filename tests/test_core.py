@@ -23,12 +23,15 @@ from multidrop.core import (
     REFUSALS,
     Block,
     Columns,
+    Completion,
     Echo,
     Exchange,
     Field,
     Framing,
     Inbox,
+    Latch,
     Message,
+    Permit,
     Port,
     Respondent,
     Result,
@@ -415,7 +418,14 @@ def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
     assert heard == [4]
 
 
-def written(address: int, start: int, *, turnaround: float = 1e-4, insists: bool = False) -> Exchange:
+def written(
+    address: int,
+    start: int,
+    *,
+    turnaround: float = 1e-4,
+    insists: bool = False,
+    permit: Permit | None = None,
+) -> Exchange:
     return Exchange(
         Framing.RTU,
         Message(address, 6, start, data=bytes(2)),
@@ -426,6 +436,7 @@ def written(address: int, start: int, *, turnaround: float = 1e-4, insists: bool
         silence=1e-4,
         turnaround=turnaround,
         insists=insists,
+        permit=permit,
     )
 
 
@@ -437,9 +448,11 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
         assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
 
 
-def test_a_stop_goes_ahead_of_all_but_what_came_before_it_for_its_own_drive(drive: Drive) -> None:
-    """Overtaken, a start would undo it."""
+def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_its_drive(drive: Drive) -> None:
+    """Sent after it, a start would undo it; sent before it, it would move the motor first."""
+    latch, other = Latch(), Latch()
     heard: list[int] = []
+    found: dict[int, Completion] = {}
     go_on = threading.Event()
 
     def answer(request: Message) -> bytes:
@@ -449,16 +462,70 @@ def test_a_stop_goes_ahead_of_all_but_what_came_before_it_for_its_own_drive(driv
         return build_reply(Framing.RTU, request) if request.function == 6 else echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        ahead = [read(0, timeout=30), read(1, timeout=30), written(2, 50), read(2, timeout=30)]
-        wanted = [*ahead, written(3, 51), written(2, 99, insists=True)]
-        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+
+        def carry_out(exchange: Exchange) -> None:
+            found[exchange.request.start] = port.carry_out(exchange)
+
+        start, others = written(2, 50, permit=latch.permit()), written(3, 51, permit=other.permit())
+        wanted = [read(0, timeout=30), read(1, timeout=30), start, others, written(2, 98, insists=True)]
+        threads = [threading.Thread(target=carry_out, args=[it]) for it in wanted]
         for thread in threads:
             thread.start()
             time.sleep(0.05)  # those that wait come in this order
+        latch.rise("a stop was called")
+        late = [written(2, 52, permit=latch.permit()), written(2, 99, insists=True)]
+        for exchange in late:
+            threads.append(threading.Thread(target=carry_out, args=[exchange]))
+            threads[-1].start()
+            time.sleep(0.05)
         go_on.set()
         for thread in threads:
             thread.join(30)
-    assert heard == [0, 1, 50, 99, 2, 51]
+    assert heard == [0, 98, 99, 1, 51, 52]
+    assert (found[50].result, found[50].sent_ns) == (Result.EXPIRED, 0)
+
+
+def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -> None:
+    latch = Latch()
+    before = latch.permit()
+    assert before.is_good
+    with latch.held("a stop"):
+        assert not before.is_good
+        during = latch.permit()
+        assert not during.is_good
+    assert not during.is_good
+    assert latch.permit().is_good
+    latch.shut("the bus was left")
+    assert not latch.permit().is_good
+
+
+def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: Drive) -> None:
+    """And what had not begun is never sent."""
+    came = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        came.set()
+        return b""
+
+    fd = drive(answer)
+    port = Port(fd, NO_SETTINGS)
+    found: list[Completion] = []
+    exchanges = [written(1, 50), written(1, 51)]
+
+    def carry_out(exchange: Exchange) -> None:
+        found.append(port.carry_out(exchange))
+
+    threads = [threading.Thread(target=carry_out, args=[it]) for it in exchanges]
+    threads[0].start()
+    assert came.wait(30)
+    threads[1].start()
+    time.sleep(0.05)  # it waits behind the other
+    port.stop()
+    for thread in threads:
+        thread.join(30)
+    port.close()
+    assert [it.result for it in found] == [Result.LINE_LOST] * 2
+    assert sorted(it.sent_ns > 0 for it in found) == [False, True]
 
 
 def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:

@@ -206,7 +206,7 @@ def test_an_echo_without_a_drive_confirms_nothing() -> None:
         with pytest.raises(NoReply):
             pump.start()
         with pytest.raises((NoReply, Unconfirmed)):
-            pump.stop()
+            pump.stop(seconds=0.5)
 
 
 def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:

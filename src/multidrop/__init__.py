@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from multidrop.errors import LineError as LineError
     from multidrop.errors import NoReply as NoReply
     from multidrop.errors import NotDone as NotDone
+    from multidrop.errors import Overtaken as Overtaken
     from multidrop.errors import Refused as Refused
     from multidrop.errors import Unconfirmed as Unconfirmed
     from multidrop.errors import Unsupported as Unsupported
@@ -68,6 +69,7 @@ _HOMES = {
         "LineError",
         "NoReply",
         "NotDone",
+        "Overtaken",
         "Refused",
         "Unconfirmed",
         "Unsupported",

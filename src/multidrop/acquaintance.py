@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
 
-from multidrop.drive import Drive, Read, Step, Wait, carry_out
-from multidrop.errors import BadReply, DriveRefused, NoReply, Refused
+from multidrop.core import Result
+from multidrop.drive import Drive, Read, Script, Step, Wait, carry_out
+from multidrop.drives import MODELS
+from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused
 from multidrop.exchanges import READ_ATTEMPTS, Exchanges
 from multidrop.line import sleep
+
+SURE = 2  # times that a drive answers as another would, before a stop is not sent to it
+
+Timed = Callable[[], AbstractContextManager[None]]
 
 
 class Acquaintance:
@@ -16,21 +23,21 @@ class Acquaintance:
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
         self._known: dict[Drive, object] = {}  # the open port on which it was found to be of its family
-        self._unheard: dict[Drive, object] = {}  # or on which it did not answer a glance
+        self._glanced: dict[Drive, object] = {}  # or on which a glance proved nothing against a stop
 
     def is_known(self, drive: Drive) -> bool:
         return self._known.get(drive, self) is self._exchanges.line.queue
 
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
-        self._unheard.pop(drive, None)
+        self._glanced.pop(drive, None)
 
-    def make(self, drive: Drive, attempts: int = READ_ATTEMPTS) -> None:
+    def make(self, drive: Drive, timed: Timed = nullcontext) -> None:
         """Look, once; Refused when it is of another family, NoReply when it cannot be heard.
 
         At least one value is read, so that a line on which an adapter echoes is known to do so before
         a write could take its echo for the drive's confirmation. After the port was opened anew it is
-        done again, because something else may be on it.
+        done again, because something else may be on it. Each look is `timed`.
         """
         if self.is_known(drive):
             return
@@ -38,10 +45,10 @@ class Acquaintance:
         def look(step: Step) -> object:
             if isinstance(step, Wait):
                 return sleep(step.seconds)
-            if not isinstance(step, Read):
-                raise Refused(f"{drive.name}: a look at its identity must not write")
-            return self._exchanges.values(drive, [step.register], attempts)[step.register.name]
+            with timed():
+                return self._looked(drive, step, READ_ATTEMPTS)
 
+        port = self._exchanges.line.queue
         try:
             carry_out(drive.identify.script(), look)
         except DriveRefused as refusal:
@@ -51,29 +58,129 @@ class Acquaintance:
                 rule="it does not look like its family",
             ) from refusal
         if not self._exchanges.is_heard(drive):
-            self._read_something(drive, attempts)
-        self._known[drive] = self._exchanges.line.queue
+            with timed():
+                self._read_something(drive, READ_ATTEMPTS)
+        self._known[drive] = port
 
-    def _read_something(self, drive: Drive, attempts: int) -> None:
+    def _looked(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
+        if not isinstance(step, Read):
+            raise Refused(f"{drive.name}: a look at its identity must not write")
+        name = step.register.name
+        return self._exchanges.values(drive, [step.register], attempts, insists=insists)[name]
+
+    def _read_something(self, drive: Drive, attempts: int, *, insists: bool = False) -> None:
         register = drive.telling or next((it for it in drive.registers.values() if it.readable), None)
         if register is not None:
             with suppress(DriveRefused):  # an answer too
-                self._exchanges.values(drive, [register], attempts)
+                self._exchanges.values(drive, [register], attempts, insists=insists)
 
-    def tell_echo(self, drive: Drive) -> None:
+    def tell_echo(self, drive: Drive, *, insists: bool = False) -> None:
         """Read once, so that the line learns whether what it heard was its adapter's echo.
 
         Another client that asks the same seems to be one: then the drive's confirmations of writes, which
         are copies too, would not count, until something is read.
         """
         with suppress(NoReply, BadReply):
-            self._read_something(drive, 1)
+            self._read_something(drive, 1, insists=insists)
+
+    # ---- before a stop ----
 
     def glance(self, drive: Drive) -> None:
-        """Before a stop, which is sent to a drive that cannot be heard too: it is asked once, at first."""
-        if self._unheard.get(drive, self) is self._exchanges.line.queue:
+        """Look, once and without waiting for anything; only what proves another family is Refused.
+
+        The stop of one family may be another's run. But a look that fails proves nothing, nor does one that
+        may have been given the answer to an earlier question: the stop is sent then. A drive that answered
+        all that it was ever asked, and SURE times in a row as another would, is another.
+        """
+        port = self._exchanges.line.queue
+        if self.is_known(drive) or self._glanced.get(drive, self) is port:
             return
+        self._glanced[drive] = port
+        refusals: list[str] = []
+        while self._is_in_step(drive) and len(refusals) < SURE:
+            refusal = self._glanced_at(drive)
+            if refusal is None:
+                return
+            refusals.append(str(refusal))
+        is_sure = len(refusals) == SURE and len(set(refusals)) == 1 and self._is_in_step(drive)
+        if is_sure and not drive.identity_is_inferred:
+            del self._glanced[drive]  # it is looked at again before the next stop
+            raise self._withheld(drive, refusals[0], self._lookalike(drive))
+
+    def _is_in_step(self, drive: Drive) -> bool:
+        """Whether an answer from its address can only be the one to what is asked now."""
+        respondent = self._exchanges.respondent(drive)
+        tally = respondent.tally()
+        return not (tally.late or tally.ended[Result.NO_REPLY] or respondent.late_until_ns)
+
+    def _glanced_at(self, drive: Drive) -> Refused | None:
+        """Why it is not of its family, where each look was answered well."""
+        port, failed = self._exchanges.line.queue, False
+
+        def look(step: Step) -> object:
+            nonlocal failed
+            if isinstance(step, Wait):
+                return None  # a stop waits for nothing
+            try:
+                return self._looked(drive, step, 1, insists=True)
+            except BusError:
+                failed = True
+                raise
+
         try:
-            self.make(drive, 1)
-        except (NoReply, BadReply):
-            self._unheard[drive] = self._exchanges.line.queue
+            carry_out(drive.identify.script(), look)
+            if not self._exchanges.is_heard(drive):
+                self._read_something(drive, 1, insists=True)
+        except Refused as refusal:
+            return None if failed else refusal
+        except Exception:  # of the family's own code: it must not keep a stop back
+            return None
+        if self._is_in_step(drive):
+            self._known[drive] = port
+        return None
+
+    def _lookalike(self, drive: Drive) -> Drive | None:
+        """A drive of the built-in family that would answer as this one does."""
+        settings = drive.settings
+        for family in MODELS.values():
+            try:
+                other = family(
+                    drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
+                )
+            except ValueError:  # it could not be on this line
+                continue
+            if not isinstance(drive, family) and self._is_one(drive, other):
+                return other
+        return None
+
+    def _is_one(self, drive: Drive, other: Drive) -> bool:
+        looks = 0
+
+        def look(step: Step) -> object:
+            nonlocal looks
+            looks += 1
+            if not isinstance(step, Read):
+                raise Refused("not a look")
+            return self._exchanges.values_as(other, drive, step.register)[step.register.name]
+
+        script: Script[None] = other.identify.script()
+        try:
+            carry_out(script, look)
+        except (BusError, ValueError):
+            return False
+        return looks > 0
+
+    @staticmethod
+    def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:
+        way = "Use the hard-wired stop, and find out which drive has this address"
+        if other is not None:
+            way = (
+                f"It answers as a {other.title} does. Use the hard-wired stop, or stop it as that: "
+                f"`multidrop stop PORT {other.model} {drive.address}`; in a program detach {drive.name} "
+                f"first, and attach {type(other).__name__}({drive.address})"
+            )
+        return Refused(
+            f"no stop was sent to {drive.name}: at its address is another drive, as it said twice ({why}), "
+            f"which may run at this family's stop. {way}",
+            rule="another family is at its address",
+        )

@@ -6,30 +6,63 @@ import logging
 import threading
 from collections.abc import Iterable
 from contextlib import suppress
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 from multidrop.audit import AuditLog
 from multidrop.core import Echo, Message, Respondent
-from multidrop.drive import Drive, Read, Script, State, Step, Wait, Write, carry_out
-from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused, Unconfirmed
+from multidrop.drive import Drive, Script, State, Write
+from multidrop.errors import BusError, Refused
 from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
+from multidrop.exit_hook import LastAct, exit_hook
 from multidrop.forks import tell_of_forks
 from multidrop.ledger import Ledger
-from multidrop.line import Line, now_ns, sleep
+from multidrop.line import Line, now_ns
 from multidrop.outcome import Outcome
-from multidrop.parting import Parting
+from multidrop.performer import Performer
 from multidrop.register import Register
-from multidrop.rules import check_own, check_plain, raw_count
+from multidrop.rules import check_own, check_plain, is_harmless, raw_count
 from multidrop.statistics import LineStatistics, look
-from multidrop.stopping import Stopped, stop_together
+from multidrop.stopping import Seen, Stopped
 from multidrop.writing import Writer
 
 __all__ = ["LEAST_TIMEOUT", "READ_ATTEMPTS", "Bus", "exchange"]
 
 D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)
+
+
+class _Claims:
+    """Which bus each drive is on: one at a time."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._buses: WeakKeyDictionary[Drive, Bus] = WeakKeyDictionary()
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        self._lock = threading.Lock()
+
+    def claim(self, drive: Drive, bus: Bus) -> None:
+        """Raise ValueError where another bus that is still open has it."""
+        with self._lock:
+            owner = self._buses.get(drive)
+            if owner is not None and owner is not bus and owner.is_open:
+                raise ValueError(
+                    f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"
+                )
+            self._buses[drive] = bus
+
+    def free(self, drive: Drive, bus: Bus) -> None:
+        with self._lock:
+            if self._buses.get(drive) is bus:
+                del self._buses[drive]
+
+
+_claims = _Claims()
 
 
 class Bus:
@@ -40,8 +73,13 @@ class Bus:
     t3.5 between frames, if all of them bear it. `echo` tells whether the adapter repeats what it sends: "on",
     "off", until it does, or "auto", to find out. Raises LineError when the port cannot be opened. Writes
     that may wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are
-    noted in the file `audit`. A write whose turn does not come within `expiry` seconds is not sent.
-    Leaving the `with` block closes the port and sends nothing, unless `stop_on_exit` was called.
+    noted in the file `audit`.
+
+    A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
+    its own looks may take. It is not sent either once a stop was called: that ends all that may move a motor
+    and was called before it, on any thread, with Overtaken. A drive is on one bus at a time. Leaving the
+    `with` block, or closing, waits for the stops that are under way and closes the port; it sends nothing,
+    unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
     """
 
     def __init__(
@@ -56,6 +94,10 @@ class Bus:
         audit: Path | str | None = None,
         expiry: float = 1.0,
     ) -> None:
+        if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
+            raise ValueError(
+                f"expiry = {expiry!r} is not a number of seconds above 0 for a write's turn to come"
+            )
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
@@ -68,10 +110,11 @@ class Bus:
             raise
         self._exchanges = Exchanges(self.line)
         book = ledger if isinstance(ledger, Ledger) else Ledger(ledger)
-        self._writer = Writer(self._exchanges, book, log, expiry)
-        self._parting: Parting | None = None
-        self._stopping = 0  # calls of stop_all under way, in which no drive may leave
-        self._stopped = threading.Condition()
+        self._writer = Writer(self._exchanges, book, log)
+        self._performer = Performer(self._exchanges, self._writer, expiry)
+        self._last_act: LastAct | None = None
+        self._is_closed = False
+        self._attaching = threading.RLock()  # one drive comes or goes at a time
         self._opened_ns = now_ns()
         self._reset_at = look(0.0, {}, self.line.overruns())
         self._at_last: LineStatistics | None = None  # when it was closed
@@ -79,7 +122,14 @@ class Bus:
 
     def forked(self) -> None:
         """In the child nobody stops drives: the line is closed there."""
-        self._stopping, self._stopped = 0, threading.Condition()
+        self._is_closed = True
+        self._attaching = threading.RLock()
+        self._performer.forked()
+
+    @property
+    def is_open(self) -> bool:
+        """It was not closed yet."""
+        return not self._is_closed
 
     def __enter__(self) -> Bus:
         return self
@@ -92,23 +142,42 @@ class Bus:
     ) -> None:
         self.close()
 
+    def leave(self) -> None:
+        """What closing does first: end all that moves a motor, and begin to stop the drives.
+
+        They are stopped if `stop_on_exit` was called.
+        """
+        self._performer.shut()
+        if self._last_act is not None:
+            self._last_act.begin()
+
     def part(self) -> None:
-        """What closing does as long as the port is open: stop the drives, if `stop_on_exit` was called."""
-        if self._parting is not None:
-            self._parting.now()
+        """What closing does as long as the port is open: leave, and wait for all stops under way."""
+        self.leave()
+        if self._last_act is not None:
+            exit_hook().finish(self._last_act)
+        self._performer.await_stops()
 
     def close(self) -> None:
-        self.part()
-        overruns = self.line.overruns()
-        self.line.close()
-        self._at_last = self._at_last or self._counted(overruns)
-        self._writer.close()
+        """Leave the line and close the port. What was sent and is not answered yet is Unconfirmed."""
+        try:
+            self.part()
+        finally:
+            self._is_closed = True
+            overruns = self.line.overruns()
+            self.line.close()
+            self._at_last = self._at_last or self._counted(overruns)
+            self._writer.close()
+
+    def regains(self) -> None:
+        """Take note that somebody opens a lost port again: a stop waits for it."""
+        self._performer.regains = True
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
         """Put a drive on the bus: a family with address, name and so on, or a drive made before.
 
-        Nothing is sent: its watchdog is read and logged at the first look. Raises ValueError for
-        what the family does not allow, or an address taken.
+        Nothing is sent: its watchdog is read and logged at the first look. Any thread may call this. Raises
+        ValueError for what the family does not allow, an address taken, or a drive that is on another bus.
         """
         family = drive if isinstance(drive, type) else type(drive)
         if not issubclass(family, Drive):
@@ -121,26 +190,35 @@ class Bus:
             drive = drive(address, **details)
         elif address is not None or details:
             raise TypeError(f"{drive.name} is made already: what it is to be goes into {family.__name__}(…)")
-        for other in self.drives:
-            if other.address == drive.address:
-                raise ValueError(f"address {drive.address} is taken by {other.name}")
-        drive.perform = lambda script: self.perform(drive, script)
-        drive.introduce = lambda: self.introduce(drive)
-        self._exchanges.add(drive)
-        self.drives = [*self.drives, drive]  # anew, for others may be going through them
-        return drive
+        made = drive
+        with self._attaching:
+            for other in self.drives:
+                if other.address == made.address:
+                    raise ValueError(f"address {made.address} is taken by {other.name}")
+            _claims.claim(made, self)
+            made.perform = lambda script: self.perform(made, script)
+            made.introduce = lambda: self.introduce(made)
+            made.begin = lambda verb: self._performer.call(made, verb)
+            made.carry_out_move = self._performer.move
+            made.carry_out_stop = lambda verb, script, seconds: self._performer.stop(made, script, seconds)
+            self._exchanges.add(made)
+            self._performer.add(made)
+            self.drives = [*self.drives, made]  # anew, for others may be going through them
+        return made
 
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: nothing is asked of it any more, and its verbs raise ValueError.
 
-        Nothing is sent: its motor goes on as it is. Waits until `stop_all`, if it is under way, is done.
+        Nothing is sent: its motor goes on as it is. Ends what would move it with Overtaken, or Unconfirmed
+        where it was sent, and waits until the stops that are under way are done.
         """
-        with self._stopped:
-            self._stopped.wait_for(lambda: not self._stopping)
+        self._performer.remove(drive)
+        with self._attaching:
             self.respondent(drive)
-            self.drives = [it for it in self.drives if it is not drive]
+            self.drives = [other for other in self.drives if other is not drive]
             self._exchanges.remove(drive)
             self._writer.acquaintance.forget(drive)
+            _claims.free(drive, self)
 
     # ---- reading ----
 
@@ -173,16 +251,29 @@ class Bus:
 
     def try_write(self, drive: Drive, register: Register[T], value: T) -> Outcome:
         """As `write`, but what became of a write that was sent is returned, whatever it is."""
-        check_plain(drive, register, raw_count(drive, register, value))
-        return self._writer.put(drive, Write(register, value))
+        raw = raw_count(drive, register, value)
+        check_plain(drive, register, raw)
+        step = Write(register, value)
+        if is_harmless(register, raw):  # a stop
+            self._performer.rise([drive])
+            try:
+                return self._writer.insist(drive, step)
+            finally:
+                self._writer.count()
+        call = self._performer.call(drive)
+        with call.noted():
+            call.check(f"{register.name} = {register.format(value)}")
+            return self._writer.put(drive, step, call)
 
     def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
         """Send any request once, past every rule, and return the data of the reply.
 
         The one deliberate way round: no look at the drive's family, no span, no budget. It may start a
-        motor. Raises Unconfirmed when no answer comes, and DriveRefused.
+        motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`.
         """
-        return self._writer.raw(drive, Message(drive.address, function, start, count, data))
+        call = self._performer.call(drive)
+        with call.noted():
+            return self._writer.raw(drive, Message(drive.address, function, start, count, data), call)
 
     # ---- who is there ----
 
@@ -191,24 +282,11 @@ class Bus:
 
         The first write does this by itself. The first look also logs what the drive's watchdog does.
         """
-        acquaintance = self._writer.acquaintance
-        if acquaintance.is_known(drive):
-            return
-        acquaintance.make(drive)
-        logging.getLogger("multidrop").info("%s: %s", drive.name, self.watchdog(drive))
+        self._performer.introduce(drive)
 
     def watchdog(self, drive: Drive) -> str:
         """What becomes of the motor when this client dies, as far as the drive can say."""
-        register = drive.registers.get("communication_timeout")
-        if register is None or not register.readable:
-            return drive.watchdog
-        try:
-            held = self.read(drive, register)
-        except DriveRefused:
-            return drive.watchdog
-        if held == 0:
-            return f"its watchdog ({register.name}) is off: the motor runs on when the client dies"
-        return f"its watchdog ({register.name}) acts {register.format(held)} after the last message"
+        return self._performer.watchdog(drive)
 
     # ---- all drives at once ----
 
@@ -233,6 +311,8 @@ class Bus:
             raise Refused(f"{drive.title} has no harmless broadcast of {register.name} = {value}")
         for it in self.drives:
             self.introduce(it)
+        if is_harmless(register, raw):
+            self._performer.rise(self.drives)
         self._writer.broadcast(drive, register, raw)
         return {it.name: self._look(it) for it in self.drives}
 
@@ -242,22 +322,18 @@ class Bus:
         except BusError as failure:
             return failure
 
-    def stop_all(self) -> dict[str, Stopped]:
+    def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
         """Stop every drive, ahead of all that is queued; by drive's name, what is known of it.
 
         By broadcast where all drives are of one family that has it, and known to be; and then each of
-        them, in turns, until it is seen to stand. Never raises for one drive: the others go on.
+        them, in turns, again and again until it is seen to stand: for `seconds` s, or without that for 30 s
+        at least, and as long as the motor's ramp may take. Never raises for one drive: the others go on.
+        What was called before and would move a motor ends with Overtaken, and so does what is called
+        meanwhile. An interruption has each that does not stand yet sent its stop once more.
         """
-        with self._stopped:
-            self._stopping += 1
-        try:
-            at_once = self._stop_by_broadcast()
-            silent_last = sorted(self.drives, key=lambda drive: self.respondent(drive).failures)
-            return stop_together(silent_last, self._step, lambda: now_ns() / 1e9, sleep, at_once)
-        finally:
-            with self._stopped:
-                self._stopping -= 1
-                self._stopped.notify_all()
+        respondents = self.respondents
+        silent_last = sorted(respondents, key=lambda drive: respondents[drive].failures)
+        return self._performer.stop_all(silent_last, self._stop_by_broadcast, seconds)
 
     def _stop_by_broadcast(self) -> bool:
         """Whether a stop was broadcast, which it is only where that harms none and all are known."""
@@ -267,7 +343,7 @@ class Bus:
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or len(kinds) != 1 or not known or control is None or not control.broadcast:
             return False
-        with suppress(BusError):
+        with suppress(Exception):
             self._writer.broadcast(drives[0], control, control.broadcast[0])
             return True
         return False
@@ -275,50 +351,28 @@ class Bus:
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 
-        Also on SIGINT and SIGTERM, at once, and then the signal does what it did before. Without this
-        call leaving sends nothing: the motors go on as they are. Call it from the main thread.
+        Also on SIGINT and SIGTERM, at once, together with the drives of all other buses that asked for it.
+        The signal is held until that is done, and then does what it did before; three within a second cut
+        it short, which is told on standard error. From the signal on nothing that moves a motor is sent.
+        Without this call leaving sends nothing: the motors go on as they are. Call it from the main thread.
         """
-        if self._parting is None:
-            self._parting = Parting(self.stop_all)
+        if self._last_act is None:
+            self._last_act = exit_hook().add(self._performer.shut, self._stop_at_last)
+
+    def _stop_at_last(self) -> None:
+        for stopped in self.stop_all().values():
+            if stopped.seen is not Seen.STOPPED:
+                logging.getLogger("multidrop").warning("%s", stopped)
 
     # ---- verbs ----
 
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
-        """Carry out a verb's steps; the drive's verbs call this.
+        """Carry out a script's steps, none of which is written once a stop was called.
 
         What fails to be read after something was written is Unconfirmed: NoReply would say that nothing
         was, and DriveRefused that the drive did not do it.
         """
-        written: list[Write] = []
-        unseen: list[BusError] = []  # why something was not read
-
-        def do(step: Step) -> Any:
-            try:
-                result = self._step(drive, step)
-            except BusError as failure:
-                if isinstance(step, Read):
-                    unseen.append(failure)
-                raise
-            if isinstance(step, Write):
-                written.append(step)
-            return result
-
-        try:
-            return carry_out(script, do)
-        except (NoReply, BadReply, DriveRefused) as failure:
-            if not written or failure not in unseen:
-                raise
-            register, value = written[-1].register, written[-1].value
-            what = f"{register.name} = {register.format(value)}"
-            reason = f"it was confirmed, but its effect could not be seen: {failure}"
-            raise Unconfirmed(drive.name, what, reason) from failure
-
-    def _step(self, drive: Drive, step: Step) -> Any:
-        if isinstance(step, Wait):
-            return sleep(step.seconds)
-        if isinstance(step, Read):
-            return self.read(drive, step.register)
-        return self._writer.put(drive, step).value
+        return self._performer.perform(script, self._performer.call(drive))
 
     def respondent(self, drive: Drive) -> Respondent:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""

@@ -18,6 +18,7 @@ from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirm
 from multidrop.register import Access, Kept, Register, Table
 from multidrop.script import (
     Insist,
+    Pulse,
     Read,
     Script,
     Step,
@@ -44,6 +45,7 @@ __all__ = [  # also the names of other modules that a family's file needs
     "Insist",
     "NotDone",
     "Option",
+    "Pulse",
     "Read",
     "Refused",
     "Script",
@@ -82,8 +84,10 @@ class Option:
     meaning: str
 
 
-# Verbs before which the drive must be known to be of its family; a stop goes to a silent one too.
-_LOOKS_FIRST = ("start", "jog", "reset_fault", "set_frequency")
+# Verbs before which the drive must be known to be of its family, and which a stop ends.
+MOVING = ("start", "jog", "reset_fault", "set_frequency")
+# A stop goes to a silent drive too, again and again.
+STOPPING = ("stop", "coast", "emergency_stop")
 # What a verb is given, its types, and in words: "reverse" is not Direction.REVERSE, and would go forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -93,17 +97,30 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 
 
 class _BoundVerb(Generic[P, R]):
-    """A verb of one drive: calling it carries it out."""
+    """A verb of one drive: calling it carries it out.
+
+    A stop takes `seconds`: for so long it is repeated until the motor is seen to stand; without it for 30 s
+    at least, and as long as the motor's ramp may take.
+    """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
         self.name = name
         self.drive = drive
         self._script = script
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+    @overload
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R: ...
+    @overload
+    def __call__(self, *, seconds: float | None) -> R: ...
+    def __call__(self, *args: Any, **kwargs: Any) -> R:
+        if self.name in STOPPING:
+            seconds = kwargs.pop("seconds", None)
+            return cast(
+                R, self.drive.carry_out_stop(self.name, lambda: self.script(*args, **kwargs), seconds)
+            )
         script = self.script(*args, **kwargs)
-        if self.name in _LOOKS_FIRST:
-            self.drive.introduce()
+        if self.name in MOVING:
+            return cast(R, self.drive.carry_out_move(script, self.drive.begin(self.name)))
         return cast(R, self.drive.perform(script))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
@@ -189,6 +206,9 @@ class Drive:
     damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and those that say the drive will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
+    identity_is_inferred: ClassVar[bool] = (
+        False  # `identify` may refuse one of the family: it keeps no stop back
+    )
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
@@ -237,6 +257,15 @@ class Drive:
         self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.introduce: Callable[[], None] = lambda: None  # a bus looks at it
+        self.begin: Callable[[str], Any] = lambda verb: None  # what keeps it from being sent after a stop
+        self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
+        self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
+            lambda verb, make, seconds: self.perform(make())
+        )
+
+    def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
+        self.introduce()
+        return self.perform(script)
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
         raise RuntimeError(f"{self.name} is not attached to a bus: use bus.attach(...)")

@@ -88,6 +88,20 @@ class Expired(BusError):
         self.seconds = seconds
 
 
+class Overtaken(BusError):
+    """Ended before it was sent: a stop was called, the bus was left, or the drive taken off it."""
+
+    def __init__(self, drive: str, what: str, why: str) -> None:
+        super().__init__(f"{drive}: {what} was not sent: {why}; nothing more was sent")
+        self.drive = drive
+        self.what = what
+        self.why = why
+
+
+class NotAttached(ValueError):
+    """The drive is not, or no more, on this bus: a mistake of the caller."""
+
+
 class Refused(BusError, ValueError):
     """The library itself would not send it: which register, by which rule, and where the manual has it."""
 

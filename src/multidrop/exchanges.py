@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from multidrop import core
-from multidrop.core import Completion, Exchange, Message, Respondent, Result, raw_value
+from multidrop.core import Completion, Exchange, Message, Permit, Respondent, Result, raw_value
 from multidrop.drive import Drive
-from multidrop.errors import BadReply, DriveRefused, NoReply
+from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
 from multidrop.line import Line, now_ns, sleep
 from multidrop.plan import Block, alone, blocks, silence
 from multidrop.register import Register
@@ -26,6 +26,7 @@ def exchange(
     period: float = 0.0,
     insists: bool = False,
     teller: Exchange | None = None,
+    permit: Permit | None = None,
 ) -> Exchange:
     """What the core needs to carry out a request to this drive."""
     settings = drive.settings
@@ -42,6 +43,7 @@ def exchange(
         insists=insists,
         block=block,
         teller=teller,
+        permit=permit,
     )
 
 
@@ -52,13 +54,14 @@ def reading(
     rows: core.Block = NO_ROWS,
     *,
     period: float = 0.0,
+    insists: bool = False,
 ) -> Exchange:
     """What reads a block from this drive, whose reply is not taken from an adapter's echo."""
     teller = None
     if drive.telling and drive.telling not in block.registers:
         teller = exchange(drive, alone(drive.telling).request(drive.address), respondent, NO_ROWS)
     request = block.request(drive.address)
-    return exchange(drive, request, respondent, rows, period=period, teller=teller)
+    return exchange(drive, request, respondent, rows, period=period, insists=insists, teller=teller)
 
 
 class Exchanges:
@@ -92,27 +95,40 @@ class Exchanges:
 
     def respondent(self, drive: Drive) -> Respondent:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
-        if drive not in self._respondents:
-            raise ValueError(f"{drive.name} is not attached to this bus: use bus.attach(...)")
-        return self._respondents[drive]
+        respondent = self._respondents.get(drive)
+        if respondent is None:
+            raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
+        return respondent
 
     def is_heard(self, drive: Drive) -> bool:
         """Whether it has answered since the port was opened."""
         return self._heard.get(drive, self) is self.line.queue
 
-    def values(self, drive: Drive, registers: list[Register[Any]], attempts: int) -> dict[str, Any]:
-        """Registers' values by name, each block asked for so many times until it is answered."""
+    def values(
+        self, drive: Drive, registers: list[Register[Any]], attempts: int, *, insists: bool = False
+    ) -> dict[str, Any]:
+        """Registers' values by name, each block asked for so many times until it is answered.
+
+        One that insists waits for no earlier answer, which may then pass for its own.
+        """
         raw: dict[str, Any] = {}
         for block in blocks(drive, registers):
-            reply = self._ask(drive, block, attempts)
+            reply = self._ask(drive, block, attempts, insists)
             for register in block.registers:
                 raw[register.name] = register.decode(
                     raw_value(reply.data, block.offset(register), register.wire)
                 )
         return {register.name: raw[register.name] for register in registers}
 
-    def _ask(self, drive: Drive, block: Block, attempts: int) -> Message:
-        made = reading(drive, block, self.respondent(drive))
+    def values_as(self, other: Drive, drive: Drive, register: Register[Any]) -> dict[str, Any]:
+        """What a drive says to the question of another family, asked once, without waiting for anything."""
+        (block,) = blocks(other, [register])
+        made = reading(other, block, self.respondent(drive), insists=True)
+        reply = self._read(drive, self._carry_out(made))
+        return {register.name: register.decode(raw_value(reply.data, block.offset(register), register.wire))}
+
+    def _ask(self, drive: Drive, block: Block, attempts: int, insists: bool) -> Message:
+        made = reading(drive, block, self.respondent(drive), insists=insists)
         for _ in range(attempts - 1):
             try:
                 return self._read(drive, self._carry_out(made))
@@ -124,17 +140,23 @@ class Exchanges:
         return self._read(drive, self._carry_out(made))
 
     def carry_out(
-        self, drive: Drive, request: Message, expiry: float = 0.0, *, insists: bool = False
+        self,
+        drive: Drive,
+        request: Message,
+        expires_ns: int = 0,
+        *,
+        insists: bool = False,
+        permit: Permit | None = None,
     ) -> Completion:
         """One exchange, ahead of any polling; first an answer that may still come late is waited for.
 
-        After `expiry` seconds it is not sent; 0: never too late. One that insists waits for no answer.
+        After `expires_ns` (0: never), and without a good permit, it is not sent. One that insists waits for
+        no answer.
         """
-        made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists)
-        return self._carry_out(made, expiry)
+        made = exchange(drive, request, self.respondent(drive), NO_ROWS, insists=insists, permit=permit)
+        return self._carry_out(made, expires_ns)
 
-    def _carry_out(self, made: Exchange, expiry: float = 0.0) -> Completion:
-        expires_ns = now_ns() + round(expiry * 1e9) if expiry else 0
+    def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
         while True:
             late_until_ns = made.respondent.late_until_ns
             completion = self.line.carry_out(made, expires_ns=expires_ns)

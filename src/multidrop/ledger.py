@@ -77,6 +77,11 @@ class Ledger:
             ledger.commit()
         return ""
 
+    def note(self, cell: Cell, now: float) -> None:
+        """Count a write that was sent whatever the budget says: a stop. OSError where it cannot be kept."""
+        with self._opened() as ledger:
+            ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
+
     def wear(self, now: float) -> list[Wear]:
         """Every cell that was ever written, the most worn in the last year first."""
         if not self.path.exists():

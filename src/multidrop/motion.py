@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -16,18 +17,31 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     """Start drives one after another, `gap` seconds apart.
 
     At the first that fails the ones already started are stopped, and so is that one; its failure is
-    raised.
+    raised. None is started once its stop was called, on any thread, since this was.
     """
-    for number, drive in enumerate(drives):
+    calls = [drive.begin("start") for drive in drives]
+    for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
             if number:
                 drive.perform(wait(gap))
-            drive.start(direction)
+            drive.carry_out_move(drive.start.script(direction), call and call.anew())
         except BaseException:
-            for started in drives[: number + 1]:
-                with suppress(BusError):
-                    started.stop()
+            _stop(drives[: number + 1])
             raise
+
+
+def _stop(drives: Sequence[Drive]) -> None:
+    """All at once: they may be on several buses, and one may be silent."""
+
+    def stop(drive: Drive) -> None:
+        with suppress(BusError, ValueError):
+            drive.stop()
+
+    threads = [threading.Thread(target=stop, args=[drive]) for drive in drives]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0.5) -> None:

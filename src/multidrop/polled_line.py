@@ -98,6 +98,7 @@ class PolledLine:
     def __init__(self, declared: plant.Line, number: int, bus: Bus, inbox: Inbox, codes: Codes) -> None:
         self.name = declared.name
         self.bus = bus
+        bus.regains()
         self.schedule: Schedule[Asked] = Schedule()
         self.started_ns = now_ns()
         self._ended_ns: int | None = None  # nothing is due any more

@@ -92,6 +92,8 @@ class Poller:
         if self._closing:
             return
         self._closing = True
+        for line in self._lines:
+            line.bus.leave()  # all of them at once
         if self._thread.is_alive():
             self._wake_up()
             self._thread.join()
@@ -160,6 +162,11 @@ class Poller:
     def bus(self, line: str) -> Bus:
         """The bus of the line with this name."""
         return self._line(line).bus
+
+    def stop_on_exit(self) -> None:
+        """Stop the drives of all lines, at once, when polling ends or the process does; see Bus."""
+        for line in self._lines:
+            line.bus.stop_on_exit()
 
     def fileno(self) -> int:
         """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""

@@ -35,6 +35,11 @@ class Insist(Write):
 
 
 @dataclass(frozen=True)
+class Pulse(Insist):
+    """One that is sent once in a call, whatever becomes of it: a stop that is itself a fault."""
+
+
+@dataclass(frozen=True)
 class Wait:
     seconds: float
 

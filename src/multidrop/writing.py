@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from multidrop.acquaintance import Acquaintance
 from multidrop.audit import AuditLog
+from multidrop.call import Call
 from multidrop.core import Completion, Message, Result, build_request
-from multidrop.drive import Drive, Insist, Step, Wait, Write, carry_out
+from multidrop.drive import Drive, Step, Wait, Write, carry_out
 from multidrop.errors import (
     BadReply,
     BusError,
@@ -18,6 +19,8 @@ from multidrop.errors import (
     Expired,
     LineError,
     NoReply,
+    NotAttached,
+    Overtaken,
     Unconfirmed,
 )
 from multidrop.exchanges import READ_ATTEMPTS, Exchanges
@@ -26,7 +29,7 @@ from multidrop.line import now_ns, sleep, utc_minus_monotonic_ns
 from multidrop.outcome import Effect, Outcome
 from multidrop.plan import write_request
 from multidrop.register import Kept, Register
-from multidrop.rules import conditions, is_harmless, raw_count, refused, wears
+from multidrop.rules import conditions, raw_count, refused, wears
 
 
 def utc_ns() -> int:
@@ -36,60 +39,107 @@ def utc_ns() -> int:
 class Writer:
     """All that is written to the drives on a line goes through here."""
 
-    def __init__(self, exchanges: Exchanges, ledger: Ledger, audit: AuditLog | None, expiry: float) -> None:
+    def __init__(self, exchanges: Exchanges, ledger: Ledger, audit: AuditLog | None) -> None:
         self.acquaintance = Acquaintance(exchanges)
         self.audit = audit
         self._exchanges = exchanges
         self._ledger = ledger
-        self._expiry = expiry
+        self._uncounted: list[Cell] = []
 
-    def put(self, drive: Drive, step: Write) -> Outcome:
-        """Write once by all rules but that for plain writes; what became of it."""
+    def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
+        """Write once by all rules but that for plain writes; what became of it.
+
+        Raises Overtaken and Expired, by its call.
+        """
         register, value = step.register, step.value
         raw = raw_count(drive, register, value)
         asked = register.decode(raw)
-        if isinstance(step, Insist) or is_harmless(register, raw):
-            self.acquaintance.glance(drive)
-        else:
-            self.acquaintance.make(drive)
-        carry_out(conditions(drive, register, asked), lambda step: self._look(drive, step))
+        self.acquaintance.make(drive, call.look)
+        carry_out(conditions(drive, register, asked), lambda step: self._look(drive, step, call))
         kept = wears(drive, register)
         if kept is not Kept.RAM:
-            if register.readable and self._read(drive, register) == asked:
-                return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
+            if register.readable:
+                with call.look():
+                    held = self._read(drive, register)
+                if held == asked:
+                    return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
+            call.check(_what(register, asked))  # what is not sent is not counted
             self._enter(drive, register, kept)
-        return self._sent(drive, step, write_request(drive, register, raw), asked)
+        return self._sent(drive, register, raw, call)
 
-    def _sent(self, drive: Drive, step: Write, request: Message, asked: Any) -> Outcome:
+    def insist(self, drive: Drive, step: Write) -> Outcome:
+        """Write what stops the motor, or does no harm at any time: the port alone keeps it back.
+
+        Neither a rule nor the ledger is asked: where it may wear an EEPROM it is counted afterwards, by
+        `count`. Only what proves another family at the address is Refused.
+        """
         register = step.register
-        what = f"{register.name} = {register.format(asked)}"
-        insists = isinstance(step, Insist)
-        seconds = 0.0 if insists else self._expiry
+        raw = raw_count(drive, register, step.value)
+        self.acquaintance.glance(drive)
+        kept = wears(drive, register)
+        try:
+            return self._sent(drive, register, raw, None)
+        finally:
+            if kept is not Kept.RAM:
+                self._uncounted.append(self._cell(drive, register))
+
+    def count(self) -> None:
+        """Count in the ledger what was insisted on; that it cannot be is a warning."""
+        while self._uncounted:
+            cell = self._uncounted.pop()
+            try:
+                self._ledger.note(cell, utc_ns() / 1e9)
+            except OSError as failure:
+                logging.getLogger("multidrop").warning("a stop was not counted: %s", failure)
+
+    def _sent(self, drive: Drive, register: Register[Any], raw: int, call: Call | None) -> Outcome:
+        """Send it once: for its call, or else insisting."""
+        request, asked = write_request(drive, register, raw), register.decode(raw)
+        what = _what(register, asked)
         with self._noted(drive, request, what):
-            completion = self._exchanges.carry_out(drive, request, seconds, insists=insists)
-            if completion.result == Result.EXPIRED:
-                raise Expired(drive.name, what, seconds)
-            outcome = self._outcome(drive, register, asked, completion)
+            completion = self._carried_out(drive, request, what, call)
+            outcome = self._outcome(drive, register, asked, completion, call)
             if (
                 outcome.effect is Effect.UNCONFIRMED
                 and build_request(drive.framing, request) in completion.raw
             ):
-                self.acquaintance.tell_echo(drive)
+                self.acquaintance.tell_echo(drive, insists=call is None)
+        if call:
+            call.is_confirmed = outcome.effect is not Effect.UNCONFIRMED
         why = "" if outcome.failure is None else str(outcome.failure)
         self.log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
 
-    def _outcome(self, drive: Drive, register: Register[Any], asked: Any, completion: Completion) -> Outcome:
+    def _carried_out(self, drive: Drive, request: Message, what: str, call: Call | None) -> Completion:
+        if call is None:
+            return self._exchanges.carry_out(drive, request, insists=True)
+        before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
+        completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
+        if completion.result == Result.EXPIRED:
+            call.sent, call.is_confirmed = before
+            raise call.unsent(what)
+        return completion
+
+    def _outcome(
+        self,
+        drive: Drive,
+        register: Register[Any],
+        asked: Any,
+        completion: Completion,
+        call: Call | None,
+    ) -> Outcome:
         """What is known: by the reply, and by what the drive then holds."""
-        what = f"{register.name} = {register.format(asked)}"
+        what = _what(register, asked)
         lost: BusError | None = None
+        held, unread = None, None
         try:
             self._exchanges.reply(drive, completion)
         except DriveRefused as failure:
             return Outcome(drive.name, register, asked, Effect.REFUSED, failure=failure)
         except (NoReply, BadReply) as failure:
             lost = failure
-        held, unread = self._held(drive, register)
+        if lost is None or call is not None:  # a stop whose reply is lost is sent again at once
+            held, unread = self._held(drive, register, call)
         if held is not None and (held == asked or lost is None):
             effect = Effect.DONE if held == asked else Effect.TAKEN_AS
             return Outcome(drive.name, register, asked, effect, held=held)
@@ -100,20 +150,19 @@ class Writer:
         unknown.__cause__ = lost or unread
         return Outcome(drive.name, register, asked, Effect.UNCONFIRMED, held=held, failure=unknown)
 
-    def _held(self, drive: Drive, register: Register[Any]) -> tuple[Any, BusError | None]:
+    def _held(self, drive: Drive, register: Register[Any], call: Call | None) -> tuple[Any, Exception | None]:
         """What the drive holds, None where that cannot be read, and why it was not."""
         if not register.readable:
             return None, None
         try:
-            return self._read(drive, register), None
-        except (NoReply, BadReply, DriveRefused) as failure:
+            with call.look() if call else nullcontext():
+                return self._read(drive, register), None
+        except (NoReply, BadReply, DriveRefused, LineError, NotAttached) as failure:
             return None, failure
 
     def _enter(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger; Refused when it may not be."""
-        cell = Cell(
-            self._exchanges.line.port, drive.address, drive.model or type(drive).__name__, register.name
-        )
+        cell = self._cell(drive, register)
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
         why = self._ledger.enter(cell, utc_ns() / 1e9, least)
         if why:
@@ -122,20 +171,27 @@ class Writer:
                 way = f'if you know that this drive keeps it in RAM, declare ram = ["{register.name}"]'
             raise refused(drive, register, f"{why}; {way}")
 
+    def _cell(self, drive: Drive, register: Register[Any]) -> Cell:
+        model = drive.model or type(drive).__name__
+        return Cell(self._exchanges.line.port, drive.address, model, register.name)
+
     def _read(self, drive: Drive, register: Register[Any]) -> Any:
         return self._exchanges.values(drive, [register], READ_ATTEMPTS)[register.name]
 
-    def _look(self, drive: Drive, step: Step) -> Any:
+    def _look(self, drive: Drive, step: Step, call: Call) -> Any:
         """A step of what the rules depend on."""
         if isinstance(step, Wait):
-            return sleep(step.seconds)
-        return self._read(drive, step.register)
+            with call.step(step.seconds):
+                return sleep(step.seconds)
+        with call.look():
+            return self._read(drive, step.register)
 
     def log(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
         """Note a write in the audit log; that it cannot be kept must not stop a stop."""
-        if self.audit is None:
+        audit = self.audit
+        if audit is None:
             return
         frame = build_request(drive.framing, request)
         record = {
@@ -149,8 +205,8 @@ class Writer:
         }
         more = {"held": None if held is None else float(held), "why": why}
         try:
-            self.audit.add(utc_ns(), record | {key: it for key, it in more.items() if it not in (None, "")})
-        except OSError as failure:
+            audit.add(utc_ns(), record | {key: it for key, it in more.items() if it not in (None, "")})
+        except (OSError, ValueError) as failure:  # it may be closed meanwhile
             logging.getLogger("multidrop").warning("the audit log cannot be written: %s", failure)
 
     @contextmanager
@@ -158,7 +214,7 @@ class Writer:
         """Note the write too when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
         try:
             yield
-        except Expired:  # it was not sent
+        except (Expired, Overtaken, NotAttached):  # it was not sent
             raise
         except BaseException as failure:
             self.log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
@@ -171,11 +227,11 @@ class Writer:
             self.audit.close()
             self.audit = None
 
-    def raw(self, drive: Drive, request: Message) -> bytes:
-        """Send any request once, past every rule; the data of the reply."""
+    def raw(self, drive: Drive, request: Message, call: Call) -> bytes:
+        """Send any request once, past every rule but its call's; the data of the reply."""
         what = f"raw request {build_request(drive.framing, request).hex(' ').upper()}"
         with self._noted(drive, request, what):
-            completion = self._exchanges.carry_out(drive, request)
+            completion = self._carried_out(drive, request, what, call)
         try:
             reply = self._exchanges.reply(drive, completion)
         except (NoReply, BadReply) as failure:
@@ -192,8 +248,12 @@ class Writer:
         request = write_request(drive, register, raw, address=0)
         what = f"{register.name} = {register.format(register.decode(raw))}"
         with self._noted(drive, request, what):
-            self._exchanges.carry_out(drive, request)
+            self._exchanges.carry_out(drive, request, insists=True)
         self.log(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
+
+
+def _what(register: Register[Any], value: Any) -> str:
+    return f"{register.name} = {register.format(value)}"
 
 
 def _why(failure: BusError) -> str:

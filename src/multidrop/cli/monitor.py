@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 import threading
 import time
@@ -86,6 +87,28 @@ def _console() -> Any:
     return console
 
 
+class _Shown(logging.Handler):
+    """Hands warnings to `show`."""
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        super().__init__(logging.WARNING)
+        self._show = show
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._show(record.getMessage())
+
+
+@contextmanager
+def _warnings_to(show: Callable[[str], None]) -> Iterator[None]:
+    """Keep the library's warnings off standard error, where they would spoil the screen."""
+    log, shown = logging.getLogger("multidrop"), _Shown(show)
+    log.addHandler(shown)
+    try:
+        yield
+    finally:
+        log.removeHandler(shown)
+
+
 class _Monitor:
     def __init__(
         self, plant: Plant, poller: Poller, takers: list[Callable[[Rows], None]], console: Any
@@ -103,7 +126,7 @@ class _Monitor:
 
     def show(self, interruption: Interruption, seconds: float | None) -> None:
         begun = next_draw = next_tick = time.monotonic()
-        with self._drawing() as (draw, every), keys() as wait_for_key:
+        with self._drawing() as (draw, every), keys() as wait_for_key, _warnings_to(self._show_warning):
             while not interruption.came:
                 now = time.monotonic()
                 if seconds is not None and now - begun >= seconds:
@@ -122,6 +145,9 @@ class _Monitor:
                 if key:
                     self._obey(key)
                     next_draw = 0.0
+
+    def _show_warning(self, text: str) -> None:
+        self._at.message = text
 
     @contextmanager
     def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:

@@ -17,6 +17,7 @@ from multidrop.core.frames import (
     sum8,
 )
 from multidrop.core.inbox import Inbox
+from multidrop.core.latch import Latch, Permit
 from multidrop.core.overheard import (
     HEARD_ROOM,
     Decoded,
@@ -55,8 +56,10 @@ __all__ = [
     "Heard",
     "Inbox",
     "Kind",
+    "Latch",
     "Message",
     "Names",
+    "Permit",
     "Port",
     "Respondent",
     "Result",

@@ -9,6 +9,7 @@ from typing import Any
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Block
 from multidrop.core.frames import Framing, Message, build_request, from_c, to_c
+from multidrop.core.latch import Permit
 from multidrop.core.results import EXCEPTION_STATUS, Result
 from multidrop.core.settings import settings_to_c
 from multidrop.core.tally import Tally, read_tally
@@ -70,10 +71,10 @@ class Exchange:
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
     `insists`: not to wait for an earlier answer, which may then pass for its own. `block` is what rows are
     made of. `teller` goes first where nobody knows yet whether the adapter echoes: unlike this one's, its
-    reply is never a copy of its request.
+    reply is never a copy of its request. `permit` keeps it from being sent once a stop was called.
     """
 
-    __slots__ = ("block", "c", "framing", "request", "respondent", "settings", "teller")
+    __slots__ = ("block", "c", "framing", "permit", "request", "respondent", "settings", "teller")
 
     def __init__(
         self,
@@ -90,6 +91,7 @@ class Exchange:
         insists: bool = False,
         block: Block | None = None,
         teller: Exchange | None = None,
+        permit: Permit | None = None,
     ) -> None:
         build_request(framing, request)  # raises for what no frame can say
         self.framing = framing
@@ -97,6 +99,7 @@ class Exchange:
         self.respondent = respondent
         self.block = block
         self.teller = teller
+        self.permit = permit
         self.settings = (baudrate, format)
         self.c: Any = ffi.new(
             "struct md_exchange *",
@@ -112,6 +115,8 @@ class Exchange:
                 "drive": respondent.c,
                 "block": block.c if block else ffi.NULL,
                 "teller": teller.c if teller else ffi.NULL,
+                "stops": permit.latch.c if permit else ffi.NULL,
+                "stops_seen": permit.seen if permit else 0,
             },
         )
 

@@ -141,6 +141,7 @@ class InnovertIBD(Drive):
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True
+    identity_is_inferred = True
     remote = "set Prb.01 to 5 and Prb.02 to 2 on the keypad"
     options = {
         "maximum_frequency": Option("Hz", (1, 400), "the highest setpoint that may be written"),

@@ -13,6 +13,7 @@ from multidrop.drive import (
     Drive,
     DriveRefused,
     Option,
+    Pulse,
     Refused,
     Script,
     State,
@@ -341,7 +342,7 @@ class YD1000(Drive):
         It is a pulse and sent once. When it is not confirmed, the stop along the ramp follows at once.
         """
         try:
-            yield from insist(self.control, STOP | Control.EMERGENCY_STOP, attempts=1)
+            yield Pulse(self.control, STOP | Control.EMERGENCY_STOP)
         except (Unconfirmed, DriveRefused):
             yield from self.stop.script()
             return

@@ -1,0 +1,66 @@
+"""Latch: what a stop raises, so that nothing that was begun before it is sent after it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop._core import ffi, lib
+
+
+class Latch:
+    """Counts the stops of one drive; the core compares the count right before a request begins to leave.
+
+    `rise` takes no lock: a signal handler may call it.
+    """
+
+    def __init__(self) -> None:
+        self.c: Any = ffi.new("uint32_t *")
+        self.why = ""  # it rose last
+        self._is_shut = False
+        self._holds = 0  # stops under way
+        self._lock = threading.Lock()
+
+    def rise(self, why: str) -> None:
+        """End every permit that there is."""
+        self.why = why
+        lib.md_count_stop(self.c)
+
+    def shut(self, why: str) -> None:
+        """Rise for good: no permit is good any more."""
+        self._is_shut = True
+        self.rise(why)
+
+    @contextmanager
+    def held(self, why: str) -> Iterator[None]:
+        """Rise, and stay so while the context lasts: no permit that is asked for meanwhile is good."""
+        with self._lock:
+            self._holds += 1
+        try:
+            self.rise(why)
+            yield
+        finally:
+            with self._lock:
+                self._holds -= 1
+
+    def permit(self) -> Permit:
+        """Return what is good until the latch rises; while a stop is under way it never is."""
+        seen = int(self.c[0])
+        if self._is_shut or self._holds:  # looked at afterwards: who rises then ends this permit
+            seen = (seen - 1) & 0xFFFF_FFFF
+        return Permit(self, seen)
+
+
+@dataclass(frozen=True)
+class Permit:
+    """The permission to write what may move a motor, until a stop is called."""
+
+    latch: Latch
+    seen: int
+
+    @property
+    def is_good(self) -> bool:
+        return int(self.latch.c[0]) == self.seen
