@@ -181,6 +181,8 @@ class Stops(RuleBasedStateMachine):
         if how in ("leave", "signal"):
             self._close()
             self._judge_order(range(DRIVES))
+            for number in SIGNALS:
+                signal.signal(number, _signalled)
             self._open()
         else:
             self._mark()
@@ -201,31 +203,42 @@ class Stops(RuleBasedStateMachine):
 
         over = threading.Event()
         second = threading.Thread(target=again)
-        second.start()
-        with suppress(Signalled):
+        try:
+            second.start()
             signal.raise_signal(signals[0])
-        over.set()
-        while second.is_alive():
-            with suppress(Signalled):
-                second.join()
-        with suppress(Signalled):
-            time.sleep(0)
+            while True:  # it is held until the stops are over
+                time.sleep(0.01)
+        except Signalled:
+            over.set()
+        while not self._is_deaf_to_signals():
+            pass
+        second.join()
+
+    def _is_deaf_to_signals(self) -> bool:
+        """The second one may come after the first one's effect."""
+        try:
+            for number in SIGNALS:
+                signal.signal(number, signal.SIG_IGN)
+        except Signalled:
+            return False
+        return True
 
     @precondition(lambda self: self.threads)
     @rule()
     def lose_the_port(self) -> None:
         """Pull the adapter out and plug it in again: nothing that was under way comes then."""
         self.far.lose(self.line)
+        failures: list[BaseException] = []
+        stopping = self._thread(self.drives[0].stop, failures)
         for thread in self.threads:
             thread.join()
         self.threads.clear()
-        with suppress(BusError):
-            self.drives[0].stop()
         self.far.bring_back(self.line)
+        stopping.join()
         self._close()
-        assert [
-            it for it in self.line.log if it.connection == self.line.connection and it.what == "moves"
-        ] == []
+        back = [it for it in self.line.log if it.connection == self.line.connection]
+        assert [str(it) for it in back if it.what == "moves"] == []
+        assert failures or not self.far_drives[0].runs
         for drive in self.far_drives:  # by hand: there was no way to stop them
             drive.runs = False
         self._open()
