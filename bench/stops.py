@@ -8,12 +8,13 @@ turning that should not, or was told to move after a stop. The same seed makes t
 from __future__ import annotations
 
 import argparse
+import itertools
 import random
 import signal
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
@@ -35,10 +36,14 @@ LOOKS: dict[str, tuple[int, ...]] = {  # the exceptions that its first looks get
     "fan": (1,),
 }
 MOST_LOOKS = 8  # of a start, before it writes
-LATE = 0.6  # s
+LATE, PATIENCE = 0.6, 3.0  # s: answers come so late; a stop that they cannot confirm in time is given so long
 CUT_SHORT = "cut short"  # in what a client says whose stops were
-EXPIRY = 1.0  # s, in which a start must leave
+PAUSE = 2.5  # s: longer than a start may be late, and than one of its looks may take
 Attack = Callable[[random.Random, int, bool], Tally]
+
+
+def _in_turn(chance: random.Random) -> Iterator[str]:
+    return itertools.cycle(chance.sample(list(KINDS), len(KINDS)))
 
 
 def signals(number: int, leaving: bool) -> Attack:
@@ -67,9 +72,8 @@ def signals(number: int, leaving: bool) -> Attack:
 
 def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Tally:
     """A thread starts a motor; the signal comes in the middle of one of its exchanges."""
-    tally = Tally()
-    for at in range(rounds):
-        kind = list(KINDS)[at % len(KINDS)]
+    tally, kinds = Tally(), _in_turn(chance)
+    for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], on_exit=True, sets=True) as client:
             client.begin(turning=False)
             client.hold(chance.randint(0, MOST_LOOKS))
@@ -119,16 +123,21 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Tally:
     return tally
 
 
-def two_buses(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def two_lines(*, polls: bool) -> Attack:
     """Each with four motors that take their time to stand; a signal stops both."""
-    tally = Tally()
-    for _ in range(rounds):
-        with victim([ALL[:4], ALL[4:]], on_exit=True, ramp=10.0 if is_long else 1.5) as client:
-            client.begin(turning=True)
-            client.signal(chance.choice(SIGNALS))
-            client.wait()
-            client.judge(tally, "two buses")
-    return tally
+
+    def attack(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+        tally = Tally()
+        for _ in range(rounds):
+            ramp = 10.0 if is_long else 1.5
+            with victim([ALL[:4], ALL[4:]], on_exit=True, polls=polls, ramp=ramp) as client:
+                client.begin(turning=True)
+                client.signal(chance.choice(SIGNALS))
+                client.wait()
+                client.judge(tally, "two lines of a poller" if polls else "two buses")
+        return tally
+
+    return attack
 
 
 def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Tally:
@@ -142,13 +151,13 @@ def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Tally:
         for kind in KINDS if is_long else chance.sample(list(KINDS), 1):
             with victim([[(kind, 1)]]) as client:
                 client.lines[0].delay = LATE
-                _stop(client, tally, f"answers {LATE:g} s late")
+                _stop(client, tally, f"answers {LATE:g} s late", seconds=PATIENCE)
     return tally
 
 
-def _stop(client: Victim, tally: Tally, why: str) -> None:
+def _stop(client: Victim, tally: Tally, why: str, **more: float) -> None:
     client.begin(turning=True)
-    client.ask(do="call", drive=0, verb="stop")
+    client.ask(do="call", drive=0, verb="stop", **more)
     client.asked_ns = client.hear("asked")["at"]
     said = client.hear("called")
     client.judge(tally, f"stop, {why} ({said['failure'] or 'done'})")
@@ -156,9 +165,8 @@ def _stop(client: Victim, tally: Tally, why: str) -> None:
 
 def paused(chance: random.Random, rounds: int, is_long: bool) -> Tally:
     """Ctrl-Z in the middle of a start, and on again after its time: what moves then was not asked for now."""
-    tally = Tally()
-    for at in range(rounds):
-        kind = list(KINDS)[at % len(KINDS)]
+    tally, kinds = Tally(), _in_turn(chance)
+    for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], sets=True) as client:
             client.begin(turning=False)
             client.hold(chance.randint(0, 3))
@@ -166,14 +174,14 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Tally:
             client.lines[0].held.wait(0.2)
             client.process.send_signal(signal.SIGSTOP)
             client.release()
-            time.sleep(EXPIRY + 0.3)
+            time.sleep(PAUSE)
             known = len(client.lines[0].log)
             client.process.send_signal(signal.SIGCONT)
             client.hear("called")
             tally.rounds += 1
             late = [it for it in client.lines[0].log[known:] if it.what == "moves"]
             tally.moved += len(late)
-            tally.stories += [f"start of {kind} after a pause of {EXPIRY + 0.3:.1f} s: {it}" for it in late]
+            tally.stories += [f"start of {kind} after a pause of {PAUSE:g} s: {it}" for it in late]
     return tally
 
 
@@ -186,7 +194,8 @@ ATTACKS: dict[str, tuple[Attack, float]] = {  # with the share of the rounds tha
     "a signal while it starts": (signal_during_start, 1.5),
     "start against stop": (race, 1),
     "a deaf line": (deaf, 0.5),
-    "two buses": (two_buses, 0.5),
+    "two buses": (two_lines(polls=False), 0.5),
+    "two lines of a poller": (two_lines(polls=True), 0.5),
     "looks that fail": (failing_looks, 0.5),
     "a pause while it starts": (paused, 1),
     "a cut network": (cut_networks, 0.5),

@@ -19,6 +19,8 @@ from own_fan import Fan
 from multidrop.bus import Bus
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
+from multidrop.plant import Line, Plant, Polled, PolledDrive
+from multidrop.poller import Poller
 
 FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
 
@@ -43,9 +45,9 @@ class Client:
         self.buses = buses
         self.drives = [drive for bus in buses for drive in bus.drives]
 
-    def call(self, drive: int, verb: str) -> None:
+    def call(self, drive: int, verb: str, **more: Any) -> None:
         tell("asked")
-        failure = told(getattr(self.drives[drive], verb))
+        failure = told(lambda: getattr(self.drives[drive], verb)(**more))
         tell("called", failure=failure)
 
     def stop_all(self) -> None:
@@ -77,13 +79,33 @@ def commands() -> Iterator[dict[str, Any]]:
         yield json.loads(line)
 
 
+def attached(stack: ExitStack, port: str, drives: Sequence[Drive]) -> Bus:
+    bus = stack.enter_context(Bus(port))
+    for drive in drives:
+        bus.attach(drive)
+    return bus
+
+
+def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Drive]]) -> list[Bus]:
+    """The buses of a poller, which reads two registers of each drive as fast as the lines allow."""
+    lines = []
+    for port, found in zip(ports, drives, strict=True):
+        asked = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings()[:2])) for it in found]
+        lines.append(Line(port, port, None, None, tuple(asked)))
+    return list(stack.enter_context(Poller(Plant(tuple(lines), Path("plant.toml")))).buses.values())
+
+
 def main() -> None:
     given = json.loads(sys.argv[1])
+    drives = [
+        [FAMILIES[kind](at, name=f"{kind}-{number}-{at}", **KINDS[kind].makes) for kind, at in found]
+        for number, found in enumerate(given["drives"])
+    ]
     with ExitStack() as stack:
-        buses = [stack.enter_context(Bus(port)) for port in given["ports"]]
-        for bus, drives in zip(buses, given["drives"], strict=True):
-            for kind, address in drives:
-                bus.attach(FAMILIES[kind](address, **KINDS[kind].makes))
+        if given["polls"]:
+            buses = polled(stack, given["ports"], drives)
+        else:
+            buses = [attached(stack, port, found) for port, found in zip(given["ports"], drives, strict=True)]
         if given["on_exit"]:
             for bus in buses:
                 bus.stop_on_exit()

@@ -136,6 +136,7 @@ def victim(
     *,
     on_exit: bool = False,
     sets: bool = False,
+    polls: bool = False,
     ramp: float = 0.0,
     far: FarEnd | None = None,
 ) -> Iterator[Victim]:
@@ -145,7 +146,7 @@ def victim(
         if far is None:
             lines = [FarLine([FarDrive(KINDS[kind], at, ramp) for kind, at in drives]) for drives in plant]
             far = FarEnd(lines, directory)
-        given = {"ports": far.ports, "drives": plant, "on_exit": on_exit, "sets": sets}
+        given = {"ports": far.ports, "drives": plant, "on_exit": on_exit, "sets": sets, "polls": polls}
         errors = directory / "errors"
         with (
             far,
