@@ -6,9 +6,17 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 
 from multidrop.core import Result
-from multidrop.drive import Drive, Read, Script, Step, Wait, carry_out
+from multidrop.drive import Drive, Read, Step, Wait, carry_out
 from multidrop.drives import MODELS
-from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Refused
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    DriveRefused,
+    LineError,
+    NoReply,
+    NotAttached,
+    Refused,
+)
 from multidrop.exchanges import READ_ATTEMPTS, Exchanges
 from multidrop.line import sleep
 
@@ -80,7 +88,7 @@ class Acquaintance:
         Another client that asks the same seems to be one: then the drive's confirmations of writes, which
         are copies too, would not count, until something is read.
         """
-        with suppress(NoReply, BadReply):
+        with suppress(NoReply, BadReply, LineError, NotAttached):
             self._read_something(drive, 1, insists=insists)
 
     # ---- before a stop ----
@@ -89,23 +97,25 @@ class Acquaintance:
         """Look, once and without waiting for anything; only what proves another family is Refused.
 
         The stop of one family may be another's run. But a look that fails proves nothing, nor does one that
-        may have been given the answer to an earlier question: the stop is sent then. A drive that answered
-        all that it was ever asked, and SURE times in a row as another would, is another.
+        may have been given the answer to an earlier question: the stop is sent then. It is withheld from a
+        drive that answered all that it was ever asked, and SURE times in a row as another would; where it
+        refuses to be asked, or its own answers prove little, only if another built-in family is recognised.
         """
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._glanced.get(drive, self) is port:
             return
         self._glanced[drive] = port
-        refusals: list[str] = []
-        while self._is_in_step(drive) and len(refusals) < SURE:
-            refusal = self._glanced_at(drive)
-            if refusal is None:
+        looks: list[tuple[str, bool]] = []
+        while len(looks) < SURE:
+            look = self._glanced_at(drive) if self._is_in_step(drive) else None
+            if look is None:
                 return
-            refusals.append(str(refusal))
-        is_sure = len(refusals) == SURE and len(set(refusals)) == 1 and self._is_in_step(drive)
-        if is_sure and not drive.identity_is_inferred:
+            looks.append(look)
+        (why, is_answered), other = looks[0], self._lookalike(drive)
+        is_proof = other is not None or (is_answered and not drive.identity_is_inferred)
+        if len(set(looks)) == 1 and is_proof and self._is_in_step(drive):
             del self._glanced[drive]  # it is looked at again before the next stop
-            raise self._withheld(drive, refusals[0], self._lookalike(drive))
+            raise self._withheld(drive, why, other)
 
     def _is_in_step(self, drive: Drive) -> bool:
         """Whether an answer from its address can only be the one to what is asked now."""
@@ -113,27 +123,29 @@ class Acquaintance:
         tally = respondent.tally()
         return not (tally.late or tally.ended[Result.NO_REPLY] or respondent.late_until_ns)
 
-    def _glanced_at(self, drive: Drive) -> Refused | None:
-        """Why it is not of its family, where each look was answered well."""
-        port, failed = self._exchanges.line.queue, False
+    def _glanced_at(self, drive: Drive) -> tuple[str, bool] | None:
+        """Why it is not of its family, and whether each look was answered; None where nothing says so."""
+        port, refused = self._exchanges.line.queue, None
 
         def look(step: Step) -> object:
-            nonlocal failed
+            nonlocal refused
             if isinstance(step, Wait):
                 return None  # a stop waits for nothing
             try:
                 return self._looked(drive, step, 1, insists=True)
-            except BusError:
-                failed = True
+            except DriveRefused as refusal:
+                refused = refusal
                 raise
 
         try:
             carry_out(drive.identify.script(), look)
             if not self._exchanges.is_heard(drive):
                 self._read_something(drive, 1, insists=True)
-        except Refused as refusal:
-            return None if failed else refusal
-        except Exception:  # of the family's own code: it must not keep a stop back
+        except (Refused, DriveRefused) as refusal:
+            if refused and drive.is_passing(refused.code):
+                return None
+            return str(refusal), refused is None
+        except Exception:  # it cannot be heard; or of the family's own code, which must not keep a stop back
             return None
         if self._is_in_step(drive):
             self._known[drive] = port
@@ -143,32 +155,29 @@ class Acquaintance:
         """A drive of the built-in family that would answer as this one does."""
         settings = drive.settings
         for family in MODELS.values():
-            try:
+            if isinstance(drive, family) or family.identity_is_inferred:
+                continue
+            with suppress(ValueError):  # it could not be on this line
                 other = family(
                     drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
                 )
-            except ValueError:  # it could not be on this line
-                continue
-            if not isinstance(drive, family) and self._is_one(drive, other):
-                return other
+                if all(self._is_one(drive, other) for _ in range(SURE)):
+                    return other
+            if not self._is_in_step(drive):
+                return None
         return None
 
     def _is_one(self, drive: Drive, other: Drive) -> bool:
-        looks = 0
-
         def look(step: Step) -> object:
-            nonlocal looks
-            looks += 1
             if not isinstance(step, Read):
-                raise Refused("not a look")
+                return None
             return self._exchanges.values_as(other, drive, step.register)[step.register.name]
 
-        script: Script[None] = other.identify.script()
         try:
-            carry_out(script, look)
+            carry_out(other.identify.script(), look)
         except (BusError, ValueError):
             return False
-        return looks > 0
+        return True
 
     @staticmethod
     def _withheld(drive: Drive, why: str, other: Drive | None) -> Refused:

@@ -206,9 +206,7 @@ class Drive:
     damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and those that say the drive will answer later
     broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
-    identity_is_inferred: ClassVar[bool] = (
-        False  # `identify` may refuse one of the family: it keeps no stop back
-    )
+    identity_is_inferred: ClassVar[bool] = False  # what `identify` refuses may be one of the family
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad

@@ -107,7 +107,11 @@ class Performer:
         with call.noted():
             call.check(f"the {call.verb}")
             self.introduce(call.drive, call)
-            return self.perform(script, call)
+            result = self.perform(script, call)
+            if not call.permit.is_good:
+                what = f"the {call.verb}"
+                raise self._unseen(call, Overtaken(call.drive.name, what, call.permit.latch.why))
+            return result
 
     def introduce(self, drive: Drive, call: Call | None = None) -> None:
         """Look whether it is of its family; the first look also logs what the drive's watchdog does."""
@@ -180,7 +184,7 @@ class Performer:
             reason = f"it was confirmed, but its effect could not be seen: {why}"
         else:
             reason = f"it was sent, and its effect could not be seen: {why}"
-        return Unconfirmed(call.drive.name, call.sent, reason)
+        return Unconfirmed(call.drive.name, call.sent or f"the {call.verb}", reason)
 
     def _do(self, step: Step, call: Call) -> Any:
         drive = call.drive

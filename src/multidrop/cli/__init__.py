@@ -80,8 +80,8 @@ def _guarded(command: str, words: list[str]) -> int:
         status = _run(command, words)
         if sys.stdout is not None:  # as it is where the caller has closed it
             sys.stdout.flush()
-    except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as interruption:  # its notes say what was sent
+        return _say("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
     except BrokenPipeError:  # whoever reads our output has seen enough
         _abandon_output()
         return DONE

@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from multidrop.bus import Bus
 from multidrop.cli.consent import ask
-from multidrop.cli.target import add_json_argument, add_target_arguments, add_writing_arguments, drive_of
+from multidrop.cli.target import (
+    add_json_argument,
+    add_target_arguments,
+    add_writing_arguments,
+    drive_of,
+    duration,
+)
 from multidrop.cli.values import as_json, taken
 from multidrop.drive import Direction, Drive, Script, State, Write
 from multidrop.errors import Unsupported
 from multidrop.register import Register
 
 _DIRECTED = ("start", "jog")
+_STOPS = ("stop", "coast", "emergency-stop")
 _WATCHED = ("state", *_DIRECTED)  # it is told what becomes of the motor when the client dies
 _ASKED = {  # before they are sent; a stop is never asked for
     "start": "Start the motor of",
@@ -35,6 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument("frequency", metavar="HZ", type=float, help="the setpoint in Hz")
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
+    if command in _STOPS:
+        parser.add_argument(
+            "--seconds",
+            metavar="S",
+            type=duration,
+            help="repeat it for so long until the motor stands; for 30 s at least if not given",
+        )
     if command != "state":
         add_writing_arguments(parser)
     add_json_argument(parser)
@@ -49,11 +66,13 @@ def run(arguments: argparse.Namespace) -> int:
     setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _ASKED:
         ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
-    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus:
+    limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
+    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus, _told(arguments) as known:
         bus.attach(drive)
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
-        state = verb(*given)
+        state = verb(*given, **limit)
+        known.append(f"{drive.name}: {arguments.command} is done")
         watchdog = bus.watchdog(drive) if arguments.command in _WATCHED else ""
         if not isinstance(state, State):
             try:
@@ -73,6 +92,29 @@ def run(arguments: argparse.Namespace) -> int:
         told = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
         print(told + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
+
+
+@contextmanager
+def _told(arguments: argparse.Namespace) -> Iterator[list[str]]:
+    """Add to an interruption what is known, and what stops the motor, for whoever is to type it."""
+    known: list[str] = []
+    try:
+        yield known
+    except KeyboardInterrupt as interruption:
+        for text in known:
+            interruption.add_note(text)
+        if arguments.command != "state":
+            interruption.add_note(f"to stop it, type: {_stop_line(arguments)}")
+        raise
+
+
+def _stop_line(arguments: argparse.Namespace) -> str:
+    words = ["multidrop", "stop", arguments.port, arguments.model, str(arguments.address)]
+    for name in ("baudrate", "format", "framing"):
+        if getattr(arguments, name) is not None:
+            words += [f"--{name}", str(getattr(arguments, name))]
+    words += [f"--option={name}={value:g}" for name, value in arguments.option]
+    return shlex.join(words)
 
 
 class _Setpoint(NamedTuple):
