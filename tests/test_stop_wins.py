@@ -91,6 +91,7 @@ class Stops(RuleBasedStateMachine):
 
     def _open(self) -> None:
         """A client anew, that has written its setpoints, and a mark on the wire."""
+        self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
         self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.far_drives]
         if self.polling:
@@ -248,6 +249,7 @@ class Stops(RuleBasedStateMachine):
     def start(self, number: int) -> None:
         """After a stop a motor can be started again."""
         self.line.troubles.clear()
+        self.far_drives[number].runs = False
         self.drives[number].start()
         assert self.far_drives[number].runs
 
