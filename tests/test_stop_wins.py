@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -39,6 +40,7 @@ from multidrop.bus import Bus
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.errors import BusError
+from multidrop.motion import start_staggered
 from multidrop.poller import Poller
 
 EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "3"))
@@ -113,14 +115,16 @@ class Stops(RuleBasedStateMachine):
                 drive.set_frequency(20)
         self._mark()
 
-    def _mark(self) -> None:
+    def _mark(self, drive: Drive | None = None) -> None:
         """An episode begins: a read is on the wire behind all that was sent before."""
+        drive = drive or self.drives[0]
         self.line.troubles.clear()
         begun = len(self.line.log)
         with suppress(BusError):
-            self.bus.read(self.drives[0], self.drives[0].register(KINDS[self.kind].mark))
+            self.bus.read(drive, drive.register(KINDS[self.kind].mark))
         assert len(self.line.log) > begun
         self.begun = len(self.line.log)
+        self.staggered = False
         self.connection = self.line.connection
 
     def _close(self) -> None:
@@ -133,17 +137,24 @@ class Stops(RuleBasedStateMachine):
         """With the next requests."""
         self.line.troubles[:] = troubles
 
-    @precondition(lambda self: len(self.threads) < 3)
+    @precondition(lambda self: len(self.threads) < 3 and not self.staggered)
     @rule(
         number=st.integers(0, DRIVES - 1),
-        name=st.sampled_from(["start", "start", "jog"]),
+        name=st.sampled_from(["start", "start", "jog", "staggered"]),
         after=st.integers(0, 12),
     )
     def start_and_hold(self, number: int, name: str, after: int) -> None:
-        """A thread starts a motor; from some request on nothing is answered until a stop is called."""
-        drive = self.drives[number]
+        """A thread starts a motor; from some request on nothing is answered until a stop is called.
+
+        A staggered start that fails is a stop too, after which nothing is started in this episode.
+        """
+        self.staggered = name == "staggered"
         self.line.hold(after)
-        thread = self._thread(getattr(drive, name))
+        thread = self._thread(
+            (lambda: start_staggered(self.drives, 0.05))
+            if self.staggered
+            else getattr(self.drives[number], name)
+        )
         while thread.is_alive() and not self.line.held.wait(0.01):
             pass
 
@@ -225,6 +236,31 @@ class Stops(RuleBasedStateMachine):
         return True
 
     @precondition(lambda self: self.threads)
+    @rule(detaches=st.booleans())
+    def part(self, detaches: bool) -> None:
+        """Close the bus, or take the first drive off: what began to move it writes nothing after that."""
+        releasing = threading.Thread(target=self._release)
+        releasing.start()
+        if detaches and self.poller:
+            self.poller.remove("line", self.drives[0].name)
+        elif detaches:
+            self.bus.detach(self.drives[0])
+        else:
+            self._close()
+            self._open()
+        self._mark(self.drives[1])
+        for thread in (releasing, *self.threads):
+            thread.join()
+        self.threads.clear()
+        begun = self.begun
+        self._mark(self.drives[1])
+        late = [at for at in self._heard("moves", 1 if detaches else None, begun) if at < self.begun]
+        assert [str(self.line.log[at]) for at in late] == [], self._story()
+        if detaches:
+            self._close()
+            self._open()
+
+    @precondition(lambda self: self.threads)
     @rule()
     def lose_the_port(self) -> None:
         """Pull the adapter out and plug it in again: nothing that was under way comes then."""
@@ -248,8 +284,9 @@ class Stops(RuleBasedStateMachine):
     @rule(number=st.integers(0, DRIVES - 1))
     def start(self, number: int) -> None:
         """After a stop a motor can be started again."""
+        if self.far_drives[number].runs:
+            return
         self.line.troubles.clear()
-        self.far_drives[number].runs = False
         self.drives[number].start()
         assert self.far_drives[number].runs
 
@@ -271,12 +308,13 @@ class Stops(RuleBasedStateMachine):
             self.threads.append(thread)
         return thread
 
-    def _heard(self, what: str, address: int | None = None) -> list[int]:
-        """Where in the log there are such frames of this episode."""
+    def _heard(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
+        """Where in the log there are such frames of this episode, or from `begun` on."""
+        begun = self.begun if begun is None else begun
         return [
             at
             for at, it in enumerate(list(self.line.log))
-            if at >= self.begun
+            if at >= begun
             and it.what == what
             and it.asked is not None
             and (address is None or it.asked.address in (0, address))
@@ -306,6 +344,9 @@ class Stops(RuleBasedStateMachine):
     def teardown(self) -> None:
         if not hasattr(self, "_stack"):
             return
+        failure = sys.exc_info()[1]
+        if isinstance(failure, Exception):  # it may not come again, and then nobody else tells of it
+            print(f"{type(failure).__name__}: {failure}\n{self._story()}\n")
         self.line.troubles.clear()
         self.far.release(self.line)
         with suppress(AttributeError, Signalled):
