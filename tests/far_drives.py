@@ -40,6 +40,7 @@ class Kind:
     makes: Mapping[str, Any] = field(default_factory=dict)  # options that its class needs
     halts: tuple[str, ...] = ("stop",)
     own_address: int | None = None  # where it holds its address
+    live: int = 3  # the function that reads what `turning` has
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
@@ -68,6 +69,7 @@ KINDS = {
             {0x0401: 1, 1: 200, 3: 15},
             "braking_threshold",
             halts=("stop", "emergency_stop"),
+            live=4,
         ),
         Kind(
             "invt-che",
@@ -162,8 +164,9 @@ class FarDrive:
         """Keep this value where it is read, whatever the family has there."""
         self._memory[address] = value
 
-    def word(self, address: int) -> int:
-        turning = self.kind.turning.get(address) if self.turns else None
+    def word(self, address: int, function: int) -> int:
+        is_live = self.turns and function in (self.kind.live, 7)
+        turning = self.kind.turning.get(address) if is_live else None
         return self._memory.get(address, 0) if turning is None else turning
 
     def state(self) -> int:

@@ -78,7 +78,7 @@ def reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int = 0) -> by
     if exception:
         body = f"{head}{asked.function | 0x80:02X}{exception:02X}"
     elif asked.function in READS:
-        words = "".join(f"{drive.word(asked.start + at):04X}" for at in range(asked.value))
+        words = "".join(f"{drive.word(asked.start + at, asked.function):04X}" for at in range(asked.value))
         body = f"{head}{asked.function:02X}{2 * asked.value:02X}{words}"
     elif asked.function in (15, 16):
         body = f"{head}{asked.function:02X}{asked.start:04X}0001"
@@ -94,7 +94,7 @@ def _delixi_reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int) -
     if asked.function == 3:
         return checksums.delixi(f"{head}03{drive.state():04X}00000000")
     if asked.function == 7:
-        return checksums.delixi(f"{head}07{asked.start:04X}{drive.word(asked.start):08X}")
+        return checksums.delixi(f"{head}07{asked.start:04X}{drive.word(asked.start, 7):08X}")
     return frame
 
 
