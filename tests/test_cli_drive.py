@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from lines import Faulty
+from motors import Heard
 from test_cli import TOY, Run, run
 from toy import Status, Toy
 
+from multidrop.core import Message
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
-from multidrop.sim import simulated
+from multidrop.sim import PoweredDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import Cell
 from multidrop.sim.simulator import Simulator
@@ -327,3 +331,62 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
         assert other.stdout.readline() == b"held\n"
         assert run("read", port, TOY, 1) == (1, "", f"multidrop: {port}: it is in use by another program\n")
         other.communicate()
+
+
+# ---- interruptions ----
+
+
+@pytest.fixture
+def che() -> Iterator[tuple[Heard, list[object]]]:
+    """What a CHE hears, and the words that name it."""
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        yield Heard(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
+
+
+def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
+    """Ctrl-C, at the first request of this kind, whose reply is not lost."""
+    pressed: list[Message] = []
+
+    def loses(request: Message) -> bool:
+        if when(request) and not pressed:
+            pressed.append(request)
+            os.kill(os.getpid(), signal.SIGINT)
+        return False
+
+    return loses
+
+
+def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
+    run: Run, che: tuple[Heard, list[object]]
+) -> None:
+    heard, words = che
+    heard.loses = pressing(lambda request: request in heard.starts)
+    status, _, err = run("start", *words, "--frequency", 20, "--yes")
+    assert status == 130
+    assert len(heard.starts) == 1
+    assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
+    assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
+
+
+def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard, list[object]]) -> None:
+    heard, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(heard.writes)
+    heard.loses = pressing(lambda request: request.start == 0x1000)
+    status, _, err = run("stop", *words)
+    assert status == 130
+    assert [it.data for it in heard.writes[begun:]] == [b"\0\5"] * 2
+    assert "the stop was sent" in err
+    assert "multidrop: to stop it, type: multidrop stop " in err
+
+
+def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: tuple[Heard, list[object]]) -> None:
+    heard, words = che
+    heard.loses = lambda request: True
+    status, _, err = run("stop", *words, "--seconds", 1)
+    assert status == 1
+    assert "it was never confirmed" in err
+    assert {it.data for it in heard.writes} == {b"\0\5"}

@@ -21,6 +21,7 @@ from multidrop.forks import tell_of_forks
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
+HANDLING_S = 0.05  # after which a signal is handled at the latest
 CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
 
 
@@ -51,7 +52,8 @@ class LastAct:
     def finish(self) -> None:
         """Have it done, and wait until it is."""
         self.begin()
-        self._over.wait()
+        while not self._over.wait(HANDLING_S):  # a signal that another thread was given is handled here
+            pass
 
     def forget(self) -> None:
         """In the child of a fork it is its parent's business."""

@@ -198,8 +198,8 @@ class Performer:
             return self._writer.insist(drive, step).value
         return self._writer.put(drive, step, call).value
 
-    def _read(self, drive: Drive, step: Read) -> Any:
-        return self._exchanges.values(drive, [step.register], READ_ATTEMPTS)[step.register.name]
+    def _read(self, drive: Drive, step: Read, attempts: int = READ_ATTEMPTS) -> Any:
+        return self._exchanges.values(drive, [step.register], attempts)[step.register.name]
 
     # ---- what stops ----
 
@@ -272,7 +272,7 @@ class Performer:
             self._writer.count()
 
     def _do_stop(self, drive: Drive, step: Step) -> Any:
-        if isinstance(step, Read):
-            return self._read(drive, step)
+        if isinstance(step, Read):  # asked once: what is not answered has the stop sent again
+            return self._read(drive, step, 1)
         assert isinstance(step, Write)
         return self._writer.insist(drive, step).value
