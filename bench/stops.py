@@ -101,7 +101,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Tally:
                 client.release()
                 said = client.hear("called")
                 client.judge(tally, f"start against {stop} ({said['failure'] or 'done'})")
-                client.lines[0].drives[1].runs = False
+                client.lines[0].drives[1].switch_on()
     return tally
 
 

@@ -145,15 +145,20 @@ class FarDrive:
         self.address = address
         self.ramp = ramp
         self.runs = False  # as it was commanded last
-        self._memory = dict(kind.memory)
-        if kind.own_address is not None:
-            self._memory[kind.own_address] = address
         self._stands_at = 0.0
-        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's
+        self.switch_on()
 
     @property
     def turns(self) -> bool:
         return self.runs or time.monotonic() < self._stands_at
+
+    def switch_on(self) -> None:
+        """As after its power was off: the motor stands, and all is as from the factory."""
+        self.runs = False
+        self._memory = dict(self.kind.memory)
+        if self.kind.own_address is not None:
+            self._memory[self.kind.own_address] = self.address
+        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's
 
     def turn(self) -> None:
         """As if somebody had started it by hand."""

@@ -247,6 +247,7 @@ class Stops(RuleBasedStateMachine):
             self.bus.detach(self.drives[0])
         else:
             self._close()
+            releasing.join()  # no client can tell an answer to the one before it
             self._open()
         self._mark(self.drives[1])
         for thread in (releasing, *self.threads):
@@ -260,7 +261,7 @@ class Stops(RuleBasedStateMachine):
             self._close()
             self._open()
 
-    @precondition(lambda self: self.threads)
+    @precondition(lambda self: self.threads and not self.staggered)
     @rule()
     def lose_the_port(self) -> None:
         """Pull the adapter out and plug it in again: nothing that was under way comes then."""
@@ -276,8 +277,8 @@ class Stops(RuleBasedStateMachine):
         back = [it for it in self.line.log if it.connection == self.line.connection]
         assert [str(it) for it in back if it.what == "moves"] == []
         assert failures or not self.far_drives[0].runs
-        for drive in self.far_drives:  # by hand: there was no way to stop them
-            drive.runs = False
+        for drive in self.far_drives:  # there may have been no way to stop them
+            drive.switch_on()
         self._open()
 
     @precondition(lambda self: not self.threads and not self.polling)
