@@ -91,7 +91,7 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
     now = 1000.0
     monkeypatch.setattr("multidrop.exit_hook.time.monotonic", lambda: now)
     hook, act = ExitHook(), Act()
-    hook.add(act.begin, act.work)
+    made = hook.add(act.begin, act.work)
     for _ in range(5):  # slowly, as many as one likes
         signal.raise_signal(signal.SIGINT)
         now += 0.7
@@ -102,6 +102,7 @@ def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
         now += 0.1
         assert len(caught) == count
     assert capfd.readouterr().err.encode() == CUT_SHORT
+    hook.finish(made)  # nobody waits for it
     act.go_on.set()
     until(lambda: not threading_names() & {"multidrop exit"})
     assert len(caught) == 1
@@ -181,6 +182,24 @@ def client(how: str, ports: list[str]) -> Iterator[subprocess.Popen[str]]:
 def stops(heard: list[Heard]) -> int:
     broadcast = max(sum(it.address == 0 for it in one.requests) for one in heard)
     return broadcast + sum(it.data[-1] == 5 for one in heard for it in one.writes if it.start == 0x1000)
+
+
+def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
+    with lines(1) as (heard, ports), client("wait", ports) as process:
+        for it in heard[0]:
+            it.loses = lambda request: True
+        process.send_signal(signal.SIGINT)
+        until(lambda: stops(heard[0]))
+        for _ in range(20):  # two that come at once are one
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(0.1)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+        _, told = process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
+        assert CUT_SHORT.decode() in told
 
 
 @BOTH

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import pytest
@@ -729,6 +730,17 @@ def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     hall = Hall(monkeypatch)
     together = threading.Barrier(8)
+    add, inside, most = hall.bus._exchanges.add, set[str](), 0
+
+    def slow(drive: Drive) -> None:
+        nonlocal most
+        inside.add(drive.name)
+        most = max(most, len(inside))
+        sleep(0.001)  # the others may go on meanwhile
+        inside.discard(drive.name)
+        add(drive)
+
+    monkeypatch.setattr(hall.bus._exchanges, "add", slow)
     outcomes: list[str] = []
 
     def attach(address: int) -> None:
@@ -750,6 +762,7 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert sorted(drive.address for drive in hall.bus.drives) == [1, 2, 3, 4]
         for drive in hall.bus.drives:
             hall.bus.detach(drive)
+    assert most == 1
 
 
 def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -760,3 +773,16 @@ def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: py
     with pytest.raises(NoReply):
         drive.start()
     assert first(hall, 0, STARTS["invt-che"]) is None
+
+
+def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each stop was sent before the first record is written."""
+    hall = Hall(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    for address in (1, 2):
+        hall.attach(InvtCHE(address))
+    stopped: list[int] = []
+    audit = hall.bus._writer.audit
+    assert audit is not None
+    monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(hall))))
+    hall.bus.stop_all()
+    assert stopped == [2, 2]

@@ -113,7 +113,7 @@ class Acquaintance:
             looks.append(look)
         (why, is_answered), other = looks[0], self._lookalike(drive)
         is_proof = other is not None or (is_answered and not drive.identity_is_inferred)
-        if len(set(looks)) == 1 and is_proof and self._is_in_step(drive):
+        if len(set(looks)) == 1 and is_proof:
             del self._glanced[drive]  # it is looked at again before the next stop
             raise self._withheld(drive, why, other)
 

@@ -156,7 +156,8 @@ class Bus:
         self.leave()
         if self._last_act is not None:
             exit_hook().finish(self._last_act)
-        self._performer.await_stops()
+        if self._last_act is None or not self._last_act.is_cut_short:
+            self._performer.await_stops()
 
     def close(self) -> None:
         """Leave the line and close the port. What was sent and is not answered yet is Unconfirmed."""
@@ -198,7 +199,7 @@ class Bus:
             _claims.claim(made, self)
             made.perform = lambda script: self.perform(made, script)
             made.introduce = lambda: self.introduce(made)
-            made.begin = lambda verb: self._performer.call(made, verb)
+            made.begin_call = lambda verb: self._performer.call(made, verb)
             made.carry_out_move = self._performer.move
             made.carry_out_stop = lambda verb, script, seconds: self._performer.stop(made, script, seconds)
             self._exchanges.add(made)
@@ -259,7 +260,7 @@ class Bus:
             try:
                 return self._writer.insist(drive, step)
             finally:
-                self._writer.count()
+                self._writer.catch_up()
         call = self._performer.call(drive)
         with call.noted():
             call.check(f"{register.name} = {register.format(value)}")
@@ -313,7 +314,10 @@ class Bus:
             self.introduce(it)
         if is_harmless(register, raw):
             self._performer.rise(self.drives)
-        self._writer.broadcast(drive, register, raw)
+        try:
+            self._writer.broadcast(drive, register, raw)
+        finally:
+            self._writer.catch_up()
         return {it.name: self._look(it) for it in self.drives}
 
     def _look(self, drive: Drive) -> State | BusError:

@@ -120,7 +120,7 @@ class _BoundVerb(Generic[P, R]):
             )
         script = self.script(*args, **kwargs)
         if self.name in MOVING:
-            return cast(R, self.drive.carry_out_move(script, self.drive.begin(self.name)))
+            return cast(R, self.drive.carry_out_move(script, self.drive.begin_call(self.name)))
         return cast(R, self.drive.perform(script))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
@@ -255,7 +255,9 @@ class Drive:
         self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.introduce: Callable[[], None] = lambda: None  # a bus looks at it
-        self.begin: Callable[[str], Any] = lambda verb: None  # what keeps it from being sent after a stop
+        self.begin_call: Callable[[str], Any] = lambda verb: (
+            None
+        )  # what keeps it from being sent after a stop
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
             lambda verb, make, seconds: self.perform(make())

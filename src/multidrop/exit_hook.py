@@ -38,11 +38,12 @@ class LastAct:
             SimpleQueue()
         )  # unlike an Event, it may be put to by a signal handler
         self._over = threading.Event()
+        self.is_cut_short = False  # nobody waits for it any more
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
 
     @property
     def is_over(self) -> bool:
-        return self._over.is_set()
+        return self.is_cut_short or self._over.is_set()
 
     def begin(self) -> None:
         """Have it done, without waiting for that."""
@@ -52,13 +53,13 @@ class LastAct:
     def finish(self) -> None:
         """Have it done, and wait until it is."""
         self.begin()
-        while not self._over.wait(HANDLING_S):  # a signal that another thread was given is handled here
-            pass
+        while not self.is_over:  # a signal that another thread was given is handled here
+            self._over.wait(HANDLING_S)
 
     def forget(self) -> None:
         """In the child of a fork it is its parent's business."""
         self._over = threading.Event()
-        self._over.set()
+        self.is_cut_short = True
 
     def _run(self) -> None:
         self._calls.get()
@@ -131,6 +132,8 @@ class ExitHook:
             self._pass_on(number)
         elif len(self._came) >= IMPATIENT:
             os.write(2, CUT_SHORT)
+            for act in self._acts:
+                act.is_cut_short = True
             self._pass_on(number)
 
     def _one_is_over(self) -> None:

@@ -19,7 +19,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     At the first that fails the ones already started are stopped, and so is that one; its failure is
     raised. None is started once its stop was called, on any thread, since this was.
     """
-    calls = [drive.begin("start") for drive in drives]
+    calls = [drive.begin_call("start") for drive in drives]
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
             if number:

@@ -161,6 +161,8 @@ class Performer:
             if not call.sent or why not in unseen:
                 raise why from None if why is failure else failure
             raise self._unseen(call, why) from why
+        finally:
+            self._writer.catch_up()
 
     @staticmethod
     def _check(step: Step, call: Call, overtaken: list[Overtaken]) -> None:
@@ -269,7 +271,7 @@ class Performer:
             with self._over:
                 self._stops -= 1
                 self._over.notify_all()
-            self._writer.count()
+            self._writer.catch_up()
 
     def _do_stop(self, drive: Drive, step: Step) -> Any:
         if isinstance(step, Read):  # asked once: what is not answered has the stop sent again

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 from multidrop.acquaintance import Acquaintance
@@ -44,7 +45,8 @@ class Writer:
         self.audit = audit
         self._exchanges = exchanges
         self._ledger = ledger
-        self._uncounted: list[Cell] = []
+        self._uncounted: deque[Cell] = deque()  # of what was insisted on
+        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
         """Write once by all rules but that for plain writes; what became of it.
@@ -70,8 +72,8 @@ class Writer:
     def insist(self, drive: Drive, step: Write) -> Outcome:
         """Write what stops the motor, or does no harm at any time: the port alone keeps it back.
 
-        Neither a rule nor the ledger is asked: where it may wear an EEPROM it is counted afterwards, by
-        `count`. Only what proves another family at the address is Refused.
+        Neither a rule nor the ledger is asked. It is noted in the log, and counted where it may wear an
+        EEPROM, afterwards, by `catch_up`: a disk may hang. Only what proves another family is Refused.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -83,20 +85,27 @@ class Writer:
             if kept is not Kept.RAM:
                 self._uncounted.append(self._cell(drive, register))
 
-    def count(self) -> None:
-        """Count in the ledger what was insisted on; that it cannot be is a warning."""
-        while self._uncounted:
-            cell = self._uncounted.pop()
-            try:
-                self._ledger.note(cell, utc_ns() / 1e9)
-            except OSError as failure:
-                logging.getLogger("multidrop").warning("a stop was not counted: %s", failure)
+    def catch_up(self) -> None:
+        """Log and count what was insisted on; that it cannot be is a warning."""
+        with suppress(IndexError):  # another thread may be at it
+            while True:
+                self._write(*self._unlogged.popleft())
+        with suppress(IndexError):
+            while True:
+                self._count(self._uncounted.popleft())
+
+    def _count(self, cell: Cell) -> None:
+        try:
+            self._ledger.note(cell, utc_ns() / 1e9)
+        except OSError as failure:
+            logging.getLogger("multidrop").warning("a stop was not counted: %s", failure)
 
     def _sent(self, drive: Drive, register: Register[Any], raw: int, call: Call | None) -> Outcome:
         """Send it once: for its call, or else insisting."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _what(register, asked)
-        with self._noted(drive, request, what):
+        log = self.log if call else self._log_later
+        with self._noted(drive, request, what, log):
             completion = self._carried_out(drive, request, what, call)
             outcome = self._outcome(drive, register, asked, completion, call)
             if (
@@ -107,7 +116,7 @@ class Writer:
         if call:
             call.is_confirmed = outcome.effect is not Effect.UNCONFIRMED
         why = "" if outcome.failure is None else str(outcome.failure)
-        self.log(drive, request, what, outcome.effect, why, outcome.held)
+        log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
 
     def _carried_out(self, drive: Drive, request: Message, what: str, call: Call | None) -> Completion:
@@ -189,9 +198,14 @@ class Writer:
     def log(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Note a write in the audit log; that it cannot be kept must not stop a stop."""
-        audit = self.audit
-        if audit is None:
+        """Note a write in the audit log; that it cannot be kept is a warning."""
+        self._log_later(drive, request, what, effect, why, held)
+        self.catch_up()
+
+    def _log_later(
+        self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
+    ) -> None:
+        if self.audit is None:
             return
         frame = build_request(drive.framing, request)
         record = {
@@ -204,25 +218,33 @@ class Writer:
             "outcome": effect.value,
         }
         more = {"held": None if held is None else float(held), "why": why}
+        record |= {key: text for key, text in more.items() if text not in (None, "")}
+        self._unlogged.append((utc_ns(), record))
+
+    def _write(self, at_ns: int, record: dict[str, Any]) -> None:
+        audit = self.audit
+        if audit is None:
+            return
         try:
-            audit.add(utc_ns(), record | {key: it for key, it in more.items() if it not in (None, "")})
+            audit.add(at_ns, record)
         except (OSError, ValueError) as failure:  # it may be closed meanwhile
             logging.getLogger("multidrop").warning("the audit log cannot be written: %s", failure)
 
     @contextmanager
-    def _noted(self, drive: Drive, request: Message, what: str) -> Iterator[None]:
+    def _noted(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:
         """Note the write too when its outcome never comes: the port failed, or somebody pressed Ctrl-C."""
         try:
             yield
         except (Expired, Overtaken, NotAttached):  # it was not sent
             raise
         except BaseException as failure:
-            self.log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
+            log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
             if isinstance(failure, LineError) and failure.is_sent:
                 raise Unconfirmed(drive.name, what, failure.reason) from failure
             raise
 
     def close(self) -> None:
+        self.catch_up()
         if self.audit is not None:
             self.audit.close()
             self.audit = None
@@ -230,7 +252,7 @@ class Writer:
     def raw(self, drive: Drive, request: Message, call: Call) -> bytes:
         """Send any request once, past every rule but its call's; the data of the reply."""
         what = f"raw request {build_request(drive.framing, request).hex(' ').upper()}"
-        with self._noted(drive, request, what):
+        with self._noted(drive, request, what, self.log):
             completion = self._carried_out(drive, request, what, call)
         try:
             reply = self._exchanges.reply(drive, completion)
@@ -247,9 +269,9 @@ class Writer:
         """Write to all drives at once, by the table of one of them."""
         request = write_request(drive, register, raw, address=0)
         what = f"{register.name} = {register.format(register.decode(raw))}"
-        with self._noted(drive, request, what):
+        with self._noted(drive, request, what, self._log_later):
             self._exchanges.carry_out(drive, request, insists=True)
-        self.log(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
+        self._log_later(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
 
 
 def _what(register: Register[Any], value: Any) -> str:
