@@ -371,3 +371,16 @@ def test_nothing_moves_after_a_stop(kind: str) -> None:
             suppress_health_check=list(HealthCheck),
         ),
     )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
+    """At each of its first exchanges: the machine's own steps, but none left to chance."""
+    machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
+    machine.begin(polling=False, on_exit=False)
+    try:
+        for after in range(6):
+            machine.start_and_hold(number=0, name="start", after=after)
+            machine.stop(how="verb", verbs=[(0, 0)], signals=[])
+    finally:
+        machine.teardown()
