@@ -1,0 +1,193 @@
+"""Drives for a far end that knows nothing of the library: what they hold, and which writes move their motors.
+
+Typed from the documents. A write that takes a stop back is counted among those that move a motor.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+STANDARD, DELIXI = "standard", "Delixi's own"
+COIL_ON = 0xFF00
+
+
+class Asked(NamedTuple):
+    """One request: `value` is a read's count, or what a write writes."""
+
+    address: int
+    function: int
+    start: int
+    value: int
+
+
+Judge = Callable[[Asked], bool]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A family: its memory at rest, what is read while the motor turns, and its writes that matter."""
+
+    name: str
+    moves: Judge
+    stops: Judge
+    memory: Mapping[int, int]  # by register; the same for all functions that read
+    turning: Mapping[int, int]  # instead, while the motor turns
+    mark: str  # a register that no verb reads
+    protocol: str = STANDARD
+    makes: Mapping[str, Any] = field(default_factory=dict)  # options that its class needs
+    halts: tuple[str, ...] = ("stop",)
+    own_address: int | None = None  # where it holds its address
+    live: int = 3  # the function that reads what `turning` has
+
+
+def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
+    return lambda it: (it.function, it.start) == (function, start) and judge(it.value)
+
+
+def _erman_moves(it: Asked) -> bool:
+    """START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
+    start = (it.start, it.value) == (0, COIL_ON)
+    return it.function == 15 or (it.function == 5 and (start or (it.start in (1, 2) and it.value == 0)))
+
+
+def _erman_stops(it: Asked) -> bool:
+    off = (it.start, it.value) == (0, 0)
+    return it.function == 5 and (off or (it.start in (1, 2) and it.value == COIL_ON))
+
+
+KINDS = {
+    it.name: it
+    for it in (
+        Kind(
+            "erman-er-g-220",
+            _erman_moves,
+            _erman_stops,
+            {2: 200, 3: 500, 4: 0, 0x0C: 10, 0x0D: 1},  # of functions 03 and 04; no address has both
+            {0x0401: 1, 1: 200, 3: 15},
+            "braking_threshold",
+            halts=("stop", "emergency_stop"),
+            live=4,
+        ),
+        Kind(
+            "invt-che",
+            _writes(6, 0x1000, lambda value: value in (1, 2, 3, 4)),
+            _writes(6, 0x1000, lambda value: value in (5, 6)),
+            {0x1001: 3, 0x2000: 4000, 0x3016: 0x0101},
+            {0x1001: 1, 0x3000: 2000},
+            "counter",
+            makes={"maximum_frequency": 50, "stop_time": 2},
+            halts=("stop", "coast"),
+        ),
+        Kind(
+            "innovert-ibd",
+            _writes(6, 0x2000, lambda value: bool(value & 2)),
+            _writes(6, 0x2000, lambda value: value & 3 == 1),
+            {22: 0x1800, 101: 5, 102: 2, 108: 1, 323: 1, 324: 7, 325: 8, 328: 3, 700: 1},
+            {22: 0x1900, 3: 15, 4: 600},
+            "stored_frequency",
+            own_address=702,
+        ),
+        Kind(
+            "delixi-modbus",
+            _writes(6, 0x2000, lambda value: bool(value & 2)),
+            _writes(6, 0x2000, lambda value: value & 3 == 1),
+            {0: 2, 1: 1, 2: 2000, 428: 3},
+            {500: 2000},
+            "counter",
+            makes={"framing": "rtu", "stop_time": 2},
+            own_address=430,
+        ),
+        Kind(
+            "delixi-native",
+            lambda it: it.function == 2 and it.start in (2, 3),
+            lambda it: it.function == 2 and it.start == 1,
+            {0: 2, 1: 1, 2: 2000, 428: 3},
+            {500: 2000},
+            "counter",
+            DELIXI,
+            makes={"stop_time": 2},
+            own_address=430,
+        ),
+        Kind(
+            "yd1000",
+            _writes(6, 0x1000, lambda value: bool(value & 0x0500) or not value & 0x8000),
+            _writes(6, 0x1000, lambda value: value & 0x8500 == 0x8000),
+            {0x0010: 1, 0x0011: 8000, 0x1001: 2000},
+            {0x1100: 2000, 0x1201: 0x0400},
+            "run_hours",
+            makes={"stop_time": 2},
+            halts=("stop", "coast", "emergency_stop"),
+            own_address=0x0802,
+        ),
+        Kind(
+            "fan",  # a user's own: its declaration is in the test
+            _writes(6, 0x0030, lambda value: value == 1),
+            _writes(6, 0x0030, lambda value: value == 0),
+            {},
+            {0x0010: 900},
+            "current",
+        ),
+    )
+}
+
+
+class FarDrive:
+    """One drive: what it holds, and whether its motor turns.
+
+    `ramp` is how many seconds the motor takes to stand after a stop.
+    """
+
+    def __init__(self, kind: Kind, address: int, ramp: float = 0.0) -> None:
+        self.kind = kind
+        self.address = address
+        self.ramp = ramp
+        self.runs = False  # as it was commanded last
+        self._stands_at = 0.0
+        self.switch_on()
+
+    @property
+    def turns(self) -> bool:
+        return self.runs or time.monotonic() < self._stands_at
+
+    def switch_on(self) -> None:
+        """As after its power was off: the motor stands, and all is as from the factory."""
+        self.runs = False
+        self._memory = dict(self.kind.memory)
+        if self.kind.own_address is not None:
+            self._memory[self.kind.own_address] = self.address
+        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's
+
+    def turn(self) -> None:
+        """As if somebody had started it by hand."""
+        self.runs = True
+        self._coils[0] = COIL_ON
+
+    def hold(self, address: int, value: int) -> None:
+        """Keep this value where it is read, whatever the family has there."""
+        self._memory[address] = value
+
+    def word(self, address: int, function: int) -> int:
+        is_live = self.turns and function in (self.kind.live, 7)
+        turning = self.kind.turning.get(address) if is_live else None
+        return self._memory.get(address, 0) if turning is None else turning
+
+    def state(self) -> int:
+        """What function 03 of Delixi's own protocol says."""
+        return 2 if self.turns else 1
+
+    def write(self, asked: Asked) -> None:
+        before = self.runs
+        if asked.function == 5:
+            self._coils[asked.start] = asked.value
+            self.runs = bool(self._coils[0]) and not (self._coils[1] or self._coils[2])
+        else:
+            self._memory[asked.start] = asked.value
+            if self.kind.moves(asked):
+                self.runs = True
+            elif self.kind.stops(asked):
+                self.runs = False
+        if before and not self.runs:
+            self._stands_at = time.monotonic() + self.ramp

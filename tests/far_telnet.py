@@ -1,0 +1,59 @@
+"""Telnet with the serial port option (RFC 2217), as far as a far end that takes any settings needs it."""
+
+from __future__ import annotations
+
+IAC, DONT, DO, WONT, WILL, SB, SE = 255, 254, 253, 252, 251, 250, 240
+BINARY, SUPPRESS_GO_AHEAD, COM_PORT = 0, 3, 44
+ANSWERS = {WILL: DO, DO: WILL}
+SERVER = 100  # a server's answer to an option has the client's number and this
+
+
+class Telnet:
+    """One connection's state: options that were agreed, and what was cut in the middle."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._agreed: set[tuple[int, int]] = set()
+
+    def decode(self, received: bytes) -> tuple[bytes, bytes]:
+        """The data in what came, and what is to be answered to the rest."""
+        self._buffer += received
+        data, answer = b"", b""
+        while self._buffer:
+            if self._buffer[0] != IAC:
+                end = self._buffer.find(IAC)
+                end = len(self._buffer) if end < 0 else end
+                data, self._buffer = data + self._buffer[:end], self._buffer[end:]
+                continue
+            length = self._length()
+            if not length:
+                break
+            command, self._buffer = self._buffer[:length], self._buffer[length:]
+            if command == bytes([IAC, IAC]):
+                data += bytes([IAC])
+            else:
+                answer += self._answer(command)
+        return data, answer
+
+    @staticmethod
+    def encode(data: bytes) -> bytes:
+        return data.replace(bytes([IAC]), bytes([IAC, IAC]))
+
+    def _length(self) -> int:
+        """That of the command at the front; 0 while it is not whole."""
+        if len(self._buffer) < 2:
+            return 0
+        if self._buffer[1] == SB:
+            return self._buffer.find(bytes([IAC, SE])) + 2 if bytes([IAC, SE]) in self._buffer else 0
+        length = 3 if self._buffer[1] in (WILL, WONT, DO, DONT) else 2
+        return length if len(self._buffer) >= length else 0
+
+    def _answer(self, command: bytes) -> bytes:
+        if command[1] == SB and command[2] == COM_PORT:
+            return command[:3] + bytes([command[3] + SERVER]) + command[4:]
+        if command[1] not in ANSWERS or (command[1], command[2]) in self._agreed:
+            return b""
+        self._agreed.add((command[1], command[2]))
+        known = command[2] in (BINARY, SUPPRESS_GO_AHEAD, COM_PORT)
+        yes, no = ANSWERS[command[1]], {WILL: DONT, DO: WONT}[command[1]]
+        return bytes([IAC, yes if known else no, command[2]])
