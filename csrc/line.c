@@ -280,6 +280,7 @@ static void search(struct md_line *line, int64_t now_ns)
             continue;
         }
         if (used > 0 && !exchange->insists && drive->owed_count && md_late_take(line, at, now_ns, 0) > 0) {
+            md_learn_lateness(drive, now_ns - line->quiet_ns, 0); /* whichever it answers, it took as long as that */
             extend(line);
             if (md_is_read(exchange->framing, exchange->request.function)) {
                 end_in_doubt(line, at, used, &reply, now_ns);

@@ -322,7 +322,7 @@ def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
         for _ in range(3):
             polling.until("ok")
-            polling.until("no reply")
+            polling.until("not asked: late reply due")
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     polling.check_summary()
 
@@ -334,7 +334,7 @@ def test_a_silence_that_is_too_short_for_the_drive() -> None:
     hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)
     with Simulator([Wire([strict])]) as sim, Polling(line(sim.wires[0].path, hasty)) as polling:
         polling.until("ok")
-        polling.until("no reply", 2)
+        polling.until("not asked: late reply due", 2)
         polling.until("ok")
     assert strict.counters.early > 0
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE

@@ -15,7 +15,7 @@ from lines import proof
 from test_hostile_line import LINES, Story, of_all_variants, of_one_variant
 from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 
-from multidrop import acquaintance, bus, exchanges, writing
+from multidrop import acquaintance, bus, call, exchanges, performer, writing
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
 from multidrop.drives import YD1000, ErmanERG220, InnovertIBD, InvtCHE
@@ -120,7 +120,7 @@ class PathLine:
     """What a bus sees of a line behind such a path; time passes only while it waits."""
 
     def __init__(self, wire: PathWire) -> None:
-        self.port = "world"
+        self.port = self.identity = "world"
         self.now = BEGIN_NS
         self.wire = wire
         self.is_called = False
@@ -166,9 +166,9 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
         wire.open()
         line = PathLine(wire)
         monkeypatch.setattr(bus, "Line", lambda port, echo: line)
-        for module in (bus, exchanges, writing, acquaintance):
+        for module in (bus, exchanges, writing, acquaintance, performer, call):
             monkeypatch.setattr(module, "now_ns", lambda: line.now, raising=False)
-            monkeypatch.setattr(module, "sleep", line.sleep)
+            monkeypatch.setattr(module, "sleep", line.sleep, raising=False)
         opened = Bus("world")
         for sim in sims:
             opened.attach(sim.drive)
