@@ -39,6 +39,7 @@ class Hall:
         self.answers: Callable[[Message], bytes | None] = lambda request: None  # instead of the drives
         self.queue_time = 0.0  # until an exchange's turn comes
         self.queue = object()  # the open port
+        self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, echo: self)
         for module in (performer, exchanges, writing, acquaintance):

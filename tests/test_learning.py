@@ -6,7 +6,18 @@ import pytest
 from frames import words
 from line_driver import MS, LineDriver
 
-from multidrop.core import Exchange, Framing, Message, Respondent, Result, build_reply, build_request
+from multidrop.core import (
+    Block,
+    Exchange,
+    Field,
+    Framing,
+    Message,
+    Respondent,
+    Result,
+    Wire,
+    build_reply,
+    build_request,
+)
 
 CHARACTER = 1 * MS
 SILENCE = 4 * MS
@@ -266,6 +277,41 @@ def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(
     assert (again.completion.result, again.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
     again.now = drive.late_until_ns
     ask(again, drive, OTHER)
+
+
+@pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "by hand"])
+def test_a_value_that_may_answer_an_earlier_question_has_its_time(
+    line: LineDriver, drive: Respondent, is_row: bool
+) -> None:
+    """Whoever asks by hand gets none: another question is to prove first that no answer is on its way."""
+    drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
+    asked = Exchange(
+        Framing.RTU,
+        READ,
+        drive,
+        baudrate=9600,
+        format="8N1",
+        character=CHARACTER / 1e9,
+        silence=SILENCE / 1e9,
+        block=Block(0, [Field(0, Wire.U16, 0, 1.0, 1.0)]) if is_row else None,
+    )
+    line.begin(asked)
+    line.wait_until_write()
+    first_ns = line.completion.sent_ns
+    line.wait_until_done()
+    line.now = drive.late_until_ns
+    line.begin(asked)
+    line.wait_until_write()
+    line.now += 20 * MS
+    line.receive(reply(1234))
+    assert line.want == "done"
+    found = line.completion
+    if is_row:
+        assert (found.result, found.sent_ns, found.reply.data) == (7, first_ns, words(1234))
+        assert found.first_ns == line.now
+    else:
+        assert (found.result, found.reply.data) == (Result.LATE_ANSWER_DUE, b"")
+    assert drive.tally().late == 1
 
 
 def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: Respondent) -> None:

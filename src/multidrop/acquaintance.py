@@ -91,6 +91,21 @@ class Acquaintance:
         with suppress(NoReply, BadReply, LineError, NotAttached):
             self._read_something(drive, 1, insists=insists)
 
+    def why_doubtful(self, drive: Drive) -> str:
+        """Return why a reply that is a copy of its request may be the adapter's echo; "" where it is not.
+
+        An echo may begin at any time, and the drive may be dead: so it is to be heard after the write. Where
+        the adapter is known to echo the core has told the one from the other.
+        """
+        line = self._exchanges.line
+        if line.has_echo:
+            return ""
+        try:
+            self._read_something(drive, READ_ATTEMPTS)
+        except (NoReply, BadReply, LineError, NotAttached) as failure:
+            return f"the reply may be the adapter's echo, for nothing was heard of the drive since: {failure}"
+        return "the reply was the adapter's echo" if line.has_echo else ""
+
     # ---- before a stop ----
 
     def glance(self, drive: Drive) -> None:

@@ -258,13 +258,15 @@ class Bus:
         if is_harmless(register, raw):  # a stop
             self._performer.rise([drive])
             try:
-                return self._writer.insist(drive, step)
+                return self._writer.heard_since(drive, self._writer.insist(drive, step))
             finally:
                 self._writer.catch_up()
         call = self._performer.call(drive)
         with call.noted():
             call.check(f"{register.name} = {register.format(value)}")
-            return self._writer.put(drive, step, call)
+            outcome = self._writer.put(drive, step, call)
+            with call.look():
+                return self._writer.heard_since(drive, outcome)
 
     def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
         """Send any request once, past every rule, and return the data of the reply.

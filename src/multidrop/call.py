@@ -9,6 +9,7 @@ from multidrop.core import Permit
 from multidrop.drive import Drive
 from multidrop.errors import Expired, Overtaken
 from multidrop.line import now_ns
+from multidrop.outcome import Outcome
 
 FRAMES = 64  # characters that a request and its reply have at most, where they are about one register
 
@@ -28,6 +29,7 @@ class Call:
         self.verb = verb
         self.sent = ""  # the latest write that may have left
         self.is_confirmed = False  # that one
+        self.unheard: Outcome | None = None  # of that one, if nothing was read of the drive after it
         self._due_ns = now_ns()
 
     def anew(self) -> Call:

@@ -315,6 +315,11 @@ class Line:
         return int(found[_OVERRUN] + found[_BUF_OVERRUN])
 
     @property
+    def has_echo(self) -> bool:
+        """The adapter is known to repeat what is sent."""
+        return self._core is not None and self._core.has_echo
+
+    @property
     def queue(self) -> Port | None:
         """The core's port, for whoever keeps it busy; None while it is closed."""
         return self._core

@@ -111,6 +111,11 @@ class Performer:
             if not call.permit.is_good:
                 what = f"the {call.verb}"
                 raise self._unseen(call, Overtaken(call.drive.name, what, call.permit.latch.why))
+            if call.unheard:
+                with call.look():
+                    outcome = self._writer.heard_since(call.drive, call.unheard)
+                if outcome.failure:
+                    raise outcome.failure
             return result
 
     def introduce(self, drive: Drive, call: Call | None = None) -> None:
@@ -195,7 +200,9 @@ class Performer:
                 return sleep(step.seconds)
         if isinstance(step, Read):
             with call.look():
-                return self._read(drive, step)
+                value = self._read(drive, step)
+            call.unheard = None
+            return value
         if isinstance(step, Insist):
             return self._writer.insist(drive, step).value
         return self._writer.put(drive, step, call).value

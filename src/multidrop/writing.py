@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from typing import Any
 
 from multidrop.acquaintance import Acquaintance
@@ -85,6 +86,16 @@ class Writer:
             if kept is not Kept.RAM:
                 self._uncounted.append(self._cell(drive, register))
 
+    def heard_since(self, drive: Drive, outcome: Outcome) -> Outcome:
+        """Return what is known of a write that is the latest thing heard of the drive, once more is read."""
+        if outcome.effect is not Effect.DONE or outcome.held is not None:
+            return outcome
+        why = self.acquaintance.why_doubtful(drive)
+        if not why:
+            return outcome
+        unknown = Unconfirmed(drive.name, _what(outcome.register, outcome.asked), why)
+        return replace(outcome, effect=Effect.UNCONFIRMED, failure=unknown)
+
     def catch_up(self) -> None:
         """Log and count what was insisted on; that it cannot be is a warning."""
         with suppress(IndexError):  # another thread may be at it
@@ -115,6 +126,7 @@ class Writer:
                 self.acquaintance.tell_echo(drive, insists=call is None)
         if call:
             call.is_confirmed = outcome.effect is not Effect.UNCONFIRMED
+            call.unheard = outcome
         why = "" if outcome.failure is None else str(outcome.failure)
         log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
@@ -263,6 +275,12 @@ class Writer:
         except DriveRefused as failure:
             self.log(drive, request, what, Effect.REFUSED, str(failure))
             raise
+        if completion.raw == build_request(drive.framing, request):
+            with call.look():
+                why_not = self.acquaintance.why_doubtful(drive)
+            if why_not:
+                self.log(drive, request, what, Effect.UNCONFIRMED, why_not)
+                raise Unconfirmed(drive.name, what, why_not)
         self.log(drive, request, what, Effect.DONE)
         return reply.data
 
