@@ -200,6 +200,22 @@ def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_pat
     assert "        kept: EEPROM; written at 800BH, in RAM" in out
 
 
+def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "moved.py").write_text(
+        "from multidrop import Drive, command, setting\n\n\n"
+        'class Moved(Drive):\n    """Moved."""\n\n'
+        "    speed = command(1, moves=False)\n    jog_bit = setting(2, moves=True)\n    unsaid = command(3)\n"
+    )
+    family = f"{tmp_path / 'moved.py'}:Moved"
+    _, out, _ = run("models", family)
+    _, _, registers = out.partition("holding registers")
+    remarks = [line.strip() for line in registers.splitlines() if line.startswith(" " * 8)]
+    assert remarks == ["a write moves nothing", "kept: not stated; a write may move the motor"]
+    _, out, _ = run("models", family, "--json")
+    told = {register["name"]: register["moves"] for register in json.loads(out)["registers"]}
+    assert told == {"speed": False, "jog_bit": True, "unsaid": None}
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -190,6 +190,8 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
         yield "may change while running" if register.while_running else "only while stopped"
     if register.broadcast:
         yield "may be broadcast: " + ", ".join(f"{raw:04X}H" for raw in register.broadcast)
+    if register.moves is not None:
+        yield "a write may move the motor" if register.moves else "a write moves nothing"
     if register.harmless is not None:
         harmless = ", ".join(register.format(register.decode(raw)) for raw in register.harmless)
         yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"
@@ -267,6 +269,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "default": register.default,
         "while_running": register.while_running,
         "broadcast": register.broadcast,
+        "moves": register.moves,
         "harmless": register.harmless,
         "never_together": register.never_together,
         "never": register.never,
