@@ -15,8 +15,9 @@ import serial
 # every way in which a port can fail
 PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
 
-MOST_STALL_MS = 1000  # of a network: what it does not take within this time it never gets
-MOST_AGE = 0.25  # s, of a request that leaves: a drive is waited for a little longer
+# A write's caller is told nothing before both are over (WRITE_TIMEOUT): what it is told then stays true.
+MOST_STALL_MS = 750  # of a network: what it does not take within this time it never gets
+MOST_AGE = 0.25  # s, of a request that leaves
 MOST_CHUNK = 1024  # bytes that the core reads at once
 LOOK_EVERY = 0.1  # s, until a thread sees that the bridge is closed
 CLOSING_TIME = 2.0  # s, for a thread that a port holds up

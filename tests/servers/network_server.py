@@ -1,4 +1,6 @@
-"""A network's serial port that only listens: what it was told to send on its line is printed.
+"""A network's serial port: what it was told to send on its line is printed, and comes back from there.
+
+So does a drive confirm the write of one register.
 
 Its TCP port is printed first. Then a line is the number of a connection and the bytes of the serial
 line, in hexadecimal. A connection that sends END ends it, when all that has come by then is printed.
@@ -63,6 +65,7 @@ class Server:
             client.close()
         elif heard := b"".join(far.filter(received)) if far else received:
             print(number, heard.hex(), flush=True)
+            client.sendall(b"".join(far.escape(heard)) if far else heard)
 
 
 def main() -> None:
