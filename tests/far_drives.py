@@ -129,6 +129,7 @@ KINDS = {
             {},
             {0x0010: 900},
             "current",
+            makes={"confirmed": 1},  # by its owner: nothing that it answers tells it from others
         ),
     )
 }

@@ -384,3 +384,15 @@ def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
             machine.stop(how="verb", verbs=[(0, 0)], signals=[])
     finally:
         machine.teardown()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
+    """Else the tests above ask nothing of this kind."""
+    machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
+    machine.begin(polling=False, on_exit=False)
+    try:
+        machine.drives[0].start()
+        assert machine.far_drives[0].runs
+    finally:
+        machine.teardown()
