@@ -22,7 +22,7 @@ MOST_CHUNK = 1024  # bytes that the core reads at once
 LOOK_EVERY = 0.1  # s, until a thread sees that the bridge is closed
 CLOSING_TIME = 2.0  # s, for a thread that a port holds up
 
-# The kernel says of each request when the core wrote it, where it keeps them apart.
+# Linux keeps the requests on such a socket apart, and stamps each with the time when the core wrote it.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; also the type of what it adds, a struct timespec
@@ -52,8 +52,8 @@ def hand_on_nothing_late(connection: socket.socket) -> None:
 class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
-    Nothing waits in it: a request that its thread finds too late, because the process stood still or
-    the port held an earlier one up, was given up meanwhile, and is thrown away.
+    Nothing waits in it. A request that its thread finds too late was given up meanwhile, and is thrown
+    away: the process stood still, or the port held an earlier one up.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:
@@ -93,7 +93,7 @@ class Bridge:
         self._hang_up()
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Give the core what came, when it takes it: until then the port keeps what comes."""
+        """Give the core what came. While it takes nothing, the port keeps what comes."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]
@@ -116,7 +116,7 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Whether a request was written just now; a clock that was set meanwhile cannot say so."""
+    """Return True for a request that was written just now; a doubt, as when the clock was set, is False."""
     if not _STAMPED:
         return True
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]

@@ -16,7 +16,7 @@ LAST_ADDRESS = 0xFFFF
 _TEXTS = ("unit", "at_least", "at_most", "never", "place", "outside", "note")
 _TRUTHS = ("while_running", "moves")
 _COUNTS = ("broadcast", "harmless", "never_together")
-# The codes that reach the same registers: one of them at once, or several.
+# Function codes that write the same registers: one at a time, and several at once.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 
 
@@ -31,7 +31,7 @@ class DeclarationError(ValueError):
 def mistakes(
     registers: Mapping[str, Register[Any]], taken: Collection[str], bounds: Collection[str]
 ) -> list[str]:
-    """What is wrong with a class's registers.
+    """Return a sentence for each mistake in a class's registers.
 
     `taken` are the names that its drives have for something else, `bounds` those of its options.
     """
@@ -165,7 +165,7 @@ def _format(register: Register[Any]) -> Iterator[str]:
                 yield f"an end of its span cannot be written: {mistake}"
 
 
-# The codes that read and write what travels as a bit or a word (application protocol V1.1b3, section 6).
+# The function codes that read and write bits, and words (application protocol V1.1b3, section 6).
 _FUNCTIONS = {Carrier.BIT: ((0x01, 0x02), (0x05, 0x0F)), Carrier.WORD: ((0x03, 0x04), (0x06, 0x10))}
 
 
@@ -180,7 +180,7 @@ def _functions(register: Register[Any]) -> Iterator[str]:
 
 
 def _access(register: Register[Any]) -> Iterator[str]:
-    """What its words promise, its table must have a function code for."""
+    """Find an access for which the table has no function code."""
     table, word = register.table, register.access.value
     if register.access is not Access.COMMAND and table.read is None:
         yield f"a {table.name} cannot be read, and so holds no {word}"
@@ -194,11 +194,11 @@ def _access(register: Register[Any]) -> Iterator[str]:
 
 
 def _shared(registers: list[Register[Any]]) -> Iterator[str]:
-    """Two registers that are written at one place must mean the same there.
+    """Find two registers that are written at one place and do not mean the same there.
 
     A reading may share its place with anything, and different tables may use the same addresses.
     """
-    written = [it for it in registers if it.access is not Access.READING and it.table.write is not None]
+    written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     for one, other in combinations(written, 2):
         if _space(one.table) != _space(other.table) or not set(_addresses(one)) & set(_addresses(other)):
             continue

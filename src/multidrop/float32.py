@@ -6,17 +6,17 @@ import math
 import struct
 from fractions import Fraction
 
-MOST_DIGITS = 9  # that tell any two of them apart
+MOST_DIGITS = 9  # enough to tell any two of them apart
 
 
 def nearest(value: float | Fraction) -> float:
-    """Return the nearest float32; OverflowError where there is none as large."""
+    """Return the nearest float32; raises OverflowError beyond the largest."""
     (found,) = struct.unpack(">f", struct.pack(">f", value))
     return float(found)
 
 
 def nearest_or_infinite(value: float) -> float:
-    """Return the nearest float32, which is infinite where there is none as large."""
+    """Return the nearest float32, or an infinity beyond the largest."""
     try:
         return nearest(value)
     except OverflowError:

@@ -21,7 +21,7 @@ YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # writes of one register in a year
-LATEST = 6e10  # UTC in s: no date is later (nor, below 0, earlier)
+LATEST = 6e10  # UTC in s: a time beyond it, or as far before 0, is damage
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
 
 
@@ -29,7 +29,7 @@ LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be 
 class Cell:
     """One register of one drive, as a ledger knows it.
 
-    `port` is what the port is (see port_identity), `spelt` its name, by which it may have been entered once.
+    `port` is the port's identity (see port_identity), `spelt` its name, which older entries may have.
     """
 
     port: str
@@ -64,7 +64,7 @@ class Ledger:
         self._is_the_user_s = not path
 
     def at(self, port: str) -> Ledger:
-        """The ledger for this port: a simulated one never spends the user's own, but one of its own."""
+        """Return the ledger for this port: a simulated one has its own, and never spends the user's."""
         if self._is_the_user_s and is_simulated(port):
             return Ledger(ledger_of(port, self.path.parent), budget=self.budget)
         return self
@@ -94,7 +94,7 @@ class Ledger:
         return ""
 
     def note(self, cell: Cell, now: float) -> None:
-        """Count a write that was sent whatever the budget says: a stop. OSError where it cannot be kept."""
+        """Count a stop, which was sent whatever the budget says. Raises OSError where it cannot be kept."""
         with self._opened() as ledger:
             ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
 
@@ -136,7 +136,7 @@ def _key(cell: Cell) -> tuple[str, int, str, str]:
 
 
 def _names(ledger: sqlite3.Connection, cell: Cell) -> list[str]:
-    """All names under which the cell's port was entered."""
+    """Return all names under which the cell's port was entered."""
     ports = [port for (port,) in ledger.execute("select distinct port from writes")]
     return [port for port in ports if port in (cell.port, cell.spelt) or of_name(port) == cell.port]
 

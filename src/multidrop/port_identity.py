@@ -13,7 +13,7 @@ _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
 
 
 def of_device(path: str) -> str:
-    """The device's link by its serial number, where it has one, or else its own path without links."""
+    """Return the link by the adapter's serial number, or where there is none the path with links followed."""
     device = os.path.realpath(path)
     try:
         links = sorted(BY_ID.iterdir())
@@ -23,18 +23,18 @@ def of_device(path: str) -> str:
 
 
 def of_connection(connection: socket.socket) -> str:
-    """The address and port of the far end: 10.0.0.7:4001."""
+    """Return the address and port of the far end: 10.0.0.7:4001."""
     return of_address(connection.getpeername())
 
 
 def of_address(address: tuple[str | int, ...]) -> str:
-    """A socket's address as one text, an IPv6 one in brackets."""
+    """Return a socket's address as one text, an IPv6 one in brackets."""
     host, port, *_ = address
     return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
 
 
 def of_name(name: str) -> str:
-    """What a name means now, as it was written down once: a path, a URL, or an identity."""
+    """Return the identity of a port that was written down as a path, a URL, or an identity."""
     if "://" in name:
         try:
             url = urlsplit(name)

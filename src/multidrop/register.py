@@ -155,7 +155,7 @@ class Register(Generic[T]):
     name: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        carrier = getattr(self.table, "carrier", Carrier.WORD)  # what is declared is checked with its class
+        carrier = getattr(self.table, "carrier", Carrier.WORD)  # a wrong table is told with the class
         if self.wire == Wire.U16 and carrier is not Carrier.WORD:
             object.__setattr__(self, "wire", Wire.BIT if carrier is Carrier.BIT else Wire.U32)
         table_kept = getattr(self.table, "kept", Kept.UNKNOWN)
@@ -187,12 +187,12 @@ class Register(Generic[T]):
 
     @property
     def is_float(self) -> bool:
-        """Its raw count is a float32."""
+        """True where the raw count is a float32."""
         return self.table.carrier is Carrier.WORD and self.wire in FLOAT_WIRES
 
     @property
     def commands(self) -> bool:
-        """A write to it may move the motor: that is left to verbs, but for what is `harmless`."""
+        """True where a write may move the motor: verbs alone send it, but for what is `harmless`."""
         if self.moves is None:
             return self.access is Access.COMMAND or self.harmless is not None
         return self.moves
@@ -215,10 +215,10 @@ class Register(Generic[T]):
                 return self.values(int(raw))
             except ValueError:
                 return cast(T, int(raw))
-        return cast(T, raw * self.scale.numerator / self.scale.denominator + 0.0)  # 0 has no sign
+        return cast(T, raw * self.scale.numerator / self.scale.denominator + 0.0)  # never -0.0
 
     def encode(self, value: T) -> float:
-        """The raw count of a value: a whole number, or the nearest float32 where it holds one.
+        """Return the raw count of a value: a whole number, or in a float register the nearest float32.
 
         Raises ValueError outside the span, TypeError for what is no number.
         """
@@ -256,13 +256,13 @@ class Register(Generic[T]):
         return round(count)
 
     def takes(self, value: T) -> bool:
-        """A drive that holds this value may have been told to: it has its name, or is in its span."""
+        """Return True for a value that a drive may have been given: it has a name, or is in the span."""
         if self.values is not None:
             return isinstance(value, self.values)
         if self.span is None:
             return True
         low, high = self.span
-        if self.is_float:  # of which the ends may be none
+        if self.is_float:  # a drive holds the float32 nearest to an end
             low, high = (float(self.scale * Fraction(float32.nearest(end / self.scale))) for end in self.span)
         return low <= value <= high
 
@@ -332,7 +332,7 @@ class Register(Generic[T]):
 
 
 def _short(value: float) -> str:
-    """A number in a sentence, also one that no float holds."""
+    """Return a number as a sentence shows it; it may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 

@@ -18,7 +18,7 @@ from serial import rfc2217
 MOST_RECEIVED = 4096  # bytes taken from the network at once
 MOST_CHUNKS = 64  # of them that wait to be read
 MOST_SUBOPTION = 256  # bytes: those of RFC 2217 are short, only its signature is a text
-LOCK_TIME = 0.1  # s, for another thread's answer to an option, which leaves at once too
+LOCK_TIME = 0.1  # s, that another thread may take to answer an option
 
 _IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 _NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
@@ -77,7 +77,7 @@ class Telnet:
 class RFC2217Port(rfc2217.Serial):
     """A network's serial port; `port` is rfc2217://host:port."""
 
-    # pyserial's own, of which its types know nothing
+    # pyserial's own attributes, which its type stubs leave out
     _socket: Any
     _write_lock: Any
     _read_buffer: Any
@@ -119,7 +119,7 @@ class RFC2217Port(rfc2217.Serial):
         if not self.is_open or not self._write_lock.acquire(timeout=LOCK_TIME):
             raise serial.SerialException("the network takes nothing")
         try:
-            # its own send() would wait for as long as its time-out says
+            # socket.send() would wait for as long as the socket's time-out
             if os.write(self._socket.fileno(), data) < len(data):
                 raise serial.SerialException("the network takes nothing more")
         except OSError as failure:

@@ -1,7 +1,7 @@
-"""Ports of simulated drives: how a client knows them, whose writes wear no EEPROM.
+"""Ports of simulated drives, whose writes wear no EEPROM: how a client recognises them.
 
-A simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)), which
-is gone when its process is, however that ends. Other systems have no such names: there a simulated
+A simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)). The
+name is gone when the process ends, in whatever way. Other systems have no such names: there a simulated
 drive's writes are counted as a real one's.
 """
 
@@ -22,12 +22,12 @@ def _name(identity: str) -> bytes:
 
 
 def ledger_of(identity: str, directory: Path) -> Path:
-    """The file in which a simulated port's writes are counted, as long as its simulator runs."""
+    """Return the file that counts a simulated port's writes while its simulator runs."""
     return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
 
 
 class SimulatedPort:
-    """A port that is known to be simulated until this is closed; its ledger begins anew."""
+    """A mark that a port is simulated, until it is closed; the port's ledger begins anew."""
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)
@@ -47,7 +47,7 @@ class SimulatedPort:
 
 
 def is_simulated(identity: str) -> bool:
-    """A simulator of this user has this port now."""
+    """Return True while a simulator of this user has this port."""
     if not _HAS_NAMES:
         return False
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
