@@ -20,7 +20,6 @@ from far_end import FarEnd, FarLine
 from stops_victim import Tally, Victim, victim
 
 NEAR, FAR, PREFIX = "10.249.17.1", "10.249.17.2", 30
-MOST_STALL = 1.0  # s, that what is sent may be held up on an open connection, and arrive all the same
 NOBODY = "02:00:00:00:00:99"  # no interface has this address: what is sent to it is lost
 LISTEN = (
     "import socket, sys; it = socket.create_server((sys.argv[1], 0));"
@@ -137,11 +136,10 @@ def _cut_one(
     client.release()
     said = client.hear("called")
     told_ns = said["at"]
-    if leaves := chance.random() < 0.5:
+    if chance.random() < 0.5:
         client.leave()
         client.hear("left")
-    least = 0.5 if leaves else MOST_STALL + 1.0
-    time.sleep(chance.uniform(least, 10.0) if is_long else least)
+    time.sleep(chance.uniform(0.0, 10.0) if is_long else 0.0)
     made.mend()
     time.sleep(3.0 if is_long else 1.5)  # what TCP held back comes now
     tally.rounds += 1
