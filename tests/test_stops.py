@@ -507,7 +507,7 @@ def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
     hall = Hall(monkeypatch, simulated(Own(1)), ledger=ledger)
-    drive = hall.attach(Own(1))
+    drive = hall.attach(Own(1, confirmed=1))
     drive.start()
     for _ in range(3):
         drive.stop()
@@ -589,7 +589,7 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
             yield from write(self.ratio, 1)
 
     hall = Hall(monkeypatch, simulated(Sleepy(1)))
-    hall.attach(Sleepy(1)).start()
+    hall.attach(Sleepy(1, confirmed=1)).start()
     assert len(writes(hall)) == 1
 
 
