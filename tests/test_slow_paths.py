@@ -123,7 +123,7 @@ class PathLine:
         self.port = self.identity = "world"
         self.now = BEGIN_NS
         self.wire = wire
-        self.is_called = self.has_echo = False
+        self.is_called = self.has_echo = self.is_lost = False
         self.queue = WorldPort(cast(World, self))
 
     def require(self, settings: tuple[int, str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -22,6 +23,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     Overtaken,
+    PortLost,
     Refused,
     Unconfirmed,
 )
@@ -465,25 +467,53 @@ def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
     assert not sim.motor.energised
 
 
-def test_a_port_that_comes_back_is_waited_for_where_somebody_opens_it(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("tended", [True, False])
+def test_a_port_that_was_lost_is_waited_for_and_opened_where_nobody_else_does(
+    monkeypatch: pytest.MonkeyPatch, tended: bool
 ) -> None:
     hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.start()
     back_at = hall.seconds + 5
+    opened: list[float] = []
+
+    def regain() -> None:
+        opened.append(hall.seconds)
+        if hall.seconds < back_at:
+            raise PortLost("hall", "there is no such port")
+        hall.is_lost = False
 
     def lost(request: Message) -> bytes | None:
-        if hall.seconds < back_at:
-            raise LineError("hall", "the port was lost (hung up)")
+        if tended and hall.seconds >= back_at:
+            hall.is_lost = False
+        if hall.is_lost:
+            raise PortLost("hall", "the port was lost (hung up)")
         return None
 
-    hall.answers = lost
+    hall.is_lost, hall.answers, vars(hall)["regain"] = True, lost, regain
+    hall.bus.tended(tended)
     with pytest.raises(LineError):
-        drive.stop()
-    hall.bus.regains()
+        hall.bus.read(drive, drive.status)
+    assert opened == []  # only a stop does
+    with pytest.raises(LineError):
+        drive.stop(seconds=1)
     drive.stop()
     assert not sim.motor.energised
+    assert bool(opened) is not tended
+    assert all(later - earlier >= 0.5 for earlier, later in pairwise(opened))
+
+
+def test_a_stop_on_a_port_that_was_closed_is_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+
+    def closed(request: Message) -> bytes | None:
+        raise LineError("hall", "it is closed")
+
+    hall.answers = closed
+    begun = hall.seconds
+    with pytest.raises(LineError, match="it is closed"):
+        drive.stop()
+    assert hall.seconds - begun < 0.1
 
 
 # ---- a user's own drive ----

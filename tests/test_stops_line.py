@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
-from lines import PATIENCE, LateWire, until
+from lines import PATIENCE, LateWire, plant, polled, until
+from lines import line as declared_line
 from motors import MAKE, Heard
 
-from multidrop import exchanges
+from multidrop import exchanges, performer
 from multidrop.bus import Bus
 from multidrop.core import Message
-from multidrop.errors import BusError, NoReply, Overtaken, Unconfirmed
-from multidrop.sim import PoweredDrive, Simulator, simulated
+from multidrop.drive import Condition
+from multidrop.errors import BusError, LineError, NoReply, Overtaken, Unconfirmed
+from multidrop.polled_line import PolledLine
+from multidrop.poller import Poller
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
 
 every_family = pytest.mark.parametrize("model", MAKE)
 
@@ -146,6 +151,92 @@ def test_closing_waits_for_a_stop_that_is_under_way() -> None:
         for thread in (stopping, closing):
             thread.join(PATIENCE)
         assert failures == []
+
+
+class Pulled:
+    """A line whose port is pulled out while the motor turns, and is back at once under the same name."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = str(link)
+        self.drive = MAKE["invt-che"](1)
+        sim = simulated(self.drive)
+        assert isinstance(sim, PoweredDrive)
+        sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+        self.heard = Heard(sim)
+
+    def plugged_in(self) -> Simulator:
+        return Simulator([Wire([self.heard.sim], port=self.link, unpaced=True)])
+
+    def starts(self, bus: Bus) -> None:
+        drive: Any = self.drive
+        drive.set_frequency(20)
+        drive.start()
+
+    def until_lost(self, bus: Bus) -> None:
+        until(lambda: bus.line.queue is None or bus.line.queue.lost)
+        assert self.heard.sim.motor.energised
+        self.heard.requests.clear()
+
+
+@pytest.mark.parametrize("ending", ["close", "stop", "stop_all", "write"])
+def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
+    pulled = Pulled(tmp_path / "port")
+    drive: Any = pulled.drive
+    with ExitStack() as stack:
+        with pulled.plugged_in():
+            bus = stack.enter_context(Bus(pulled.link))
+            bus.attach(drive)
+            pulled.starts(bus)
+        pulled.until_lost(bus)
+        with pytest.raises(LineError):
+            drive.state()
+        with pytest.raises(LineError):  # nobody opens it
+            bus.line.regain()
+        with pulled.plugged_in():
+            with pytest.raises(LineError):
+                drive.state()
+            if ending == "close":
+                bus.stop_on_exit()
+            elif ending == "write":
+                bus.write(drive, drive.control, drive.control.values(5))
+                until(lambda: drive.state().condition is Condition.STOPPED)
+            else:
+                getattr(drive if ending == "stop" else bus, ending)()
+            bus.close()
+            assert pulled.heard.writes
+            assert pulled.heard.starts == []
+            until(lambda: not pulled.heard.sim.motor.energised)
+    with pytest.raises(LineError, match="it is closed"):
+        drive.stop()
+
+
+@pytest.mark.parametrize("opener", ["the poller", "the stop"])
+def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opener: str
+) -> None:
+    """Whoever opens it again."""
+    if opener == "the stop":
+        monkeypatch.setattr(PolledLine, "_reopen", lambda tended: None)
+    pulled = Pulled(tmp_path / "port")
+    drive: Any = pulled.drive
+    with ExitStack() as stack:
+        with pulled.plugged_in():
+            declared = declared_line(pulled.link, polled(drive, [drive.status]))
+            poller = stack.enter_context(Poller(plant(declared)))
+            poller.stop_on_exit()
+            bus = poller.bus("line")
+            pulled.starts(bus)
+        pulled.until_lost(bus)
+        with pulled.plugged_in():
+            poller.close()
+            assert pulled.heard.writes
+            assert pulled.heard.starts == []
+            until(lambda: not pulled.heard.sim.motor.energised)
+            waits: list[float] = []
+            monkeypatch.setattr(performer, "sleep", waits.append)
+            with pytest.raises(LineError, match="it is closed"):
+                drive.stop()
+            assert sum(waits) == 0  # it never comes back
 
 
 def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:

@@ -263,6 +263,9 @@ class WorldLine:
             raise LineError(self.port, "it is not there")
         self.queue = self._world.port = WorldPort(self._world)
 
+    regain = reopen  # it is lost: the poller has dropped it
+    is_lost = False  # nobody stops a motor here
+
 
 class World:
     """A wire, and a poller of drives on it: `run` lets time pass, and returns the rows that come of it."""

@@ -170,9 +170,9 @@ class Bus:
             self._at_last = self._at_last or self._counted(overruns)
             self._writer.close()
 
-    def regains(self) -> None:
-        """Take note that somebody opens a lost port again: a stop waits for it."""
-        self._performer.regains = True
+    def tended(self, is_tended: bool) -> None:
+        """Take note whether somebody opens a lost port again: a stop waits for that, or else does it."""
+        self._performer.is_tended = is_tended
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
         """Put a drive on the bus: a family with address, name and so on, or a drive made before.
@@ -258,7 +258,7 @@ class Bus:
         if is_harmless(register, raw):  # a stop
             self._performer.rise([drive])
             try:
-                return self._writer.heard_since(drive, self._writer.insist(drive, step))
+                return self._writer.heard_since(drive, self._performer.insist(drive, step))
             finally:
                 self._writer.catch_up()
         call = self._performer.call(drive)

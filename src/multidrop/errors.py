@@ -20,6 +20,10 @@ class LineError(BusError, OSError):
         self.is_sent = False  # a request had begun to leave
 
 
+class PortLost(LineError):
+    """The port vanished, or is not back yet: it may be opened again."""
+
+
 class NoSuchPort(LineError, ValueError):
     """No port can have this name, whatever is plugged in: a mistake of the caller."""
 

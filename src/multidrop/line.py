@@ -20,7 +20,7 @@ import serial
 from multidrop import port_identity
 from multidrop.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
-from multidrop.errors import LineError, NoSuchPort
+from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.forks import tell_of_forks
 from multidrop.rfc2217 import RFC2217Port
 
@@ -153,6 +153,7 @@ class Line:
     def forked(self) -> None:
         """In the child it is closed, at once: a descriptor left open there would keep the port in use."""
         self._make_locks()
+        self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
         self._core = None
         if self._bridge:
@@ -166,6 +167,7 @@ class Line:
 
     def _open(self) -> None:
         self._why_closed = "it is closed"
+        self._is_over = False
         try:
             port = self._serial = unopened(self.port)
             port.timeout = 0
@@ -182,7 +184,7 @@ class Line:
         except NoSuchPort:
             raise
         except PORT_FAILURES as failure:
-            self.close()
+            self._let_go()
             raise LineError(self.port, reason_of(failure)) from failure
 
     def _identify(self, port: serial.SerialBase) -> str:
@@ -221,7 +223,12 @@ class Line:
                     core.close()  # nobody looks at it any more
 
     def close(self) -> None:
-        """Drop the port and close it."""
+        """Drop the port and close it; no `regain` opens it any more."""
+        with self._lock:
+            self._is_over = True
+            self._let_go()
+
+    def _let_go(self) -> None:
         with self._lock:
             self.drop()
             if self._bridge:
@@ -244,8 +251,26 @@ class Line:
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
         with self._lock:
-            self.close()
+            self._let_go()
             self._open()
+
+    @property
+    def is_lost(self) -> bool:
+        """It failed, and was neither opened again nor closed since."""
+        core = self._core
+        return not self._is_over and (core is None or core.lost)
+
+    def regain(self) -> None:
+        """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
+        with self._lock:
+            if self._is_over:
+                raise LineError(self.port, self._why_closed)
+            if not self.is_lost:
+                return
+            try:
+                self.reopen()
+            except LineError as failure:
+                raise PortLost(self.port, failure.reason) from failure
 
     def require(self, settings: tuple[int, str]) -> None:
         """Exchanges with these settings will come: a port that is bridged can only have one kind of them.
@@ -265,14 +290,14 @@ class Line:
 
     def _opened(self, settings: tuple[int, str]) -> Port:
         if self._core is None:
-            raise LineError(self.port, self._why_closed)
+            raise self._closed()
         self.require(settings)
         return self._core
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
         if self._core is None:  # at once, also while it is being opened again
-            raise LineError(self.port, self._why_closed)
+            raise self._closed()
         with self._lock:
             core = self._opened(exchange.settings)
             self._waiting += 1
@@ -291,13 +316,16 @@ class Line:
 
     def _failure(self, result: int, error: int) -> LineError | None:
         if result == Result.LINE_LOST and self._core is None:
-            return LineError(self.port, self._why_closed)
+            return self._closed()
         if result == Result.LINE_LOST:
-            return LineError(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
+            return PortLost(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
         if result == Result.SETTINGS_REFUSED:
             refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
             return LineError(self.port, f"the port does not take the {refused} that the drive needs")
         return None
+
+    def _closed(self) -> LineError:
+        return (LineError if self._is_over else PortLost)(self.port, self._why_closed)
 
     def overruns(self) -> int | None:
         """Characters that came too fast for the port, since its driver was loaded.

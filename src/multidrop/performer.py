@@ -23,12 +23,15 @@ from multidrop.errors import (
 )
 from multidrop.exchanges import READ_ATTEMPTS, Exchanges
 from multidrop.line import now_ns, sleep
+from multidrop.outcome import Outcome
 from multidrop.stopping import Patience, Stopped, Stopping, send_once_more, stop_together
 from multidrop.writing import Writer
 
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
+
+REGAIN_NS = 500_000_000  # between attempts of stops to open a port that was lost
 
 
 class _Over(Exception):
@@ -38,11 +41,12 @@ class _Over(Exception):
 class Performer:
     """A latch for each drive, and what is under way.
 
-    `regains` tells that somebody opens a lost port again: then a stop waits for it.
+    `is_tended` tells that somebody opens a lost port again: a stop waits for that, or else does it itself.
     """
 
     def __init__(self, exchanges: Exchanges, writer: Writer, expiry: float) -> None:
-        self.regains = False
+        self.is_tended = False
+        self._regain_ns = 0  # not before then
         self._exchanges = exchanges
         self._writer = writer
         self._expiry = expiry
@@ -217,7 +221,7 @@ class Performer:
 
         Raises Unconfirmed when it is not seen to stand then, and says what is known.
         """
-        patience = self._patience(seconds)
+        patience = _patience(seconds)
         self._latch(drive)
         with self._under_way([drive]):
             stop = Stopping(drive, make, now_ns() / 1e9, patience)
@@ -232,7 +236,7 @@ class Performer:
 
         `at_once` is called before, and says whether that has sent a stop to all of them.
         """
-        patience = self._patience(seconds)
+        patience = _patience(seconds)
         found: dict[str, Stopped] = {}
         with self._under_way(drives):
             begun = now_ns() / 1e9
@@ -250,16 +254,6 @@ class Performer:
 
             stop_together(stops, self._do_stop, lambda: now_ns() / 1e9, sleep, over)
         return found
-
-    def _patience(self, seconds: float | None) -> Patience:
-        if seconds is not None and (isinstance(seconds, bool) or isnan(seconds) or seconds < 0):
-            raise ValueError(
-                f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none"
-            )
-        usual = Patience(seconds)
-        if not self.regains:
-            return usual
-        return Patience(seconds, (*usual.worth_repeating, LineError))
 
     @contextmanager
     def _under_way(self, drives: Sequence[Drive]) -> Iterator[None]:
@@ -282,6 +276,24 @@ class Performer:
 
     def _do_stop(self, drive: Drive, step: Step) -> Any:
         if isinstance(step, Read):  # asked once: what is not answered has the stop sent again
+            self._regain()
             return self._read(drive, step, 1)
         assert isinstance(step, Write)
-        return self._writer.insist(drive, step).value
+        return self.insist(drive, step).value
+
+    def insist(self, drive: Drive, step: Write) -> Outcome:
+        """Write what stops the motor, on a port that is opened again if it was lost."""
+        self._regain()
+        return self._writer.insist(drive, step)
+
+    def _regain(self) -> None:
+        line, now = self._exchanges.line, now_ns()
+        if not self.is_tended and line.is_lost and now >= self._regain_ns:
+            self._regain_ns = now + REGAIN_NS
+            line.regain()
+
+
+def _patience(seconds: float | None) -> Patience:
+    if seconds is not None and (isinstance(seconds, bool) or isnan(seconds) or seconds < 0):
+        raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
+    return Patience(seconds)

@@ -100,7 +100,6 @@ class PolledLine:
     def __init__(self, declared: plant.Line, number: int, bus: Bus, inbox: Inbox, codes: Codes) -> None:
         self.name = declared.name
         self.bus = bus
-        bus.regains()
         self.schedule: Schedule[Asked] = Schedule()
         self.started_ns = now_ns()
         self._ended_ns: int | None = None  # nothing is due any more
@@ -214,6 +213,7 @@ class PolledLine:
     def start(self) -> None:
         with self._lock:
             self.started_ns = now_ns()
+            self.bus.tended(True)
             self.bus.reset_statistics()
             chosen = {polled.drive: it.jobs for polled, it in self._chosen.items()}
             for drive in in_order(self.bus.drives, self.switching):
@@ -381,7 +381,7 @@ class PolledLine:
 
     def _reopen(self) -> None:
         with suppress(LineError):
-            self.bus.line.reopen()
+            self.bus.line.regain()
 
     def end(self) -> bool:
         """Nothing more is begun, and no port opened again; whether an exchange is still under way."""

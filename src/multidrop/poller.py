@@ -98,6 +98,8 @@ class Poller:
             self._wake_up()
             self._thread.join()
         for line in self._lines:
+            line.bus.tended(False)
+        for line in self._lines:
             line.bus.part()  # before the port is closed, on which it stops motors
         given_up_ns = now_ns() + PARTING_NS
         while sum(line.end() for line in self._lines) and now_ns() < given_up_ns:

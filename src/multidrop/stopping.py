@@ -20,6 +20,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     NotDone,
+    PortLost,
     Refused,
     Unconfirmed,
     Unsupported,
@@ -60,7 +61,14 @@ class Patience:
     """
 
     seconds: float | None = None
-    worth_repeating: tuple[type[Exception], ...] = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused)
+    worth_repeating: tuple[type[Exception], ...] = (
+        Unconfirmed,
+        NotDone,
+        NoReply,
+        BadReply,
+        DriveRefused,
+        PortLost,
+    )
 
 
 class Stopping:
