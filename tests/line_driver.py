@@ -60,10 +60,12 @@ class LineDriver:
         self._exchanges.append(exchange)
         lib.md_line_begin(self._line, exchange.c, self.found, self.now)
 
-    def take(self, most: int = 513) -> bytes:
-        """The port takes up to `most` bytes of what the line wants written."""
+    def take(self, most: int = 513, held_up: int = 0) -> bytes:
+        """The port takes up to `most` bytes of what the line wants written, and comes back so much later."""
         tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
-        lib.md_line_sent(self._line, len(tx), self.now, self.now)
+        begun = self.now
+        self.now += held_up
+        lib.md_line_sent(self._line, len(tx), begun, self.now)
         return tx
 
     def receive(self, data: bytes, piece: int = 4096) -> None:

@@ -173,6 +173,28 @@ def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, 
     assert drive.failures == 0
 
 
+def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: Respondent) -> None:
+    """However quick the drive was at reads: a write that is wrongly told to be unconfirmed costs more."""
+    for _ in range(12):
+        answer(line, drive, 2 * MS)
+    assert given_up(line, drive) < 100 * MS
+    write = Exchange(
+        Framing.RTU,
+        WRITE,
+        drive,
+        baudrate=9600,
+        format="8N1",
+        character=CHARACTER / 1e9,
+        silence=SILENCE / 1e9,
+        timeout=1.0,
+    )
+    line.begin(write)
+    line.wait_until_write()
+    left = line.now + 8 * CHARACTER
+    line.wait_until_done()
+    assert line.now - left == 1000 * MS + 8 * CHARACTER
+
+
 # ---- nothing has begun ----
 
 AWAITED = 3 * CHARACTER  # where characters come one by one: that one, and two

@@ -66,6 +66,28 @@ def answer(line: LineDriver, received: bytes, piece: int = 4096) -> None:
 # ---- silence ----
 
 
+def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
+    """The port held the thread up when it took the request, which may have left long before."""
+    line.begin(exchange(READ))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    begun = line.now
+    line.take(held_up=10 * MS)
+    line.receive(reply_of(7))  # it was there when the thread went on
+    assert line.want == "done"
+    assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
+
+
+def test_a_request_that_may_have_left_late_has_its_whole_time_out(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    line.take(held_up=10 * MS)
+    left = line.now + 8 * CHARACTER
+    line.wait_until_done()
+    assert line.now == left + TIMEOUT + 7 * CHARACTER
+
+
 def test_no_request_before_the_silence_is_over(line: LineDriver) -> None:
     opened = line.now
     line.begin(exchange(READ))

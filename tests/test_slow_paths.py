@@ -18,7 +18,7 @@ from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 from multidrop import acquaintance, bus, call, exchanges, performer, writing
 from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
-from multidrop.drives import YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.outcome import Effect
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, simulated
@@ -233,6 +233,32 @@ def test_what_became_of_a_write_over_a_slow_path_is_true(
             assert (outcome.held, sim[name]) == (asked, asked)
             done += 1
     assert done > 10
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_write_has_the_time_that_reads_did_not_need(
+    name: str, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = WRITTEN[name]
+    opened, line = path_of([simulated(drive)], constant(0.0))
+    register = drive.register(name)
+    with opened:
+        for _ in range(12):
+            opened.read(drive, register)
+        assert opened.respondent(drive).timeout < 0.15
+        line.wire.delay = constant(0.25)
+        assert opened.try_write(drive, register, 11.0).effect is Effect.DONE
+
+
+def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
+    path_of: Callable[..., tuple[Bus, PathLine]],
+) -> None:
+    for drive in (DelixiModbus(1), DelixiNative(1)):
+        opened, _ = path_of([simulated(drive)], constant(0.0))
+        with opened:
+            for _ in range(30):
+                opened.read(drive, drive.register("fault"))
+            assert opened.respondent(drive).timeout == 0.08
 
 
 @pytest.mark.parametrize("kind", ["drop", "flip", "split", "noise"])
