@@ -1,6 +1,6 @@
-"""A network's serial port: what it was told to send on its line is printed, and comes back from there.
+"""A network's serial port: what it was told to send on its line is printed, and answered.
 
-So does a drive confirm the write of one register.
+Registers that are read hold 0. All else comes back: so does a drive confirm the write of one register.
 
 Its TCP port is printed first. Then a line is the number of a connection and the bytes of the serial
 line, in hexadecimal. A connection that sends END ends it, when all that has come by then is printed.
@@ -26,6 +26,22 @@ def manager(client: socket.socket) -> rfc2217.PortManager:
     flushes = dict.fromkeys(("reset_input_buffer", "reset_output_buffer"), lambda: None)
     port = SimpleNamespace(**settings, **modem_lines, **flushes)
     return rfc2217.PortManager(port, SimpleNamespace(write=client.sendall))
+
+
+def with_crc(body: bytes) -> bytes:
+    crc = 0xFFFF
+    for byte in body:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return body + crc.to_bytes(2, "little")
+
+
+def answer(request: bytes) -> bytes:
+    """What one drive says to a whole request."""
+    if len(request) == 8 and request[1] in (3, 4):
+        return with_crc(request[:2] + bytes([2 * request[5]]) + bytes(2 * request[5]))
+    return request
 
 
 class Server:
@@ -65,7 +81,8 @@ class Server:
             client.close()
         elif heard := b"".join(far.filter(received)) if far else received:
             print(number, heard.hex(), flush=True)
-            client.sendall(b"".join(far.escape(heard)) if far else heard)
+            said = answer(heard)
+            client.sendall(b"".join(far.escape(said)) if far else said)
 
 
 def main() -> None:
