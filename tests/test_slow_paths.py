@@ -95,11 +95,16 @@ class Path(Story):
         return {row.drive for row in tail if row.value is not None}
 
 
-DELAYS = (0.0, 0.1, 0.3, 0.45, 0.6, 1.5, 4.0, 10.0)
-STALLS = {f"stalls of {longest:g} s": longest for longest in (0.1, 0.3, 0.9, 3.0, 15.0, 60.0)}
+def usually(tried: object, *others: object) -> list[Any]:
+    """The one that is always tried, and those that take long."""
+    return [tried, *(pytest.param(other, marks=pytest.mark.long) for other in others)]
 
 
-@pytest.mark.parametrize("path", [constant, jittering])
+DELAYS = usually(0.6, 0.0, 0.1, 0.3, 0.45, 1.5, 4.0, 10.0)
+STALLS = usually(0.9, 0.1, 0.3, 3.0, 15.0, 60.0)
+
+
+@pytest.mark.parametrize("path", usually(constant, jittering))
 @pytest.mark.parametrize("seconds", DELAYS)
 @pytest.mark.parametrize("name", LINES)
 def test_a_slow_path_costs_time_and_no_truth(
@@ -110,10 +115,10 @@ def test_a_slow_path_costs_time_and_no_truth(
     assert answering == {drive.name for drive in story.drives}
 
 
-@pytest.mark.parametrize("path", STALLS)
+@pytest.mark.parametrize("longest", STALLS)
 @pytest.mark.parametrize("name", LINES)
-def test_a_stall_costs_time_and_no_truth(name: str, path: str) -> None:
-    Path(of_one_variant(LINES[name])).tell_of(stalling(STALLS[path]))
+def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
+    Path(of_one_variant(LINES[name])).tell_of(stalling(longest))
 
 
 class PathLine:
@@ -177,7 +182,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
     return made
 
 
-@pytest.mark.parametrize("path", [constant, jittering])
+@pytest.mark.parametrize("path", usually(constant, jittering))
 @pytest.mark.parametrize("seconds", DELAYS)
 @pytest.mark.parametrize("name", LINES)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
@@ -209,7 +214,7 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6, 4.0])
+@pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
 @pytest.mark.parametrize("name", WRITTEN)
 def test_what_became_of_a_write_over_a_slow_path_is_true(
     name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
@@ -261,7 +266,7 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
             assert opened.respondent(drive).timeout == 0.08
 
 
-@pytest.mark.parametrize("kind", ["drop", "flip", "split", "noise"])
+@pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))
 def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
     story = Path(of_all_variants())
     story.wire.faults = Faults(**{kind: 0.1})
