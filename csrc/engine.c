@@ -242,6 +242,13 @@ void md_port_tell_echo(struct md_port *port, int echo)
     leave(port->engine);
 }
 
+void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before)
+{
+    enter(port->engine);
+    md_late_inherit(drive, before);
+    leave(port->engine);
+}
+
 void md_port_stop(struct md_port *port)
 {
     struct md_engine *engine = port->engine;

@@ -307,6 +307,8 @@ void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Nothing more of what is queued or repeated is begun; whether one of that is under way. Urgent
  * exchanges still are. */
 int md_port_end(struct md_port *port);
+/* md_late_inherit, while the thread looks at neither. */
+void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
 /* Nothing more is carried out, and the descriptor is the caller's again. What is under way after
  * md_port_end() is MD_POLL_ENDED. */
 void md_port_stop(struct md_port *port);

@@ -109,8 +109,8 @@ class Exchanges:
         # another family at its address would get that.
         respondent = self._respondents[drive] = self._known.setdefault(key, made)
         for other, known in self._known.items():
-            if other[0] == drive.address:
-                respondent.inherit(known)
+            if other[0] == drive.address and known is not respondent:
+                self.line.inherit(respondent, known)
         respondent.prove_by(
             [
                 exchange(drive, block.request(drive.address), respondent, NO_ROWS, answer=answer)

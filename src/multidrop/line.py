@@ -19,7 +19,17 @@ import serial
 
 from multidrop import port_identity
 from multidrop.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
-from multidrop.core import REFUSALS, Completion, Echo, Exchange, Port, Result, Tap, utc_minus_monotonic_ns
+from multidrop.core import (
+    REFUSALS,
+    Completion,
+    Echo,
+    Exchange,
+    Port,
+    Respondent,
+    Result,
+    Tap,
+    utc_minus_monotonic_ns,
+)
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.forks import tell_of_forks
 from multidrop.rfc2217 import RFC2217Port
@@ -287,6 +297,14 @@ class Line:
             except PORT_FAILURES as failure:
                 raise LineError(self.port, reason_of(failure)) from failure
             self._settings = settings
+
+    def inherit(self, respondent: Respondent, before: Respondent) -> None:
+        """Have a drive take the place of another at its address, whose answers may still come."""
+        with self._lock:
+            if self._core:
+                self._core.inherit(respondent, before)
+            else:
+                respondent.inherit(before)
 
     def _opened(self, settings: tuple[int, str]) -> Port:
         if self._core is None:

@@ -94,6 +94,11 @@ class Port:
         """Whether its adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
+    def inherit(self, respondent: Respondent, before: Respondent) -> None:
+        """Have one take the place of another, which may be on the line."""
+        self._kept.update((respondent, before))
+        lib.md_port_inherit(self.c, respondent.c, before.c)
+
     def end(self) -> bool:
         """Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are."""
         return bool(lib.md_port_end(self.c))
