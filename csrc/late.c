@@ -28,6 +28,14 @@ static int is_same_question(const struct md_owed *owed, const struct md_exchange
            memcmp(owed->data, request->data, kept) == 0;
 }
 
+int md_late_is_repeated(const struct md_exchange *exchange)
+{
+    for (uint32_t i = 0; i < exchange->drive->owed_count; i++)
+        if (is_same_question(&exchange->drive->owed[i], exchange))
+            return 1;
+    return 0;
+}
+
 static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     return !owed->most || !exchange->most || (owed->least <= exchange->most && exchange->least <= owed->most);

@@ -6,6 +6,8 @@
 
 /* A late answer could be taken for its reply, and it may not be sent now. */
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
+/* An answer to the same question is outstanding: then a second copy of it is no adapter's echo. */
+int md_late_is_repeated(const struct md_exchange *exchange);
 /* The exchange under way is over, and its answer may still come: for so long in any order. */
 void md_late_expect(struct md_line *line, int64_t window_ns);
 /* Answers of this drive may still come that were asked for on another line, or before the port was lost. */

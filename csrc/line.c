@@ -191,7 +191,8 @@ static void time_out(struct md_line *line)
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first)) /* it may be an earlier one's */
         md_late_expect(line, md_window_ns(exchange));
-    md_learn_silence(exchange->drive);
+    if (!is_doubtful)
+        md_learn_silence(exchange->drive);
     int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
     finish(line, is_doubtful ? MD_MAYBE_ECHO : reason, line->rx, line->rx_len);
 }
@@ -201,9 +202,9 @@ static void time_out(struct md_line *line)
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
-    if (line->completion->skipped <= most_stray && !is_copy(line, reply_at))
+    if (line->completion->skipped - line->cut <= most_stray && !is_copy(line, reply_at))
         learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* one may have been lost */
-    for (size_t at = 0; at + line->tx_len <= reply_at; at++)
+    for (size_t at = 0; at + line->tx_len <= reply_at && !md_late_is_repeated(line->exchange); at++)
         if (is_copy(line, at))
             learn(line, MD_ECHO);
 }
@@ -225,6 +226,7 @@ static int has_begun(const struct md_line *line)
 static void cut_out(struct md_line *line, size_t at, size_t len)
 {
     tell(line, MD_NOISE, line->completion->last_ns, line->rx + at, len);
+    line->cut += (uint32_t)len;
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - len);
     memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
@@ -461,6 +463,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
             line->ready_ns = line->begun_by_ns;
     }
     line->waited = line->looks = line->sight = 0;
+    line->cut = 0;
     line->state = LISTENING;
 }
 

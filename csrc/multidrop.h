@@ -175,7 +175,8 @@ struct md_exchange {
      * copy of its request. NULL: none does. */
     const struct md_exchange *teller;
     int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
-    int64_t timeout_ns;   /* at least so long its reply is waited for: a write's; 0: as learnt */
+    int64_t timeout_ns;   /* at least so long its reply is waited for: a write's; 0: as learnt. One that insists
+                             is waited for as long as answers are known to be late, but not beyond that */
     uint16_t least, most; /* the one register of its reply lies between these; most 0: it may hold anything */
     /* The stops of its drive (md_count_stop): sent only while there are no more than that. NULL: sent anyway. */
     const uint32_t *stops;
@@ -227,6 +228,7 @@ struct md_line {
     int echo_due;             /* a copy of the request is still to come, and is not its reply */
     int waited, looks;        /* since the request left: whether it was left alone, how often it was looked at */
     struct md_tap *tap;       /* is told of all that goes over the line; NULL: nobody is */
+    uint32_t cut;             /* bytes of late answers that came since the request left */
     uint16_t sight_at, sight; /* where the reply may begin, and what there was of it at the first sight */
     uint16_t burst;           /* at most so many characters wait in the adapter; 0: it may be a whole reply */
     uint8_t tx[513], rx[1026];

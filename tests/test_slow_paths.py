@@ -12,16 +12,17 @@ from typing import Any, cast
 
 import pytest
 from lines import proof
+from motors import MAKE, Heard
 from test_hostile_line import LINES, Story, of_all_variants, of_one_variant
 from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 
 from multidrop import acquaintance, bus, call, exchanges, performer, writing
 from multidrop.bus import Bus
-from multidrop.core import Completion, Exchange
+from multidrop.core import Completion, Exchange, Message
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.outcome import Effect
-from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, simulated
+from multidrop.sim import EncodedDrive, Faults, PoweredDrive, SimulatedDrive, simulated
 
 pytestmark = pytest.mark.story
 
@@ -264,6 +265,38 @@ def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
             for _ in range(30):
                 opened.read(drive, drive.register("fault"))
             assert opened.respondent(drive).timeout == 0.08
+
+
+@pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("model", MAKE)
+def test_a_stop_over_a_slow_path_is_seen_to_be_done(
+    model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    """Its first frame leaves at once; what it asks then waits for as long as answers are known to take."""
+    drive = MAKE[model](1)
+    sim = simulated(drive)
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    opened, line = path_of([sim], constant(seconds))
+    heard = Heard(sim)
+    sent_after: list[float] = []
+    begun = line.now
+
+    def note(request: Message) -> bool:
+        if request in heard.writes:
+            sent_after.append((line.now - begun) / S)
+        return False
+
+    heard.loses = note
+    with opened:
+        line.wire.advance(line.now / S)  # its clock begins
+        sim.motor.run(1)
+        opened.drives[0].stop()
+    assert not sim.motor.energised
+    assert sent_after[0] < 1  # after the looks that are answered, and one that is not
+    assert len(sent_after) <= 6
+    assert (line.now - begun) / S < 8 * seconds + 3
 
 
 @pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))

@@ -17,7 +17,7 @@ from multidrop.errors import (
     NotAttached,
     Refused,
 )
-from multidrop.exchanges import READ_ATTEMPTS, Exchanges
+from multidrop.exchanges import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 from multidrop.line import sleep
 
 SURE = 2  # times that a drive answers as another would, before a stop is not sent to it
@@ -76,11 +76,13 @@ class Acquaintance:
         name = step.register.name
         return self._exchanges.values(drive, [step.register], attempts, insists=insists)[name]
 
-    def _read_something(self, drive: Drive, attempts: int, *, insists: bool = False) -> None:
+    def _read_something(
+        self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0
+    ) -> None:
         register = drive.telling or next((it for it in drive.registers.values() if it.readable), None)
         if register is not None:
             with suppress(DriveRefused):  # an answer too
-                self._exchanges.values(drive, [register], attempts, insists=insists)
+                self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
     def tell_echo(self, drive: Drive, *, insists: bool = False) -> None:
         """Read once, so that the line learns whether what it heard was its adapter's echo.
@@ -89,7 +91,7 @@ class Acquaintance:
         are copies too, would not count, until something is read.
         """
         with suppress(NoReply, BadReply, LineError, NotAttached):
-            self._read_something(drive, 1, insists=insists)
+            self._read_something(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
 
     def why_doubtful(self, drive: Drive) -> str:
         """Return why a reply that is a copy of its request may be the adapter's echo; "" where it is not.

@@ -63,13 +63,16 @@ def reading(
     *,
     period: float = 0.0,
     insists: bool = False,
+    timeout: float = 0.0,
 ) -> Exchange:
     """What reads a block from this drive, whose reply is not taken from an adapter's echo."""
     teller = None
     if drive.telling and drive.telling not in block.registers:
         teller = exchange(drive, alone(drive.telling).request(drive.address), respondent, NO_ROWS)
     request = block.request(drive.address)
-    return exchange(drive, request, respondent, rows, period=period, insists=insists, teller=teller)
+    return exchange(
+        drive, request, respondent, rows, period=period, insists=insists, timeout=timeout, teller=teller
+    )
 
 
 class Prepared:
@@ -140,15 +143,22 @@ class Exchanges:
         return self._heard.get(drive, self) is self.line.queue
 
     def values(
-        self, drive: Drive, registers: list[Register[Any]], attempts: int, *, insists: bool = False
+        self,
+        drive: Drive,
+        registers: list[Register[Any]],
+        attempts: int,
+        *,
+        insists: bool = False,
+        timeout: float = 0.0,
     ) -> dict[str, Any]:
         """Registers' values by name, each block asked for so many times until it is answered.
 
-        One that insists waits for no earlier answer, which may then pass for its own.
+        One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
+        answers are known to be late, for as long as `timeout` seconds.
         """
         raw: dict[str, Any] = {}
         for block in self._prepare(drive).blocks(tuple(registers)):
-            reply = self._ask(drive, block, attempts, insists)
+            reply = self._ask(drive, block, attempts, insists, timeout)
             for register in block.registers:
                 raw[register.name] = register.decode(
                     raw_value(reply.data, block.offset(register), register.wire)
@@ -179,9 +189,9 @@ class Exchanges:
         reply = self._read(drive, self._carry_out(made))
         return {register.name: register.decode(raw_value(reply.data, block.offset(register), register.wire))}
 
-    def _ask(self, drive: Drive, block: Block, attempts: int, insists: bool) -> Message:
+    def _ask(self, drive: Drive, block: Block, attempts: int, insists: bool, timeout: float) -> Message:
         if insists:
-            made = reading(drive, block, self.respondent(drive), insists=True)
+            made = reading(drive, block, self.respondent(drive), insists=True, timeout=timeout)
         else:
             made = self._prepare(drive).exchange(block)
         for _ in range(attempts - 1):
@@ -201,15 +211,16 @@ class Exchanges:
         expires_ns: int = 0,
         *,
         insists: bool = False,
+        timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
         """Write once, ahead of any polling; first an answer that may still come late is waited for.
 
-        After `expires_ns` (0: never), and without a good permit, it is not sent. One that insists waits for
-        no answer. Raises NoReply, and nothing was sent, where answers may still come late and the drive is
-        silent.
+        After `expires_ns` (0: never), and without a good permit, it is not sent. Its answer is waited for
+        for `timeout` seconds at least. One that insists waits for no earlier answer, and for its own, where
+        answers are known to be late, for as long as `timeout`. Raises NoReply, and nothing was sent,
+        where answers may still come late and the drive is silent.
         """
-        timeout = 0.0 if insists else WRITE_TIMEOUT
         made = exchange(
             drive,
             request,

@@ -21,7 +21,7 @@ from multidrop.errors import (
     Overtaken,
     Unconfirmed,
 )
-from multidrop.exchanges import READ_ATTEMPTS, Exchanges
+from multidrop.exchanges import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 from multidrop.line import now_ns, sleep
 from multidrop.outcome import Outcome
 from multidrop.stopping import Patience, Stopped, Stopping, send_once_more, stop_together
@@ -274,17 +274,18 @@ class Performer:
                 self._over.notify_all()
             self._writer.catch_up()
 
-    def _do_stop(self, drive: Drive, step: Step) -> Any:
+    def _do_stop(self, stop: Stopping, step: Step) -> Any:
+        """The first stop must not hold up those of others; one that was sent may wait for a late answer."""
         if isinstance(step, Read):  # asked once: what is not answered has the stop sent again
             self._regain()
-            return self._read(drive, step, 1)
+            return self._read(stop.drive, step, 1)
         assert isinstance(step, Write)
-        return self.insist(drive, step).value
+        return self.insist(stop.drive, step, WRITE_TIMEOUT if stop.is_sent else 0.0).value
 
-    def insist(self, drive: Drive, step: Write) -> Outcome:
+    def insist(self, drive: Drive, step: Write, timeout: float = 0.0) -> Outcome:
         """Write what stops the motor, on a port that is opened again if it was lost."""
         self._regain()
-        return self._writer.insist(drive, step)
+        return self._writer.insist(drive, step, timeout)
 
     def _regain(self) -> None:
         line, now = self._exchanges.line, now_ns()

@@ -30,7 +30,7 @@ LEAST_S = 30.0  # so long a stop is repeated where its caller says nothing else
 PAUSE_S = 0.2  # before it is repeated
 MOST_STEPS = 8  # that are sent once more after an interruption
 
-Do = Callable[[Drive, Step], Any]
+Do = Callable[["Stopping", Step], Any]
 
 
 class Seen(Enum):
@@ -134,7 +134,7 @@ class Stopping:
             self._resume = lambda: script.throw(again)
             return
         try:
-            result = do(self.drive, step)
+            result = do(self, step)
         except (BusError, ValueError) as failure:
             error = failure  # outlives the except clause
             self._note(step, error)

@@ -70,18 +70,19 @@ class Writer:
             self._enter(drive, register, kept)
         return self._sent(drive, register, raw, call)
 
-    def insist(self, drive: Drive, step: Write) -> Outcome:
+    def insist(self, drive: Drive, step: Write, timeout: float = 0.0) -> Outcome:
         """Write what stops the motor, or does no harm at any time: the port alone keeps it back.
 
         Neither a rule nor the ledger is asked. It is noted in the log, and counted where it may wear an
         EEPROM, afterwards, by `catch_up`: a disk may hang. Only what proves another family is Refused.
+        Where answers are known to be late, its own is waited for for as long as `timeout` seconds.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
         self.acquaintance.glance(drive)
         kept = wears(drive, register)
         try:
-            return self._sent(drive, register, raw, None)
+            return self._sent(drive, register, raw, None, timeout)
         finally:
             if kept is not Kept.RAM:
                 self._uncounted.append(self._cell(drive, register))
@@ -111,13 +112,15 @@ class Writer:
         except OSError as failure:
             logging.getLogger("multidrop").warning("a stop was not counted: %s", failure)
 
-    def _sent(self, drive: Drive, register: Register[Any], raw: float, call: Call | None) -> Outcome:
+    def _sent(
+        self, drive: Drive, register: Register[Any], raw: float, call: Call | None, timeout: float = 0.0
+    ) -> Outcome:
         """Send it once: for its call, or else insisting."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _what(register, asked)
         log = self.log if call else self._log_later
         with self._noted(drive, request, what, log):
-            completion = self._carried_out(drive, request, what, call)
+            completion = self._carried_out(drive, request, what, call, timeout)
             outcome = self._outcome(drive, register, asked, completion, call)
             if (
                 outcome.effect is Effect.UNCONFIRMED
@@ -131,9 +134,11 @@ class Writer:
         log(drive, request, what, outcome.effect, why, outcome.held)
         return outcome
 
-    def _carried_out(self, drive: Drive, request: Message, what: str, call: Call | None) -> Completion:
+    def _carried_out(
+        self, drive: Drive, request: Message, what: str, call: Call | None, timeout: float = 0.0
+    ) -> Completion:
         if call is None:
-            return self._exchanges.carry_out(drive, request, insists=True)
+            return self._exchanges.carry_out(drive, request, insists=True, timeout=timeout)
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
         if completion.result == Result.EXPIRED:
@@ -289,7 +294,7 @@ class Writer:
         request = write_request(drive, register, raw, address=0)
         what = f"{register.name} = {register.format(register.decode(raw))}"
         with self._noted(drive, request, what, self._log_later):
-            self._exchanges.carry_out(drive, request, insists=True)
+            self._exchanges.carry_out(drive, request, insists=True, timeout=0.0)
         self._log_later(drive, request, what, Effect.UNCONFIRMED, "nobody answers a broadcast")
 
 
