@@ -452,6 +452,26 @@ def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     }
 
 
+def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor for the first one, of a drive that is known."""
+    others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
+    hall = Hall(monkeypatch, *(simulated(drive) for drive in others))
+    hall.attach(InvtCHE(1, maximum_frequency=50))
+    for drive in others[1:]:
+        hall.attach(drive)
+    hall.bus.introduce(others[2])
+    begun = len(hall.frames)
+    found = hall.bus.stop_all()
+    addresses = [request.address for request, _ in hall.frames[begun:]]
+    assert [request.address for request in writes(hall, begun)][:2] == [3, 2]
+    assert addresses[0] == 3
+    before = first(hall, begun, lambda it: it.address == 2)
+    assert before is not None
+    assert addresses[:before].count(1) == 1
+    assert found["invt-che@1"].seen is Seen.FAILED
+    assert all(it.address != 1 for it in writes(hall, begun))
+
+
 def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -22,6 +22,11 @@ from multidrop.line import sleep
 
 SURE = 2  # times that a drive answers as another would, before a stop is not sent to it
 
+
+class LookAgain(Exception):
+    """It answered once as another would: it is looked at again when others had their turn."""
+
+
 Timed = Callable[[], AbstractContextManager[None]]
 
 
@@ -32,6 +37,7 @@ class Acquaintance:
         self._exchanges = exchanges
         self._known: dict[Drive, object] = {}  # the open port on which it was found to be of its family
         self._glanced: dict[Drive, object] = {}  # or on which a glance proved nothing against a stop
+        self._doubts: dict[Drive, tuple[object, tuple[str, bool]]] = {}  # the port, and what the first said
 
     def is_known(self, drive: Drive) -> bool:
         return self._known.get(drive, self) is self._exchanges.line.queue
@@ -39,6 +45,7 @@ class Acquaintance:
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
         self._glanced.pop(drive, None)
+        self._doubts.pop(drive, None)
 
     def make(self, drive: Drive, timed: Timed = nullcontext) -> None:
         """Look, once; Refused when it is of another family, NoReply when it cannot be heard.
@@ -113,6 +120,8 @@ class Acquaintance:
     def glance(self, drive: Drive) -> None:
         """Look, once and without waiting for anything; only what proves another family is Refused.
 
+        Raises LookAgain after the first answer as another's: call it again, after the stops of others.
+
         The stop of one family may be another's run. But a look that fails proves nothing, nor does one that
         may have been given the answer to an earlier question: the stop is sent then. It is withheld from a
         drive that answered all that it was ever asked, and SURE times in a row as another would; where it
@@ -121,18 +130,16 @@ class Acquaintance:
         port = self._exchanges.line.queue
         if self.is_known(drive) or self._glanced.get(drive, self) is port:
             return
+        look = self._glanced_at(drive) if self._is_in_step(drive) else None
+        on, before = self._doubts.pop(drive, (port, None))
+        if look is not None and (before is None or on is not port):
+            self._doubts[drive] = port, look
+            raise LookAgain
+        if look is not None and look == before:
+            (why, is_answered), other = look, self._lookalike(drive)
+            if other is not None or (is_answered and not drive.identity_is_inferred):
+                raise self._withheld(drive, why, other)  # it is looked at again before the next stop
         self._glanced[drive] = port
-        looks: list[tuple[str, bool]] = []
-        while len(looks) < SURE:
-            look = self._glanced_at(drive) if self._is_in_step(drive) else None
-            if look is None:
-                return
-            looks.append(look)
-        (why, is_answered), other = looks[0], self._lookalike(drive)
-        is_proof = other is not None or (is_answered and not drive.identity_is_inferred)
-        if len(set(looks)) == 1 and is_proof:
-            del self._glanced[drive]  # it is looked at again before the next stop
-            raise self._withheld(drive, why, other)
 
     def _is_in_step(self, drive: Drive) -> bool:
         """Whether an answer from its address can only be the one to what is asked now."""

@@ -338,8 +338,9 @@ class Bus:
         meanwhile. An interruption has each that does not stand yet sent its stop once more.
         """
         respondents = self.respondents
-        silent_last = sorted(respondents, key=lambda drive: respondents[drive].failures)
-        return self._performer.stop_all(silent_last, self._stop_by_broadcast, seconds)
+        is_known = self._writer.acquaintance.is_known
+        in_turn = sorted(respondents, key=lambda drive: (not is_known(drive), respondents[drive].failures))
+        return self._performer.stop_all(in_turn, self._stop_by_broadcast, seconds)
 
     def _stop_by_broadcast(self) -> bool:
         """Whether a stop was broadcast, which it is only where that harms none and all are known."""

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from math import isnan
 from typing import Any
 
+from multidrop.acquaintance import LookAgain
 from multidrop.call import Call
 from multidrop.core import Latch
 from multidrop.drive import Drive, Insist, Read, Script, Step, Wait, Write, carry_out
@@ -208,7 +209,7 @@ class Performer:
             call.unheard = None
             return value
         if isinstance(step, Insist):
-            return self._writer.insist(drive, step).value
+            return self.insist(drive, step).value
         return self._writer.put(drive, step, call).value
 
     def _read(self, drive: Drive, step: Read, attempts: int = READ_ATTEMPTS) -> Any:
@@ -276,16 +277,19 @@ class Performer:
 
     def _do_stop(self, stop: Stopping, step: Step) -> Any:
         """The first stop must not hold up those of others; one that was sent may wait for a late answer."""
+        self._regain()
         if isinstance(step, Read):  # asked once: what is not answered has the stop sent again
-            self._regain()
             return self._read(stop.drive, step, 1)
         assert isinstance(step, Write)
-        return self.insist(stop.drive, step, WRITE_TIMEOUT if stop.is_sent else 0.0).value
+        return self._writer.insist(stop.drive, step, WRITE_TIMEOUT if stop.is_sent else 0.0).value
 
-    def insist(self, drive: Drive, step: Write, timeout: float = 0.0) -> Outcome:
+    def insist(self, drive: Drive, step: Write) -> Outcome:
         """Write what stops the motor, on a port that is opened again if it was lost."""
         self._regain()
-        return self._writer.insist(drive, step, timeout)
+        try:
+            return self._writer.insist(drive, step)
+        except LookAgain:  # nobody else waits
+            return self._writer.insist(drive, step)
 
     def _regain(self) -> None:
         line, now = self._exchanges.line, now_ns()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from multidrop.acquaintance import LookAgain
 from multidrop.drive import Drive, Pulse, Script, Step, Wait, Write
 from multidrop.errors import (
     BadReply,
@@ -135,6 +136,8 @@ class Stopping:
             return
         try:
             result = do(self, step)
+        except LookAgain:
+            self._resume = lambda: step
         except (BusError, ValueError) as failure:
             error = failure  # outlives the except clause
             self._note(step, error)
