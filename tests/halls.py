@@ -8,7 +8,16 @@ from typing import Any
 import pytest
 
 from multidrop import acquaintance, bus, call, exchanges, performer, writing
-from multidrop.core import Completion, Exchange, Message, Result, build_reply, build_request, parse_reply
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Message,
+    Respondent,
+    Result,
+    build_reply,
+    build_request,
+    parse_reply,
+)
 from multidrop.drive import Drive
 from multidrop.sim import PoweredDrive, SimulatedDrive, simulated
 
@@ -62,6 +71,9 @@ class Hall:
 
     def overruns(self) -> None:
         return None
+
+    def inherit(self, respondent: Respondent, before: Respondent) -> None:
+        respondent.inherit(before)
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         request = exchange.request
