@@ -36,7 +36,8 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
 
 /* After a failure a question has all the time that the document allows: the drive may have become slower.
  * While it stays silent that is rare, because it is time that the other drives lose. What must not wait so
- * long before it is repeated, a stop, has twice the time after each failure; and where answers are known to be
+ * long before it is repeated, a stop, has twice the time after each failure but
+ * the first, which is a look's; and where answers are known to be
  * late, as late as its sender bears. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
@@ -45,7 +46,8 @@ int64_t md_timeout_ns(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
     if (exchange->insists) {
-        int64_t doubled_ns = usual_timeout_ns(drive) << sooner(drive->failures, MOST_DOUBLINGS);
+        int64_t doublings = drive->failures > 1 ? sooner(drive->failures - 1, MOST_DOUBLINGS) : 0;
+        int64_t doubled_ns = usual_timeout_ns(drive) << doublings;
         int64_t late_ns = sooner(learnt(&drive->patience_ns), exchange->timeout_ns);
         return later(sooner(doubled_ns, drive->most_timeout_ns), late_ns);
     }
