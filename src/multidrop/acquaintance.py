@@ -13,6 +13,7 @@ from multidrop.errors import (
     BusError,
     DriveRefused,
     LineError,
+    LookAgain,
     NoReply,
     NotAttached,
     Refused,
@@ -21,11 +22,6 @@ from multidrop.exchanges import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 from multidrop.line import sleep
 
 SURE = 2  # times that a drive answers as another would, before a stop is not sent to it
-
-
-class LookAgain(Exception):
-    """It answered once as another would: it is looked at again when others had their turn."""
-
 
 Timed = Callable[[], AbstractContextManager[None]]
 

@@ -114,3 +114,7 @@ class Refused(BusError, ValueError):
         self.register = register
         self.rule = rule
         self.place = place
+
+
+class LookAgain(Exception):
+    """A drive answered once as another would: it is looked at again, after the stops of others."""

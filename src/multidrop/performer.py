@@ -9,7 +9,6 @@ from contextlib import ExitStack, contextmanager
 from math import isnan
 from typing import Any
 
-from multidrop.acquaintance import LookAgain
 from multidrop.call import Call
 from multidrop.core import Latch
 from multidrop.drive import Drive, Insist, Read, Script, Step, Wait, Write, carry_out
@@ -17,6 +16,7 @@ from multidrop.errors import (
     BadReply,
     DriveRefused,
     LineError,
+    LookAgain,
     NoReply,
     NotAttached,
     Overtaken,

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from multidrop.acquaintance import LookAgain
 from multidrop.drive import Drive, Pulse, Script, Step, Wait, Write
 from multidrop.errors import (
     BadReply,
     BusError,
     DriveRefused,
     LineError,
+    LookAgain,
     NoReply,
     NotDone,
     PortLost,
