@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from lines import Faulty
+from lines import Faulty, until
 from motors import Heard
 from test_cli import TOY, Run, run
 from toy import Status, Toy
@@ -385,6 +385,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard
     heard.loses = pressing(lambda request: request.start == 0x1000)
     status, _, err = run("stop", *words)
     assert status == 130
+    until(lambda: len(heard.writes) >= begun + 2)  # the drive may hear it when the client has left
     assert [it.data for it in heard.writes[begun:]] == [b"\0\5"] * 2
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
