@@ -261,7 +261,8 @@ void md_late_resume(struct md_line *line, struct md_drive *drive)
 
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 {
-    if (drive == before || before->late_until_ns <= drive->late_until_ns)
+    int is_known = drive->owed_count > 0 && before->late_until_ns <= drive->late_until_ns;
+    if (drive == before || before->owed_count == 0 || is_known)
         return;
     drive->owed_count = before->owed_count;
     memcpy(drive->owed, before->owed, sizeof drive->owed);
@@ -309,7 +310,8 @@ static int take_of(struct md_line *line, struct md_drive *drive, size_t at, int6
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (is_surely_late && fits == 1)
         md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
-    line->late_since_ns = is_same_question(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
+    int is_the_same = !is_surely_late && is_same_question(earliest, line->exchange); /* else that may be gone */
+    line->late_since_ns = is_the_same ? earliest->sent_ns[0] : 0;
     drop_earliest_time(earliest);
     if (earliest->times == 0)
         drop(drive, earliest);
