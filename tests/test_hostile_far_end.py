@@ -28,7 +28,7 @@ from multidrop.errors import BusError
 from multidrop.plant import PolledDrive
 from multidrop.poller import Poller
 
-SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "2")))
+SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))
 FRAMES = 150  # that the far end hears
 STRANGER = 99  # no drive of ours has this address
 MOTOR = "yd1000"

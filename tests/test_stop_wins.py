@@ -43,7 +43,7 @@ from multidrop.errors import BusError
 from multidrop.motion import start_staggered
 from multidrop.poller import Poller
 
-EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "3"))
+EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
 EXPIRY = 60.0  # s: a busy machine is slow, and nothing is wrong with it
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

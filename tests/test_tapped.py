@@ -197,8 +197,8 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.parametrize(
     "make",
     [
-        pytest.param(rough_wires, id="rough", marks=pytest.mark.long),
-        pytest.param(echoing_wires, id="echoing"),
+        pytest.param(rough_wires, id="rough"),
+        pytest.param(echoing_wires, id="echoing", marks=pytest.mark.long),
     ],
 )
 def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(
