@@ -101,7 +101,14 @@ def usually(tried: object, *others: object) -> list[Any]:
     return [tried, *(pytest.param(other, marks=pytest.mark.long) for other in others)]
 
 
-DELAYS = usually(0.6, 0.0, 0.1, 0.3, 0.45, 1.5, 4.0, 10.0)
+PATHS = [
+    pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
+    for path, delays in (
+        (constant, (0.0, 0.1, 0.3, 0.45, 0.6, 1.5, 4.0, 10.0)),
+        (jittering, (0.3, 0.6, 10.0)),
+    )
+    for seconds in delays
+]
 FEW = [
     pytest.param(name, marks=() if name in ("innovert-ibd rtu", "yd1000 rtu") else pytest.mark.long)
     for name in LINES
@@ -109,8 +116,7 @@ FEW = [
 STALLS = usually(0.9, 0.1, 0.3, 3.0, 15.0, 60.0)
 
 
-@pytest.mark.parametrize("path", usually(constant, jittering))
-@pytest.mark.parametrize("seconds", DELAYS)
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
 @pytest.mark.parametrize("name", LINES)
 def test_a_slow_path_costs_time_and_no_truth(
     name: str, seconds: float, path: Callable[[float], Delay]
@@ -187,8 +193,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
     return made
 
 
-@pytest.mark.parametrize("path", usually(constant, jittering))
-@pytest.mark.parametrize("seconds", DELAYS)
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
 @pytest.mark.parametrize("name", LINES)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
     name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
