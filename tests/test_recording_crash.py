@@ -235,7 +235,8 @@ def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_read_only_directory(suffix: str) -> None:
+def test_read_only_directory(tmp_path: Path, suffix: str) -> None:
+    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # loads what nobody may be unable to read below
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:
