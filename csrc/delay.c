@@ -66,7 +66,7 @@ int64_t md_present_timeout_ns(const struct md_drive *drive)
 
 int64_t md_vain_ns(const struct md_drive *drive)
 {
-    return drive->failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
+    return __atomic_load_n(&drive->failures, __ATOMIC_RELAXED) % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
 }
 
 static void smooth(struct md_drive *drive, int64_t delay_ns)

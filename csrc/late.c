@@ -306,7 +306,7 @@ static int take_of(struct md_line *line, struct md_drive *drive, size_t at, int6
     if (!earliest)
         return 0;
     drive->tally.late++;
-    drive->failures = 0;
+    md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (is_surely_late && fits == 1)
         md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);

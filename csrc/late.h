@@ -19,4 +19,10 @@ int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most);
 int md_is_read(int framing, uint8_t function);
 
+/* Others look at it meanwhile. */
+static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
+{
+    __atomic_store_n(&drive->failures, failures, __ATOMIC_RELAXED);
+}
+
 #endif

@@ -48,9 +48,9 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_drive *drive = exchange->drive;
     md_tally_end(&drive->tally, exchange, completion);
     if (is_failure(completion->result))
-        drive->failures++;
+        md_count_failures(drive, drive->failures + 1);
     if (completion->result > 0)
-        drive->failures = 0;
+        md_count_failures(drive, 0);
 }
 
 static void count_refusals(struct md_block *block, const struct md_completion *completion)
