@@ -26,9 +26,11 @@ const struct md_exchange *md_before(struct md_before *before, const struct md_ex
     return exchange->teller;
 }
 
-int md_is_asked_again(struct md_before *before, const struct md_completion *completion)
+/* A write never is: it may have started a motor. */
+int md_is_asked_again(struct md_before *before, const struct md_exchange *exchange, const struct md_completion *completion)
 {
-    if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns && before->proofs < MOST_PROOFS_ASKED)
+    int is_in_doubt = completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns;
+    if (is_in_doubt && md_is_read(exchange->framing, exchange->request.function) && before->proofs < MOST_PROOFS_ASKED)
         return 1;
     before->then = NULL;
     return 0;

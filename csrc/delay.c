@@ -36,9 +36,8 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
 
 /* After a failure a question has all the time that the document allows: the drive may have become slower.
  * While it stays silent that is rare, because it is time that the other drives lose. What must not wait so
- * long before it is repeated, a stop, has twice the time after each failure but
- * the first, which is a look's; and where answers are known to be
- * late, as late as its sender bears. */
+ * long before it is repeated, a stop, has twice the time after each failure but the first, which is a look's;
+ * and where answers are known to be late, as long as its sender bears. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -66,7 +65,8 @@ int64_t md_present_timeout_ns(const struct md_drive *drive)
 
 int64_t md_vain_ns(const struct md_drive *drive)
 {
-    return __atomic_load_n(&drive->failures, __ATOMIC_RELAXED) % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
+    uint32_t failures = __atomic_load_n(&drive->failures, __ATOMIC_RELAXED);
+    return failures % RARELY == 1 ? drive->most_timeout_ns : usual_timeout_ns(drive);
 }
 
 static void smooth(struct md_drive *drive, int64_t delay_ns)

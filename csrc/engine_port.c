@@ -189,7 +189,7 @@ static void settle(struct md_port *port, int64_t took_ns)
         port->owed_ns = MOST_OWED_NS;
 }
 
-/* Whether one exchange of what is polled may hold up the wishes: never two in a row, and never a stop. */
+/* One exchange of what is polled may hold up the wishes: never two in a row, and never a stop. */
 static int is_owed(const struct md_port *port)
 {
     for (const struct wish *wish = port->wishes; wish; wish = wish->next)
@@ -204,7 +204,7 @@ static void grant(struct md_port *port, struct wish *wish, int64_t now_ns)
         md_line_abandon(&port->line, MD_EXPIRED, 0);
 }
 
-/* Take up what is queued and due, or else repeated; whether there is any. */
+/* Take up what is queued and due, or else repeated; 0 where there is none. */
 static int take_polled(struct md_port *port, int64_t *wake_ns, int64_t now_ns)
 {
     if (port->ending)
@@ -260,7 +260,7 @@ void md_port_finish(struct md_port *port)
     if (turn == BEFORE)
         return;
     int goes_on = !port->progress.lost && (turn == WISHED || !port->ending);
-    if (md_is_asked_again(&port->before, port->line.completion) && goes_on) {
+    if (md_is_asked_again(&port->before, port->line.exchange, port->line.completion) && goes_on) {
         if (turn == REPEATED && port->round_len)
             port->round_at = (port->round_at ? port->round_at : port->round_len) - 1;
         return;

@@ -19,6 +19,18 @@ static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anythin
 
 /* ---- what could be taken for what ---- */
 
+static struct md_owed question_of(const struct md_exchange *exchange)
+{
+    const struct md_message *request = &exchange->request;
+    struct md_owed owed = {.framing = (uint8_t)exchange->framing, .address = request->address,
+                           .function = request->function, .start = request->start, .count = request->count,
+                           .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
+                           .least = exchange->least, .most = exchange->most,
+                           .data_len = (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT)};
+    memcpy(owed.data, request->data, owed.data_len);
+    return owed;
+}
+
 static int is_same_question(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -108,18 +120,18 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
     }
 }
 
-/* Outstanding answers that could be taken for the exchange's; `own`: those to the same question too. */
-static unsigned count_mistakable(const struct md_exchange *exchange, int own)
+/* One that is outstanding could be taken for the exchange's; `own`: one to the same question too. */
+static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
-    unsigned found = 0;
+    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->owed[i];
-        int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
-        if (is_open(drive, owed) && (own || !is_same_question(owed, exchange)))
-            found += is_crowded || is_mistakable(owed, exchange);
+        int counts = is_open(drive, owed) && (own || !is_same_question(owed, exchange));
+        if (counts && (is_crowded || is_mistakable(owed, exchange)))
+            return 1;
     }
-    return found;
+    return 0;
 }
 
 /* ---- what may be asked ---- */
@@ -153,7 +165,7 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     if (is_in_window(exchange, now_ns))
         return 1;
     forget_settled(drive, now_ns);
-    return !is_proof(exchange) && count_mistakable(exchange, 0) > 0;
+    return !is_proof(exchange) && has_mistakable(exchange, 0);
 }
 
 /* The last of its proofs is kept for a drive that was heard again: so it is not outstanding from the time of
@@ -167,10 +179,8 @@ static const struct md_exchange *last_proof(const struct md_drive *drive)
 static int is_asked_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
-    struct md_owed own = {.framing = (uint8_t)exchange->framing, .function = exchange->request.function,
-                          .start = exchange->request.start,
-                          .reply_len = (uint16_t)md_reply_length(exchange->framing, &exchange->request)};
-    return exchange->drive->failures > 0 && !count_mistakable(exchange, 0) && (!last || !is_mistakable(&own, last));
+    struct md_owed own = question_of(exchange);
+    return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) && (!last || !is_mistakable(&own, last));
 }
 
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
@@ -196,7 +206,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
     if (drive->owed_count == 0 || exchange->insists || is_in_window(exchange, now_ns))
         return NULL;
     forget_settled(drive, now_ns);
-    if (!count_mistakable(exchange, 1) || is_asked_alone(exchange))
+    if (!has_mistakable(exchange, 1) || is_asked_alone(exchange))
         return NULL;
     int is_heard = drive->failures == 0;
     const struct md_exchange *latest = NULL;
@@ -229,13 +239,7 @@ static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange
     if (drive->owed_count == MD_MOST_OWED)
         return NULL;
     struct md_owed *owed = &drive->owed[drive->owed_count++];
-    const struct md_message *request = &exchange->request;
-    *owed = (struct md_owed){.framing = (uint8_t)exchange->framing, .address = request->address,
-                             .function = request->function, .start = request->start, .count = request->count,
-                             .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
-                             .least = exchange->least, .most = exchange->most};
-    owed->data_len = (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT);
-    memcpy(owed->data, request->data, owed->data_len);
+    *owed = question_of(exchange);
     return owed;
 }
 
@@ -285,33 +289,32 @@ static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t l
     return used > 0 && !md_is_in_range(&reply, owed->least, owed->most) ? MD_BAD_ECHO : used;
 }
 
-/* Account for the earliest request that this answer fits. What fits no other, and nothing that was asked
- * since, tells how late it is. */
-static int take_of(struct md_line *line, struct md_drive *drive, size_t at, int64_t now_ns, int is_surely_late, int *found)
+/* Account for the earliest request of the drive that the answer there fits: its length, MD_INCOMPLETE or
+ * MD_NO_START. What fits no other, and nothing that is asked at present, tells how late it is. */
+static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
 {
-    const uint8_t *bytes = line->rx + at;
-    size_t len = line->rx_len - at;
     struct md_owed *earliest = NULL;
-    int length = 0, fits = 0;
+    int found = MD_NO_START, length = 0, fits = 0;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
-        int used = parse_owed(&drive->owed[i], bytes, len);
+        struct md_owed *owed = &drive->owed[i];
+        int used = parse_owed(owed, line->rx + at, line->rx_len - at);
         if (used == MD_INCOMPLETE)
-            *found = used;
+            found = used;
         fits += used > 0;
-        if (used > 0 && (!earliest || drive->owed[i].sent_ns[0] < earliest->sent_ns[0])) {
-            earliest = &drive->owed[i];
+        if (used > 0 && (!earliest || owed->sent_ns[0] < earliest->sent_ns[0])) {
+            earliest = owed;
             length = used;
         }
     }
     if (!earliest)
-        return 0;
+        return found;
     drive->tally.late++;
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
-    if (is_surely_late && fits == 1)
+    if (since_ns)
+        *since_ns = is_same_question(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
+    else if (fits == 1)
         md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
-    int is_the_same = !is_surely_late && is_same_question(earliest, line->exchange); /* else that may be gone */
-    line->late_since_ns = is_the_same ? earliest->sent_ns[0] : 0;
     drop_earliest_time(earliest);
     if (earliest->times == 0)
         drop(drive, earliest);
@@ -320,7 +323,7 @@ static int take_of(struct md_line *line, struct md_drive *drive, size_t at, int6
     return length;
 }
 
-int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_late)
+int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
 {
     int found = MD_NO_START;
     for (struct md_drive **link = &line->late; *link;) {
@@ -330,9 +333,11 @@ int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int is_surely_
             *link = drive->next_late;
             continue;
         }
-        int used = take_of(line, drive, at, now_ns, is_surely_late, &found);
+        int used = take_of(drive, line, at, now_ns, since_ns);
         if (used > 0)
             return used;
+        if (used == MD_INCOMPLETE)
+            found = used;
         link = &drive->next_late;
     }
     return found;

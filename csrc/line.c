@@ -155,7 +155,7 @@ static int parse_at(const struct md_line *line, size_t at, struct md_message *re
 static void recognise_late_answers(struct md_line *line, size_t from, int64_t now_ns)
 {
     for (size_t at = from; line->late && at < line->rx_len; at++) {
-        int used = md_late_take(line, at, now_ns, 1);
+        int used = md_late_take(line, at, now_ns, NULL);
         if (used > 0)
             at += (size_t)used - 1;
     }
@@ -244,12 +244,13 @@ static void extend(struct md_line *line)
 /* It answers this question or an earlier one, and the other's answer may still come. A row may have it, with
  * a time that leaves that open; whoever asks for a value by hand wants the present one: another question
  * tells more. */
-static void end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns)
+static void end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
+                         int64_t since_ns)
 {
     struct md_completion *completion = line->completion;
     const struct md_block *block = line->exchange->block;
     int64_t request_ns = line->tx_len * line->exchange->character_ns;
-    int is_row = line->late_since_ns && block && block->count > 0 && now_ns - line->late_since_ns < OLDEST_IN_DOUBT;
+    int is_row = since_ns && block && block->count > 0 && now_ns - since_ns < OLDEST_IN_DOUBT;
     md_late_expect(line, 0);
     if (!is_row) {
         recognise_late_answers(line, at + (size_t)used, now_ns);
@@ -258,7 +259,7 @@ static void end_in_doubt(struct md_line *line, size_t at, int used, const struct
     }
     md_copy_message(&completion->reply, reply);
     completion->skipped -= (uint32_t)used;
-    completion->sent_ns = line->late_since_ns - request_ns;
+    completion->sent_ns = since_ns - request_ns;
     md_tally_answer(&line->exchange->drive->tally, 0, request_ns + used * line->exchange->character_ns);
     finish(line, used, line->rx + at, (size_t)used);
 }
@@ -271,6 +272,7 @@ static void search(struct md_line *line, int64_t now_ns)
     struct md_drive *drive = exchange->drive;
     struct md_message reply;
     size_t at = line->rx_from, first_open = SIZE_MAX;
+    int64_t since_ns;
     while (at < line->rx_len) {
         int used = parse_at(line, at, &reply);
         if (used > 0 && line->echo_due && may_become_copy(line, at))
@@ -281,11 +283,11 @@ static void search(struct md_line *line, int64_t now_ns)
             at += line->tx_len;
             continue;
         }
-        if (used > 0 && !exchange->insists && drive->owed_count && md_late_take(line, at, now_ns, 0) > 0) {
+        if (used > 0 && !exchange->insists && drive->owed_count && md_late_take(line, at, now_ns, &since_ns) > 0) {
             md_learn_lateness(drive, now_ns - line->quiet_ns, 0); /* whichever it answers, it took as long as that */
             extend(line);
             if (md_is_read(exchange->framing, exchange->request.function)) {
-                end_in_doubt(line, at, used, &reply, now_ns);
+                end_in_doubt(line, at, used, &reply, now_ns, since_ns);
                 return;
             }
             cut_out(line, at, (size_t)used);
@@ -303,7 +305,7 @@ static void search(struct md_line *line, int64_t now_ns)
             return;
         }
         if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
-            used = md_late_take(line, at, now_ns, 1);
+            used = md_late_take(line, at, now_ns, NULL);
         if (used > 0) {
             extend(line);
             cut_out(line, at, (size_t)used);

@@ -218,7 +218,6 @@ struct md_line {
     int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
     int64_t ready_ns;   /* before then nothing is worth reading */
     struct md_drive *late; /* the first of those whose answers may still come */
-    int64_t late_since_ns; /* when what the last late answer answers was asked first; 0: another question */
     const struct md_exchange *exchange;
     struct md_completion *completion;
     uint16_t tx_len, tx_at;
@@ -282,7 +281,7 @@ struct md_before {
 /* What to ask next before the exchange; NULL: it is its turn. */
 const struct md_exchange *md_before(struct md_before *before, const struct md_exchange *exchange, int echo, int64_t now_ns);
 /* Its turn is over; 1: its reply may have been an earlier answer, and it is to be asked again. */
-int md_is_asked_again(struct md_before *before, const struct md_completion *completion);
+int md_is_asked_again(struct md_before *before, const struct md_exchange *exchange, const struct md_completion *completion);
 
 /* ---- tally.c: what became of a drive's exchanges, counted ---- */
 

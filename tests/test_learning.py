@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from frames import words
 from line_driver import MS, LineDriver
+from multidrop._core import ffi, lib
 
 from multidrop.core import (
     Block,
@@ -36,7 +39,7 @@ def drive() -> Respondent:
     return Respondent(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
 
 
-def exchange(request: Message, drive: Respondent, framing: Framing = Framing.RTU) -> Exchange:
+def exchange(request: Message, drive: Respondent, framing: Framing = Framing.RTU, **details: Any) -> Exchange:
     return Exchange(
         framing,
         request,
@@ -45,6 +48,7 @@ def exchange(request: Message, drive: Respondent, framing: Framing = Framing.RTU
         format="8N1",
         character=CHARACTER / 1e9,
         silence=SILENCE / 1e9,
+        **details,
     )
 
 
@@ -178,17 +182,7 @@ def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: R
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
-    write = Exchange(
-        Framing.RTU,
-        WRITE,
-        drive,
-        baudrate=9600,
-        format="8N1",
-        character=CHARACTER / 1e9,
-        silence=SILENCE / 1e9,
-        timeout=1.0,
-    )
-    line.begin(write)
+    line.begin(exchange(WRITE, drive, timeout=1.0))
     line.wait_until_write()
     left = line.now + 8 * CHARACTER
     line.wait_until_done()
@@ -212,12 +206,12 @@ def gathered(line: LineDriver, drive: Respondent, request: Message = READ) -> No
     assert line.want == "done"
 
 
-@pytest.mark.parametrize("request_", [READ, LONG], ids=["short", "long"])
+@pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
 def test_a_reply_that_has_not_begun_is_not_waited_for_to_its_end(
-    line: LineDriver, drive: Respondent, request_: Message
+    line: LineDriver, drive: Respondent, asked: Message
 ) -> None:
     answer(line, drive, 2 * MS)
-    assert given_up(line, drive, request_) == LEAST + AWAITED
+    assert given_up(line, drive, asked) == LEAST + AWAITED
 
 
 def test_a_reply_that_has_begun_is_waited_for(line: LineDriver, drive: Respondent) -> None:
@@ -248,13 +242,13 @@ def test_the_adapter_s_echo_is_no_beginning(line: LineDriver, drive: Respondent)
     assert line.now == left + LEAST + AWAITED
 
 
-@pytest.mark.parametrize("request_", [READ, LONG], ids=["short", "long"])
+@pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
 def test_an_adapter_that_gathers_replies_is_waited_for(
-    line: LineDriver, drive: Respondent, request_: Message
+    line: LineDriver, drive: Respondent, asked: Message
 ) -> None:
     """Nothing of a reply is seen before its end."""
     for _ in range(20):
-        gathered(line, drive, request_)
+        gathered(line, drive, asked)
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
@@ -307,16 +301,8 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
 ) -> None:
     """Whoever asks by hand gets none: another question is to prove first that no answer is on its way."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
-    asked = Exchange(
-        Framing.RTU,
-        READ,
-        drive,
-        baudrate=9600,
-        format="8N1",
-        character=CHARACTER / 1e9,
-        silence=SILENCE / 1e9,
-        block=Block(0, [Field(0, Wire.U16, 0, 1.0, 1.0)]) if is_row else None,
-    )
+    rows = Block(0, [Field(0, Wire.U16, 0, 1.0, 1.0)]) if is_row else None
+    asked = exchange(READ, drive, block=rows)
     line.begin(asked)
     line.wait_until_write()
     first_ns = line.completion.sent_ns
@@ -334,6 +320,14 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
     else:
         assert (found.result, found.reply.data) == (Result.LATE_ANSWER_DUE, b"")
     assert drive.tally().late == 1
+
+
+@pytest.mark.parametrize(("asked", "again"), [(READ, 1), (WRITE, 0)], ids=["a read", "a write"])
+def test_nothing_but_a_read_is_asked_again(drive: Respondent, asked: Message, again: int) -> None:
+    """Whatever became of it: a write may have started a motor."""
+    in_doubt = ffi.new("struct md_completion *", {"result": Result.LATE_ANSWER_DUE, "sent_ns": 1})
+    before = ffi.new("struct md_before *")
+    assert lib.md_is_asked_again(before, exchange(asked, drive).c, in_doubt) == again
 
 
 def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: Respondent) -> None:

@@ -208,7 +208,7 @@ class WorldPort:
         self._turn, self._under_way = Turn.NOBODYS, None
         if turn is Turn.BEFORE:
             return
-        if lib.md_is_asked_again(self._before, found) and not self.lost and not self._has_ended:
+        if lib.md_is_asked_again(self._before, exchange.c, found) and not self.lost and not self._has_ended:
             self._put_off = turn, exchange
             return
         if turn is Turn.WISHED:
