@@ -120,6 +120,7 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
         ours = bus.attach(Toy, address=1, name="pump-1")
         assert bus.read(ours, CURRENT) == proof(Toy(1), CURRENT)
         respondent = bus.respondent(ours)
+        proofs = respondent.proofs
         bus.detach(ours)
         assert bus.drives == []
         for do in (lambda: bus.read(ours, CURRENT), ours.stop, lambda: bus.detach(ours)):
@@ -127,6 +128,7 @@ def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
         assert bus.respondent(again) is respondent  # which knows of answers that may come late
+        assert respondent.proofs is proofs  # at one of which the core may look just now
 
 
 def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: str) -> None:

@@ -99,27 +99,29 @@ class Exchanges:
     def __init__(self, line: Line) -> None:
         self.line = line
         self._respondents: dict[Drive, Respondent] = {}
-        self._known: dict[tuple[int, float, float], Respondent] = {}  # by address, also of those that left
+        self._known: dict[tuple[object, ...], Respondent] = {}  # by what they are, also of those that left
         self._heard: dict[Drive, object] = {}  # the open port on which it answered last
         self._prepared: dict[Drive, Prepared] = {}
 
     def add(self, drive: Drive) -> None:
         documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
         least = min(drive.response_timeout, documented)
-        key = drive.address, least, drive.response_timeout
-        made = Respondent(least_timeout=least, most_timeout=drive.response_timeout)
+        asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
+        key = drive.address, *asked_as
+        if key not in self._known:  # the core may be asking a proof of one that has left
+            made = self._known[key] = Respondent(least_timeout=least, most_timeout=drive.response_timeout)
+            made.prove_by(
+                [
+                    exchange(drive, block.request(drive.address), made, NO_ROWS, answer=answer)
+                    for block, answer in proofs(drive)
+                ]
+            )
         # One that comes back may still owe the answer to what it was asked before it left, and one of
         # another family at its address would get that.
-        respondent = self._respondents[drive] = self._known.setdefault(key, made)
+        respondent = self._respondents[drive] = self._known[key]
         for other, known in self._known.items():
             if other[0] == drive.address and known is not respondent:
                 self.line.inherit(respondent, known)
-        respondent.prove_by(
-            [
-                exchange(drive, block.request(drive.address), respondent, NO_ROWS, answer=answer)
-                for block, answer in proofs(drive)
-            ]
-        )
 
     def remove(self, drive: Drive) -> None:
         del self._respondents[drive]

@@ -65,7 +65,8 @@ class Respondent:
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
         """Ask one of these, at most MOST_PROOFS, first where a late answer could be taken for a reply.
 
-        No reply to one of them may pass for the reply to another.
+        No reply to one of them may pass for the reply to another. Once only, and before it is asked anything:
+        the core looks at them from then on.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
