@@ -34,9 +34,7 @@ class LastAct:
         self._prepare = begin
         self._work = work
         self._tell = over
-        self._calls: SimpleQueue[None] = (
-            SimpleQueue()
-        )  # unlike an Event, it may be put to by a signal handler
+        self._calls: SimpleQueue[None] = SimpleQueue()  # a signal handler may put to it; not so an Event
         self._over = threading.Event()
         self.is_cut_short = False  # nobody waits for it any more
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
