@@ -17,11 +17,11 @@ from jobs import REGISTERS, Job, expected
 from multidrop._core import lib
 from played import Played, Unpaced
 
-from multidrop.batch import Batch, Row
 from multidrop.bus import Bus
-from multidrop.core import Block, Columns, Field, Names, new_completion
-from multidrop.plant import load_plant
+from multidrop.core import Columns, Field, Names, RowLayout, new_completion
+from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
+from multidrop.polling.batch import Batch, Row
 from multidrop.recording import open_writer
 
 BATCH_ROWS = 1 << 14
@@ -68,7 +68,7 @@ def missed(batch: Batch) -> int:
 
 def dropped(poller: Poller) -> int:
     """Rows so far that nobody took in time; the summary says so too, but of thousands of drives at length."""
-    return poller._inbox.dropped
+    return poller._row_queue.dropped
 
 
 @contextmanager
@@ -128,12 +128,12 @@ def decoder(drives: int) -> Callable[[], Batch]:
     registers = list(Played.registers.values())
     replies = []
     for address in range(1, drives + 1):
-        fields = [Field(it.address, it.wire, it.address, 1, 10) for it in registers]
+        fields = [Field(it.address, it.number_format, it.address, 1, 10) for it in registers]
         data = b"".join(value.to_bytes(2, "big") for value in expected(address))
         found = new_completion()
         found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
         found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
-        replies.append((Block(address - 1, fields), found))
+        replies.append((RowLayout(address - 1, fields), found))
     turns = replies * (BATCH_ROWS // REGISTERS // drives + 1)
     names = Names(f"drive-{address}" for address in range(1, drives + 1)), Names(it.name for it in registers)
 

@@ -20,7 +20,8 @@ from threading import Thread
 
 from multidrop.cli.demo import DRIVES, OPTIONS
 from multidrop.drives import MODELS
-from multidrop.plant import Plant, load_plant
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
 from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, Wire, proof, serve, simulated
 
 MOTOR = "fan"

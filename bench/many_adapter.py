@@ -16,16 +16,15 @@ import numpy
 import pyarrow
 from played import Played, Unpaced, Unreliable
 
-from multidrop.batch import Batch
 from multidrop.core import Echo, Port
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
-from multidrop.line import Line
-from multidrop.plan import planned
-from multidrop.plant import Line as Declared
-from multidrop.plant import Plant, Polled, PolledDrive
+from multidrop.planning.blocks import planned
+from multidrop.planning.prediction import predict
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
-from multidrop.prediction import predict
+from multidrop.polling.batch import Batch
+from multidrop.transport.line import Line
 
 
 class Inherited(Line):
@@ -49,7 +48,7 @@ def _opened(port: str, echo: Echo) -> Line:
 def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
     """All registers of the drives on each port: a path, or the number of an open descriptor."""
     declared = tuple(
-        Declared(
+        PlantLine(
             port,
             port,
             None,

@@ -28,7 +28,7 @@ from soak import MOST_GROWTH_KB, resident_kb
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, InnovertIBD
 from multidrop.errors import BusError
-from multidrop.plant import Line, Plant, Polled, PolledDrive
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated
 
@@ -54,7 +54,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
         motor = YD1000(drives, name=f"{hall.MOTOR}-{number}")
         polled = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings())) for it in found]
         polled.append(PolledDrive(motor, (Polled(YD1000.register("status"), 1.0),)))
-        lines.append(Line(f"line-{number}", port, None, None, tuple(polled)))
+        lines.append(PlantLine(f"line-{number}", port, None, None, tuple(polled)))
     return Plant(tuple(lines), Path("plant.toml"))
 
 

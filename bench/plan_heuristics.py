@@ -16,10 +16,11 @@ from typing import Any
 import tables
 
 from multidrop.drive import Drive
+from multidrop.drive.register import Register, Table
 from multidrop.drives import MODELS
-from multidrop.plan import Block, Planned, blocks, gap, sending
-from multidrop.plan import in_order as cycle_order
-from multidrop.register import Register, Table
+from multidrop.planning.blocks import Block, Planned, blocks
+from multidrop.planning.bus_time import gap, sending
+from multidrop.planning.bus_time import in_order as cycle_order
 
 GAPS = range(40)
 MOST_DRIVES = 31

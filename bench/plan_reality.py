@@ -26,10 +26,10 @@ from programs import paced_line
 from multidrop.core import Framing, Result
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.plan import Planned, planned
-from multidrop.plant import Line, Plant, Polled, PolledDrive
+from multidrop.planning.blocks import Planned, planned
+from multidrop.planning.prediction import predict
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
-from multidrop.prediction import predict
 
 GOAL = 0.02
 SETTLING_S = 0.5  # in which response delays are learnt
@@ -71,7 +71,7 @@ def exchanges(wanted: Wanted) -> list[Planned]:
 def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
     """Of the drives that are polled as fast as the line allows."""
     drives = tuple(PolledDrive(drive, polls(drive, every)) for drive, every in wanted)
-    plant = Plant((Line("line", port, None, None, drives),), Path("plant.toml"))
+    plant = Plant((PlantLine("line", port, None, None, drives),), Path("plant.toml"))
     watched = next(drive for drive, every in wanted if every is None)
     first = watched.readings()[0].name
     with Poller(plant) as poller:
@@ -82,7 +82,7 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
             for row in batch
             if (row.drive, row.register) == (watched.name, first)
         ]
-    delays = {drive: poller.bus("line").respondent(drive).response_delay for drive, _ in wanted}
+    delays = {drive: poller.bus("line").peer(drive).response_delay for drive, _ in wanted}
     misses = Counter(poller.summary()["lines"]["line"]["misses"])
     del misses[str(Result.POLL_ENDED)]
     return Case(name, cycle(wanted, {}), cycle(wanted, delays), middle(times), misses.total())

@@ -3,8 +3,8 @@
 from typing import Any
 
 from multidrop.drive import Drive
-from multidrop.register import HOLDING, INPUT, reading
-from multidrop.timing import Settings
+from multidrop.drive.register import HOLDING, INPUT, reading
+from multidrop.drive.timing import Settings
 
 
 class Played(Drive):

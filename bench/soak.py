@@ -23,11 +23,12 @@ from tempfile import TemporaryDirectory
 import hall
 import tables
 
-from multidrop.batch import Batch, Row
 from multidrop.bus import Bus
 from multidrop.errors import BusError
-from multidrop.plant import Plant, load_plant, parse_duration
+from multidrop.plant.loader import load_plant, parse_duration
+from multidrop.plant.model import Plant
 from multidrop.poller import Poller
+from multidrop.polling.batch import Batch, Row
 from multidrop.recording import open_reader, open_writer
 from multidrop.sim import load_faults
 

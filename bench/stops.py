@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 import tables
 from far_drives import KINDS
 from stops_network import cut_networks
-from stops_victim import Tally, Victim, victim
+from stops_victim import Counters, Victim, victim
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
@@ -39,7 +39,7 @@ MOST_LOOKS = 8  # of a start, before it writes
 LATE, PATIENCE = 0.6, 3.0  # s: answers come so late; a stop that they cannot confirm in time is given so long
 CUT_SHORT = "cut short"  # in what a client says whose stops were
 PAUSE = 2.5  # s: longer than a start may be late, and than one of its looks may take
-Attack = Callable[[random.Random, int, bool], Tally]
+Attack = Callable[[random.Random, int, bool], Counters]
 
 
 def _in_turn(chance: random.Random) -> Iterator[str]:
@@ -49,8 +49,8 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 def signals(number: int, leaving: bool) -> Attack:
     """So many signals at random moments, while the client waits or leaves; three may cut its stops short."""
 
-    def attack(chance: random.Random, rounds: int, is_long: bool) -> Tally:
-        tally = Tally()
+    def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
+        counters = Counters()
         for _ in range(rounds):
             with victim([ALL], on_exit=True) as client:
                 client.begin(turning=True)
@@ -64,15 +64,15 @@ def signals(number: int, leaving: bool) -> Attack:
                     client.signal(sent[-1])
                 client.wait()
                 cut_short = number > 2 and CUT_SHORT in client.errors
-                client.judge(tally, f"signals {[it.name for it in sent]}", excuse=cut_short)
-        return tally
+                client.judge(counters, f"signals {[it.name for it in sent]}", excuse=cut_short)
+        return counters
 
     return attack
 
 
-def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """A thread starts a motor; the signal comes in the middle of one of its exchanges."""
-    tally, kinds = Tally(), _in_turn(chance)
+    counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], on_exit=True, sets=True) as client:
             client.begin(turning=False)
@@ -83,13 +83,13 @@ def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Ta
             client.signal(chance.choice(SIGNALS))
             client.release()
             client.wait()
-            client.judge(tally, "signal while it starts")
-    return tally
+            client.judge(counters, "signal while it starts")
+    return counters
 
 
-def race(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """A start in one thread, and a stop in another in the middle of it."""
-    tally = Tally()
+    counters = Counters()
     for kind, known in KINDS.items():
         with victim([[(kind, 1)]], sets=True) as client:
             for _ in range(rounds):
@@ -100,14 +100,14 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Tally:
                 client.asked_ns = client.hear("asked")["at"]
                 client.release()
                 said = client.hear("called")
-                client.judge(tally, f"start against {stop} ({said['failure'] or 'done'})")
+                client.judge(counters, f"start against {stop} ({said['failure'] or 'done'})")
                 client.lines[0].drives[1].switch_on()
-    return tally
+    return counters
 
 
-def deaf(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """Nobody hears anything for a while from the asking on."""
-    tally = Tally()
+    counters = Counters()
     for _ in range(rounds):
         seconds = chance.uniform(2.0, 20.0) if is_long else 1.2
         for how in ("stop_all", "call"):
@@ -119,53 +119,53 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Tally:
                 client.ask(do=how, **command)
                 client.asked_ns = client.hear("asked")["at"]
                 client.hear("called")
-                client.judge(tally, f"{how} while deaf for {seconds:.1f} s")
-    return tally
+                client.judge(counters, f"{how} while deaf for {seconds:.1f} s")
+    return counters
 
 
 def two_lines(*, polls: bool) -> Attack:
     """Each with four motors that take their time to stand; a signal stops both."""
 
-    def attack(chance: random.Random, rounds: int, is_long: bool) -> Tally:
-        tally = Tally()
+    def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
+        counters = Counters()
         for _ in range(rounds):
             ramp = 10.0 if is_long else 1.5
             with victim([ALL[:4], ALL[4:]], on_exit=True, polls=polls, ramp=ramp) as client:
                 client.begin(turning=True)
                 client.signal(chance.choice(SIGNALS))
                 client.wait()
-                client.judge(tally, "two lines of a poller" if polls else "two buses")
-        return tally
+                client.judge(counters, "two lines of a poller" if polls else "two buses")
+        return counters
 
     return attack
 
 
-def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """The first looks at a drive are answered by an exception, or all that it says is 0.6 s late."""
-    tally = Tally()
+    counters = Counters()
     for _ in range(rounds):
         for kind, codes in LOOKS.items():
             with victim([[(kind, 1)]]) as client:
                 client.lines[0].troubles = [chance.choice(codes)] * chance.randint(1, 2)
-                _stop(client, tally, f"{len(client.lines[0].troubles)} exceptions")
+                _stop(client, counters, f"{len(client.lines[0].troubles)} exceptions")
         for kind in KINDS if is_long else chance.sample(list(KINDS), 1):
             with victim([[(kind, 1)]]) as client:
                 client.lines[0].delay = LATE
-                _stop(client, tally, f"answers {LATE:g} s late", seconds=PATIENCE)
-    return tally
+                _stop(client, counters, f"answers {LATE:g} s late", seconds=PATIENCE)
+    return counters
 
 
-def _stop(client: Victim, tally: Tally, why: str, **more: float) -> None:
+def _stop(client: Victim, counters: Counters, why: str, **more: float) -> None:
     client.begin(turning=True)
     client.ask(do="call", drive=0, verb="stop", **more)
     client.asked_ns = client.hear("asked")["at"]
     said = client.hear("called")
-    client.judge(tally, f"stop, {why} ({said['failure'] or 'done'})")
+    client.judge(counters, f"stop, {why} ({said['failure'] or 'done'})")
 
 
-def paused(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """Ctrl-Z in the middle of a start, and on again after its time: what moves then was not asked for now."""
-    tally, kinds = Tally(), _in_turn(chance)
+    counters, kinds = Counters(), _in_turn(chance)
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], sets=True) as client:
             client.begin(turning=False)
@@ -178,11 +178,11 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Tally:
             known = len(client.lines[0].log)
             client.process.send_signal(signal.SIGCONT)
             client.hear("called")
-            tally.rounds += 1
+            counters.rounds += 1
             late = [it for it in client.lines[0].log[known:] if it.what == "moves"]
-            tally.moved += len(late)
-            tally.stories += [f"start of {kind} after a pause of {PAUSE:g} s: {it}" for it in late]
-    return tally
+            counters.moved += len(late)
+            counters.stories += [f"start of {kind} after a pause of {PAUSE:g} s: {it}" for it in late]
+    return counters
 
 
 ATTACKS: dict[str, tuple[Attack, float]] = {  # with the share of the rounds that it has
@@ -204,10 +204,17 @@ HEAD: tuple[str, ...] = ("attack", "rounds", "stops", "left turning", "moved aft
 HEAD += ("first p50 ms", "p99", "longest")
 
 
-def row(name: str, tally: Tally) -> tuple[object, ...]:
-    found = sorted(tally.first_ms) or [0.0]
+def row(name: str, counters: Counters) -> tuple[object, ...]:
+    found = sorted(counters.first_ms) or [0.0]
     cuts = statistics.quantiles(found, n=100, method="inclusive") if len(found) > 1 else found * 99
-    counts = (tally.rounds, tally.asked, tally.turning, tally.moved, tally.unsent, tally.excused)
+    counts = (
+        counters.rounds,
+        counters.asked,
+        counters.turning,
+        counters.moved,
+        counters.unsent,
+        counters.excused,
+    )
     return (name, *counts, f"{cuts[49]:.0f}", f"{cuts[98]:.0f}", f"{found[-1]:.0f}")
 
 
@@ -227,11 +234,11 @@ def main() -> int:
         rounds = max(1, round(arguments.rounds * share))
         chance = random.Random(f"{arguments.seed} {name}")
         begun = time.monotonic()
-        tally = attack(chance, rounds, arguments.rounds > 4)
+        counters = attack(chance, rounds, arguments.rounds > 4)
         print(f"{name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-        rows.append(row(name, tally))
-        failures += tally.failures
-        stories += tally.stories
+        rows.append(row(name, counters))
+        failures += counters.failures
+        stories += counters.stories
     tables.show(HEAD, rows)
     if arguments.stories:
         print("", *stories, sep="\n")

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 from far_drives import KINDS
 from own_fan import Fan
@@ -19,7 +19,7 @@ from own_fan import Fan
 from multidrop.bus import Bus
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
-from multidrop.plant import Line, Plant, Polled, PolledDrive
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 
 FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
@@ -91,7 +91,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
     lines = []
     for port, found in zip(ports, drives, strict=True):
         asked = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings()[:2])) for it in found]
-        lines.append(Line(port, port, None, None, tuple(asked)))
+        lines.append(PlantLine(port, port, None, None, tuple(asked)))
     return list(stack.enter_context(Poller(Plant(tuple(lines), Path("plant.toml")))).buses.values())
 
 

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 from far_drives import KINDS, FarDrive
 from far_end import FarEnd, FarLine
-from stops_victim import Tally, Victim, victim
+from stops_victim import Counters, Victim, victim
 
 NEAR, FAR, PREFIX = "10.249.17.1", "10.249.17.2", 30
 NOBODY = "02:00:00:00:00:99"  # no interface has this address: what is sent to it is lost
@@ -99,25 +99,25 @@ def network() -> Iterator[Network | None]:
             made.__exit__()
 
 
-def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Tally:
+def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """The network is cut just before a START leaves, and whole again after the client was told."""
-    tally = Tally()
+    counters = Counters()
     with network() as made:
         if made is None:
             print("skipped: a cut network needs root, ip, and namespaces of the network", file=sys.stderr)
-            return tally
+            return counters
         for _ in range(rounds):
             for telnet in (False, True):
                 kind = chance.choice(list(KINDS))
                 line = FarLine([FarDrive(KINDS[kind], 1)])
                 far = FarEnd([line], listening=[made.listen()], telnet=telnet)
                 with victim([[(kind, 1)]], sets=True, far=far) as client:
-                    _cut_one(chance, client, line, made, tally, is_long)
-    return tally
+                    _cut_one(chance, client, line, made, counters, is_long)
+    return counters
 
 
 def _cut_one(
-    chance: random.Random, client: Victim, line: FarLine, made: Network, tally: Tally, is_long: bool
+    chance: random.Random, client: Victim, line: FarLine, made: Network, counters: Counters, is_long: bool
 ) -> None:
     """Start twice whole, the second time to learn how many looks there are, and a third time cut."""
     looks = 0
@@ -142,10 +142,10 @@ def _cut_one(
     time.sleep(chance.uniform(0.0, 10.0) if is_long else 0.0)
     made.mend()
     time.sleep(3.0 if is_long else 1.5)  # what TCP held back comes now
-    tally.rounds += 1
+    counters.rounds += 1
     late = [it for it in client.heard(line, 1, "moves") if it.at > told_ns]
-    tally.moved += len(late)
+    counters.moved += len(late)
     port = client.far.ports[0].partition(":")[0]
-    tally.stories += [
+    counters.stories += [
         f"{port}, told {said['failure']!r}: {(it.at - told_ns) / 1e9:.1f} s later {it}" for it in late
     ]

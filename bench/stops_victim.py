@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 from far_drives import KINDS, FarDrive
 from far_end import FarEnd, FarLine, Heard
@@ -24,7 +24,7 @@ PATIENCE = 150.0  # s, for a client to end by itself
 
 
 @dataclass
-class Tally:
+class Counters:
     """Stops that were asked for, one a motor, and what became of them."""
 
     rounds: int = 0
@@ -110,24 +110,26 @@ class Victim:
             if it.what == what and it.asked is not None and it.asked.address in (0, address)
         ]
 
-    def judge(self, tally: Tally, what: str, *, excuse: bool = False) -> None:
+    def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
         """Count what became of the stops of all drives."""
-        tally.rounds += 1
+        counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():
                 stops = self.heard(line, address, "stops")
-                tally.asked += 1
+                counters.asked += 1
                 if stops and self.asked_ns:
-                    tally.first_ms.append((stops[0].at - self.asked_ns) / 1e6)
+                    counters.first_ms.append((stops[0].at - self.asked_ns) / 1e6)
                 late = [it for it in self.heard(line, address, "moves") if stops and it.at > stops[0].at]
-                tally.moved += len(late)
-                tally.unsent += not stops
-                tally.turning += drive.runs and not excuse
-                tally.excused += drive.runs and excuse
+                counters.moved += len(late)
+                counters.unsent += not stops
+                counters.turning += drive.runs and not excuse
+                counters.excused += drive.runs and excuse
                 if late or drive.runs:
                     said = self.errors.strip().splitlines()[-1:]
                     story = "; ".join(str(it) for it in (*stops[:3], *late))
-                    tally.stories.append(f"{what}: {drive.kind.name}@{address}: {story or 'no stop'} {said}")
+                    counters.stories.append(
+                        f"{what}: {drive.kind.name}@{address}: {story or 'no stop'} {said}"
+                    )
 
 
 @contextmanager

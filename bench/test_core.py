@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 
 from multidrop.core import (
-    Block,
     Columns,
     Exchange,
     Field,
     Framing,
-    Inbox,
     Message,
+    NumberFormat,
+    Peer,
     Port,
-    Respondent,
-    Wire,
+    RowLayout,
+    RowQueue,
     build_request,
     crc16,
     new_completion,
@@ -32,7 +32,7 @@ READ_TEN = Message(1, 3, 0, 10)
 REPLY = bytes.fromhex("010308010001F401F4003225C4")  # ERMAN ER-G-220, section 6, FC03
 
 
-TEN_VALUES = Block(0, [Field(at, Wire.U16, at, 1, 10) for at in range(10)])
+TEN_VALUES = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in range(10)])
 
 
 def unhurried(request: Message) -> Exchange:
@@ -40,7 +40,7 @@ def unhurried(request: Message) -> Exchange:
     return Exchange(
         Framing.RTU,
         request,
-        Respondent(least_timeout=1, most_timeout=1),
+        Peer(least_timeout=1, most_timeout=1),
         baudrate=115200,
         format="8N1",
         character=0.0,
@@ -73,21 +73,21 @@ def fd(responder: str) -> Any:
     os.close(opened)
 
 
-def carry_out(port: Port, exchanges: list[Exchange], inbox: Inbox) -> Columns:
+def carry_out(port: Port, exchanges: list[Exchange], row_queue: RowQueue) -> Columns:
     """Queue them all, and take their rows."""
     port.submit(exchanges, [0] * len(exchanges))
     while port.pending:
-        inbox.await_calls(0.02)
-    columns = inbox.take()
+        row_queue.await_calls(0.02)
+    columns = row_queue.take()
     assert columns is not None
     return columns
 
 
 def test_256_exchanges_and_their_2560_values(benchmark: Any, fd: int) -> None:
     with closing(Port(fd, -1, room=EXCHANGES)) as port:
-        inbox = Inbox()
-        port.report_to(inbox, 0)
-        columns = benchmark(carry_out, port, [unhurried(READ_TEN)] * EXCHANGES, inbox)
+        row_queue = RowQueue()
+        port.report_to(row_queue, 0)
+        columns = benchmark(carry_out, port, [unhurried(READ_TEN)] * EXCHANGES, row_queue)
     assert len(columns) == 10 * EXCHANGES
     assert set(columns.array("status")) == {0}
     assert columns.array("value")[0] == 0x0304 / 10

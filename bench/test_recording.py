@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from multidrop.batch import Batch
-from multidrop.core import Block, Columns, Field, Names, Wire, new_completion
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, new_completion
+from multidrop.polling.batch import Batch
 from multidrop.recording import open_writer
 
 ROWS = 4096
@@ -21,7 +21,7 @@ def batch() -> Batch:
     found = new_completion()
     found.result, found.sent_ns, found.first_ns = 37, 1, 2
     found.reply.data_len, found.reply.data[0:32] = 32, list(range(32))
-    block = Block(0, [Field(at, Wire.U16, at, 1, 10) for at in range(16)])
+    block = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in range(16)])
     columns = Columns(ROWS)
     while columns.add(block, found, 0):
         pass

@@ -6,7 +6,7 @@ enum { MOST_PROOFS_ASKED = 12 };
 
 static uint64_t heard(const struct md_drive *drive)
 {
-    return drive->tally.answered + drive->tally.late;
+    return drive->counters.answered + drive->counters.late;
 }
 
 const struct md_exchange *md_before(struct md_before *before, const struct md_exchange *exchange, int echo, int64_t now_ns)
@@ -20,10 +20,10 @@ const struct md_exchange *md_before(struct md_before *before, const struct md_ex
         before->heard = heard(exchange->drive);
         return proof;
     }
-    if (!exchange->teller || echo != MD_ECHO_UNKNOWN || before->is_told)
+    if (!exchange->echo_probe || echo != MD_ECHO_UNKNOWN || before->is_told)
         return NULL;
     before->is_told = 1;
-    return exchange->teller;
+    return exchange->echo_probe;
 }
 
 /* A write never is: it may have started a motor. */

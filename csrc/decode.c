@@ -1,4 +1,4 @@
-/* What was overheard becomes columns, as fast as a disk delivers it. */
+/* What was sniffed becomes columns, as fast as a disk delivers it. */
 #include "multidrop.h"
 
 #include <string.h>
@@ -81,19 +81,19 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
 }
 
 /* What came, but is not the reply, tells why there is none. */
-static void explain(struct md_decoder *decoder, const struct md_heard *heard)
+static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
     struct md_completion *completion = &decoder->completion;
     size_t room = sizeof completion->raw - completion->raw_len, len = span->len < room ? span->len : room;
     if (span->side == MD_NOISE || len == 0)
         return;
-    memcpy(completion->raw + completion->raw_len, heard->bytes + span->at, len);
+    memcpy(completion->raw + completion->raw_len, stream->bytes + span->at, len);
     completion->raw_len = (uint16_t)(completion->raw_len + len);
     decoder->failure = md_reason(decoder->splitter.framing, &decoder->splitter.request, completion->raw, completion->raw_len);
 }
 
-static int take(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns)
+static int take(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
     int is_request = span->kind == MD_REQUEST || span->kind == MD_EITHER;
@@ -107,7 +107,7 @@ static int take(struct md_decoder *decoder, const struct md_heard *heard, struct
     if (is_request)
         decoder->is_sure = span->kind == MD_REQUEST;
     if (decoder->block && (span->kind == MD_STRAY || span->kind == MD_JUNK))
-        explain(decoder, heard);
+        explain(decoder, stream);
     decoder->frames += span->kind != MD_JUNK;
     decoder->exchanges += span->kind == MD_REPLY;
     decoder->strays += span->kind == MD_STRAY;
@@ -115,11 +115,11 @@ static int take(struct md_decoder *decoder, const struct md_heard *heard, struct
     return MD_ALL_DECODED;
 }
 
-int md_decode(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns)
+int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)
 {
-    while (decoder->is_due || md_split(&decoder->splitter, heard, &decoder->span)) {
+    while (decoder->is_due || md_split(&decoder->splitter, stream, &decoder->span)) {
         decoder->is_due = 1;
-        int undone = take(decoder, heard, columns);
+        int undone = take(decoder, stream, columns);
         if (undone)
             return undone;
         decoder->is_due = 0;

@@ -132,7 +132,7 @@ static void *run(void *argument)
                 told = 1;
         }
         if (told) {
-            md_bell_silence(&engine->bell);
+            md_wakeup_silence(&engine->wakeup);
             open_ports(engine);
             close_ports(engine);
         }
@@ -167,11 +167,11 @@ struct md_engine *md_engine_start(void)
     pthread_mutex_init(&engine->mutex, NULL);
     pthread_cond_init(&engine->changed, NULL);
     engine->waiter = md_waiter_new();
-    if (engine->waiter && md_bell_make(&engine->bell) == 0) {
-        if (md_waiter_add(engine->waiter, engine->bell.fd, NULL) == 0 &&
+    if (engine->waiter && md_wakeup_make(&engine->wakeup) == 0) {
+        if (md_waiter_add(engine->waiter, engine->wakeup.fd, NULL) == 0 &&
             pthread_create(&engine->thread, NULL, run, engine) == 0)
             return engine;
-        md_bell_destroy(&engine->bell);
+        md_wakeup_destroy(&engine->wakeup);
     }
     if (engine->waiter)
         md_waiter_free(engine->waiter);
@@ -205,7 +205,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
     enter(engine);
     port->next = engine->arriving;
     engine->arriving = port;
-    md_bell_ring(&engine->bell);
+    md_wakeup_ring(&engine->wakeup);
     while (!port->opened)
         pthread_cond_wait(&engine->changed, &engine->mutex);
     leave(engine);
@@ -254,7 +254,7 @@ void md_port_stop(struct md_port *port)
     struct md_engine *engine = port->engine;
     enter(engine);
     port->closing = 1;
-    md_bell_ring(&engine->bell);
+    md_wakeup_ring(&engine->wakeup);
     while (!port->closed)
         pthread_cond_wait(&engine->changed, &engine->mutex);
     leave(engine);
@@ -266,10 +266,10 @@ void md_port_free(struct md_port *port)
     free(port);
 }
 
-void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t number)
+void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number)
 {
     enter(port->engine);
-    port->inbox = inbox;
+    port->row_queue = row_queue;
     port->number = number;
     leave(port->engine);
 }
@@ -286,7 +286,7 @@ int md_port_submit(struct md_port *port, const struct md_exchange *const *exchan
     }
     md_put(&port->progress.submitted, submitted + (unsigned)taken);
     if (taken && atomic_exchange(&port->idle, 0))
-        md_bell_ring(&port->engine->bell);
+        md_wakeup_ring(&port->engine->wakeup);
     return taken;
 }
 
@@ -299,7 +299,7 @@ unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *e
     port->round_at = 0;
     md_put(&port->progress.repeating, port->round_len > 0);
     leave(port->engine);
-    md_bell_ring(&port->engine->bell);
+    md_wakeup_ring(&port->engine->wakeup);
     return next;
 }
 
@@ -331,7 +331,7 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
                 at = &(*it)->next;
         wish.next = *at;
         *at = &wish;
-        md_bell_ring(&engine->bell);
+        md_wakeup_ring(&engine->wakeup);
     }
     while (!wish.done)
         pthread_cond_wait(&engine->changed, &engine->mutex);

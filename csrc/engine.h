@@ -44,7 +44,7 @@ struct md_port {
     struct wish *wishes;
     const struct md_exchange *const *round; /* what is repeated */
     unsigned round_len, round_at;
-    struct md_inbox *inbox;
+    struct md_row_queue *row_queue;
     uint32_t number; /* there */
 
     enum turn turn, last_turn; /* of now, and of the exchange that was carried out last */
@@ -67,7 +67,7 @@ struct md_engine {
     atomic_int callers;     /* clients that want the mutex, whom the thread lets in */
     pthread_cond_t changed; /* a wish was granted, a port opened or closed */
     struct md_waiter *waiter;
-    struct md_bell bell;
+    struct md_wakeup wakeup;
     struct md_port *arriving; /* clients wait for these to be opened */
     struct md_port **ports;
     int64_t *wakes; /* when the thread is to wake for each port, whatever happens */

@@ -1,7 +1,7 @@
 /* One port, on the engine's thread: whose turn it is, and what is done until there is nothing to do but
  * to wait. An urgent exchange goes ahead of all, then comes what is queued and due, and else what is
  * repeated. These two keep a share of the line beside urgent exchanges without end, but for those that
- * insist. What became of it goes to the client's inbox. */
+ * insist. What became of it goes to the client's row_queue. */
 #define _GNU_SOURCE
 #include "engine.h"
 
@@ -19,8 +19,8 @@ static const int64_t RETRY_WRITE_NS = 1000000;
 
 static void call(struct md_port *port)
 {
-    if (port->inbox)
-        md_inbox_call(port->inbox, port->number);
+    if (port->row_queue)
+        md_row_queue_call(port->row_queue, port->number);
 }
 
 static void watch(struct md_port *port, int watched)
@@ -165,7 +165,7 @@ static void move_on(struct md_port *port)
     __builtin_prefetch(&port->round[third]->request);
     __builtin_prefetch(soon->block);
     __builtin_prefetch(soon->drive);
-    __builtin_prefetch(&soon->drive->tally);
+    __builtin_prefetch(&soon->drive->counters);
 }
 
 /* Whether nobody wants any more what is under way, and nothing of it has left. */
@@ -243,8 +243,8 @@ static void report(struct md_port *port)
 {
     const struct md_exchange *exchange = port->line.exchange;
     const struct md_completion *completion = &port->completion;
-    if (port->inbox)
-        md_inbox_add(port->inbox, exchange->block, completion);
+    if (port->row_queue)
+        md_row_queue_add(port->row_queue, exchange->block, completion);
     int is_refusal = completion->result > 0 && completion->reply.exception;
     if (is_refusal || exchange->drive->failures != port->before.failures)
         call(port);

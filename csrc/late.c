@@ -308,7 +308,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     }
     if (!earliest)
         return found;
-    drive->tally.late++;
+    drive->counters.late++;
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)

@@ -46,7 +46,7 @@ static int is_failure(int result)
 static void count(const struct md_exchange *exchange, const struct md_completion *completion)
 {
     struct md_drive *drive = exchange->drive;
-    md_tally_end(&drive->tally, exchange, completion);
+    md_counters_end(&drive->counters, exchange, completion);
     if (is_failure(completion->result))
         md_count_failures(drive, drive->failures + 1);
     if (completion->result > 0)
@@ -141,7 +141,7 @@ static void measure(struct md_line *line, int reply_len)
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
     /* A port that is faster than its settings, such as a network's, needs no more than it took. */
     int64_t took_ns = line->silence_ns + later(completion->last_ns, left_ns) - completion->sent_ns;
-    md_tally_answer(&drive->tally, delay_ns, ideal_ns < took_ns ? ideal_ns : took_ns);
+    md_counters_answer(&drive->counters, delay_ns, ideal_ns < took_ns ? ideal_ns : took_ns);
 }
 
 static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
@@ -260,7 +260,7 @@ static void end_in_doubt(struct md_line *line, size_t at, int used, const struct
     md_copy_message(&completion->reply, reply);
     completion->skipped -= (uint32_t)used;
     completion->sent_ns = since_ns - request_ns;
-    md_tally_answer(&line->exchange->drive->tally, 0, request_ns + used * line->exchange->character_ns);
+    md_counters_answer(&line->exchange->drive->counters, 0, request_ns + used * line->exchange->character_ns);
     finish(line, used, line->rx + at, (size_t)used);
 }
 

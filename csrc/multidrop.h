@@ -117,8 +117,8 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 
 enum { MD_DELAY_BUCKETS = 128 };
 
-/* What became of a drive's exchanges (tally.c). Values are those of the exchange's block, or one. */
-struct md_tally {
+/* What became of a drive's exchanges (counters.c). Values are those of the exchange's block, or one. */
+struct md_counters {
     uint64_t exchanges, answered, values; /* the first eight: counted at every exchange, and side by side */
     uint64_t sent;        /* requests that began to leave */
     uint64_t stray_bytes; /* bytes that were no part of a reply */
@@ -156,7 +156,7 @@ struct md_drive {
     uint32_t owed_count, proof_count;
     const struct md_exchange *const *proofs; /* questions whose replies differ from each other's, and most others' */
     struct md_drive *next_late;     /* on the same line, whose answers may still come */
-    struct md_tally tally;
+    struct md_counters counters;
     struct md_owed owed[12];
 };
 
@@ -173,7 +173,7 @@ struct md_exchange {
     int framing;
     /* Goes first where nobody knows whether the adapter echoes: unlike this one's, its reply is never a
      * copy of its request. NULL: none does. */
-    const struct md_exchange *teller;
+    const struct md_exchange *echo_probe;
     int insists; /* not to wait for an earlier answer, which may pass for its own: a stop, that is looked at */
     int64_t timeout_ns;   /* at least so long its reply is waited for: a write's; 0: as learnt. One that insists
                              is waited for as long as answers are known to be late, but not beyond that */
@@ -274,7 +274,7 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 struct md_before {
     const struct md_exchange *then; /* the exchange */
     uint64_t heard;                 /* from its drive, before the last proof */
-    uint32_t proofs, is_told;       /* that were asked; its teller was */
+    uint32_t proofs, is_told;       /* that were asked; its echo_probe was */
     uint32_t failures;              /* of its drive, before all of that */
 };
 
@@ -283,12 +283,12 @@ const struct md_exchange *md_before(struct md_before *before, const struct md_ex
 /* Its turn is over; 1: its reply may have been an earlier answer, and it is to be asked again. */
 int md_is_asked_again(struct md_before *before, const struct md_exchange *exchange, const struct md_completion *completion);
 
-/* ---- tally.c: what became of a drive's exchanges, counted ---- */
+/* ---- counters.c: what became of a drive's exchanges, counted ---- */
 
 /* An exchange is over, as its completion says. */
-void md_tally_end(struct md_tally *tally, const struct md_exchange *exchange, const struct md_completion *completion);
+void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange, const struct md_completion *completion);
 /* It was answered after this delay, and had to take so long of the line. */
-void md_tally_answer(struct md_tally *tally, int64_t delay_ns, int64_t ideal_ns);
+void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns);
 /* The least delay of a bucket; it is less than a part in 8 longer than that, but in the first and the last. */
 int64_t md_delay_edge(int bucket);
 
@@ -296,7 +296,7 @@ int64_t md_delay_edge(int bucket);
 
 struct md_engine;
 struct md_port; /* a descriptor with its line */
-struct md_inbox;
+struct md_row_queue;
 
 struct md_engine *md_engine_start(void); /* it ends with the process; NULL: see errno */
 
@@ -317,7 +317,7 @@ void md_port_free(struct md_port *port); /* a port that was stopped */
 /* Who has the rows of what is carried out, and is called, by this number, when the port is to be looked at. */
 /* Whether its adapter echoes (enum md_echo): MD_ECHO is never unlearnt, MD_NO_ECHO holds until one shows. */
 void md_port_tell_echo(struct md_port *port, int echo);
-void md_port_report(struct md_port *port, struct md_inbox *inbox, uint32_t number);
+void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
 /* Queue exchanges, none to be sent before its time; how many there was room for. One client at a time.
  * A slot that is late by a period is not sent either (MD_EXPIRED) when the same exchange's next is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
@@ -343,24 +343,24 @@ void md_count_stop(uint32_t *stops);
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
 
-/* ---- inbox.c: what the thread leaves for a client: rows, and calls to look at a port ---- */
+/* ---- row_queue.c: what the thread leaves for a client: rows, and calls to look at a port ---- */
 
 /* Rows are kept in so many chunks; those that come when all are full are dropped, and counted. */
-struct md_inbox *md_inbox_new(size_t chunk_rows, size_t most_chunks); /* NULL: see errno */
+struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks); /* NULL: see errno */
 /* When no port reports to it; what was taken can still be given back. */
-void md_inbox_free(struct md_inbox *inbox);
+void md_row_queue_free(struct md_row_queue *row_queue);
 /* Make rows of what became of an exchange, where it has a block. */
-void md_inbox_add(struct md_inbox *inbox, const struct md_block *block, const struct md_completion *completion);
+void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block, const struct md_completion *completion);
 /* The oldest rows, the caller's until they are given back; NULL when there are none. */
-struct md_columns *md_inbox_take(struct md_inbox *inbox);
-void md_inbox_give_back(struct md_inbox *inbox, struct md_columns *columns);
-size_t md_inbox_chunks(struct md_inbox *inbox); /* that hold rows; the newest is still being filled */
-uint64_t md_inbox_dropped(struct md_inbox *inbox); /* rows */
+struct md_columns *md_row_queue_take(struct md_row_queue *row_queue);
+void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
+size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* that hold rows; the newest is still being filled */
+uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* rows */
 enum { MD_MOST_NUMBERS = 65536 };
 /* Call the client that waits, about whatever it gave this number. */
-void md_inbox_call(struct md_inbox *inbox, uint32_t number);
+void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number);
 /* Wait for a call, no longer than that; the numbers that were called, each once, and how many. */
-int md_inbox_await(struct md_inbox *inbox, int64_t timeout_ns, uint32_t *numbers, int room);
+int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
 
 /* ---- columns.c: completions become columns ---- */
 
@@ -445,7 +445,7 @@ size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t f
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- heard.c: bytes that were overheard, in pieces ---- */
+/* ---- stream.c: bytes that were sniffed, in pieces ---- */
 
 /* Bytes that came together, from `at` up to the next piece. */
 struct md_piece {
@@ -456,7 +456,7 @@ struct md_piece {
 };
 
 /* What was heard and not yet forgotten. */
-struct md_heard {
+struct md_stream {
     uint8_t *bytes;
     struct md_piece *pieces;
     size_t len, room, count, most; /* of the bytes, of the pieces */
@@ -466,11 +466,11 @@ struct md_heard {
 struct md_splitter;
 
 /* Append a piece; 0 when there is no room. */
-int md_hear(struct md_heard *heard, const uint8_t *bytes, size_t len, struct md_piece piece);
+int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
 /* Forget what was split. */
-void md_forget(struct md_heard *heard, struct md_splitter *splitter);
+void md_forget(struct md_stream *stream, struct md_splitter *splitter);
 
-/* ---- split.c: what was overheard on a line, cut into frames of both directions ---- */
+/* ---- split.c: what was sniffed on a line, cut into frames of both directions ---- */
 
 enum md_kind {
     MD_JUNK,    /* no frame */
@@ -499,9 +499,9 @@ struct md_splitter {
 
 /* The next span of what was heard: 1; 0 when more must be heard first. Every byte is part of one
  * span. How the bytes came in does not matter but for pauses and sides; junk comes in any number of spans. */
-int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct md_span *span);
+int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
 
-/* ---- decode.c: what was overheard becomes columns ---- */
+/* ---- decode.c: what was sniffed becomes columns ---- */
 
 /* What a request's reply holds; key 0 where there is none. */
 struct md_known {
@@ -533,7 +533,7 @@ enum md_decoded {
 int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
             const struct md_block *block);
 /* Make rows of every exchange that was heard, also of requests that nobody answered (enum md_decoded). */
-int md_decode(struct md_decoder *decoder, const struct md_heard *heard, struct md_columns *columns);
+int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 
 /* ---- unpack.c: packets out of capture files ---- */
 
@@ -545,7 +545,7 @@ struct md_channel {
     int has_sides;        /* the packets' directions are to be believed */
     uint64_t ticks_per_s; /* of the packets' time stamps */
     int64_t offset_ns;
-    struct md_heard heard;
+    struct md_stream stream;
 };
 
 struct md_capture {

@@ -1,8 +1,8 @@
-/* What was overheard on a line, cut into frames of both directions and every framing.
+/* What was sniffed on a line, cut into frames of both directions and every framing.
  *
  * Nothing is known beforehand but the table of functions: a frame is what has a good checksum where
  * a frame may be. What follows a request is first tried as its reply, then as a request, then as a
- * reply whose request was not heard. At most three frames are tried at a byte, so that garbage costs
+ * reply whose request was not stream. At most three frames are tried at a byte, so that garbage costs
  * no more than its length. */
 #include "multidrop.h"
 
@@ -17,12 +17,12 @@ enum {
 enum { RUN_COMMAND = 2, STATE_QUERY = 3, PARAMETER_QUERY = 7 };
 
 /* Bytes that follow `at` in its piece, and in the pieces that came without a pause. */
-static size_t end_of_run(const struct md_heard *heard, size_t piece)
+static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
-    while (++piece < heard->count)
-        if (heard->pieces[piece].is_after_pause)
-            return heard->pieces[piece].at;
-    return heard->len;
+    while (++piece < stream->count)
+        if (stream->pieces[piece].is_after_pause)
+            return stream->pieces[piece].at;
+    return stream->len;
 }
 
 /* In which framings a frame may be that begins with this byte: in Modbus RTU an address. */
@@ -151,13 +151,13 @@ static int is_ruled_out(const struct md_piece *piece)
     return piece->side == MD_FAILED || piece->side == MD_NOISE;
 }
 
-int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct md_span *span)
+int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span)
 {
-    const struct md_piece *pieces = heard->pieces;
+    const struct md_piece *pieces = stream->pieces;
     size_t at = splitter->at, end = 0;
     int used = MD_INCOMPLETE;
-    for (; at < heard->len; at++) {
-        while (splitter->piece + 1 < heard->count && pieces[splitter->piece + 1].at <= at)
+    for (; at < stream->len; at++) {
+        while (splitter->piece + 1 < stream->count && pieces[splitter->piece + 1].at <= at)
             splitter->piece++;
         if (at == splitter->at) {
             span->time_ns = pieces[splitter->piece].time_ns;
@@ -166,22 +166,22 @@ int md_split(struct md_splitter *splitter, const struct md_heard *heard, struct 
         if (is_ruled_out(&pieces[splitter->piece]))
             break;
         if (at >= end)
-            end = end_of_run(heard, splitter->piece);
+            end = end_of_run(stream, splitter->piece);
         /* A pause ends what begins amid junk: it must not swallow the good frame behind the pause. */
         const struct md_piece *piece = &pieces[splitter->piece];
         int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
-        size_t limit = is_due ? heard->len : end;
-        int least = limit < heard->len || heard->is_all ? 1 : MD_INCOMPLETE;
-        used = find_frame(splitter, piece->side, heard->bytes + at, limit - at, least, span);
+        size_t limit = is_due ? stream->len : end;
+        int least = limit < stream->len || stream->is_all ? 1 : MD_INCOMPLETE;
+        used = find_frame(splitter, piece->side, stream->bytes + at, limit - at, least, span);
         if (used >= 0)
             break;
     }
     span->at = splitter->at;
     span->len = at - splitter->at;
-    if (!span->len && at < heard->len && is_ruled_out(&pieces[splitter->piece])) {
+    if (!span->len && at < stream->len && is_ruled_out(&pieces[splitter->piece])) {
         span->kind = MD_JUNK; /* which says nothing of the frames around it */
         size_t next = splitter->piece + 1;
-        splitter->at = next < heard->count ? pieces[next].at : heard->len;
+        splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;
         return 1;
     }

@@ -17,16 +17,16 @@ void md_waiter_remove(struct md_waiter *waiter, int fd);
 /* Who can read; how many. Waits for so long, or for ever where it is negative. */
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns);
 
-/* ---- bell.c ---- */
+/* ---- wakeup.c ---- */
 
-struct md_bell {
+struct md_wakeup {
     int fd, ringer; /* `fd` can be read while it rings */
     atomic_int is_rung;
 };
 
-int md_bell_make(struct md_bell *bell); /* -1: see errno */
-void md_bell_destroy(struct md_bell *bell);
-void md_bell_ring(struct md_bell *bell);
-void md_bell_silence(struct md_bell *bell);
+int md_wakeup_make(struct md_wakeup *wakeup); /* -1: see errno */
+void md_wakeup_destroy(struct md_wakeup *wakeup);
+void md_wakeup_ring(struct md_wakeup *wakeup);
+void md_wakeup_silence(struct md_wakeup *wakeup);
 
 #endif

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from multidrop import exchanges
-from multidrop.core import Respondent
+from multidrop.core import Peer
+from multidrop.transport import exchange as exchanges
 
 PATIENCE = 60.0  # s
 
@@ -33,10 +33,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for every drive however busy the machine is; not for tests in which one is silent."""
 
-    def respondent(**timeouts: float) -> Respondent:
-        return Respondent(**{name: max(seconds, PATIENCE) for name, seconds in timeouts.items()})
+    def peer(**timeouts: float) -> Peer:
+        return Peer(**{name: max(seconds, PATIENCE) for name, seconds in timeouts.items()})
 
-    monkeypatch.setattr(exchanges, "Respondent", respondent)
+    monkeypatch.setattr(exchanges, "Peer", peer)
 
 
 @pytest.fixture(autouse=True)

@@ -8,14 +8,22 @@ from typing import TYPE_CHECKING, Any
 from multidrop.interpreter import refuse_other_interpreters
 
 if TYPE_CHECKING:
-    from multidrop.audit import read_audit as read_audit
-    from multidrop.batch import Batch as Batch
     from multidrop.bus import Bus as Bus
-    from multidrop.drive import Condition as Condition
-    from multidrop.drive import Direction as Direction
-    from multidrop.drive import Drive as Drive
-    from multidrop.drive import State as State
-    from multidrop.drive import verb as verb
+    from multidrop.control.audit_log import read_audit as read_audit
+    from multidrop.control.eeprom_ledger import Ledger as Ledger
+    from multidrop.control.outcome import Effect as Effect
+    from multidrop.control.outcome import Outcome as Outcome
+    from multidrop.control.ramp import ramp as ramp
+    from multidrop.control.ramp import start_staggered as start_staggered
+    from multidrop.drive.family import Drive as Drive
+    from multidrop.drive.register import Register as Register
+    from multidrop.drive.register import command as command
+    from multidrop.drive.register import reading as reading
+    from multidrop.drive.register import setting as setting
+    from multidrop.drive.state import Condition as Condition
+    from multidrop.drive.state import Direction as Direction
+    from multidrop.drive.state import State as State
+    from multidrop.drive.verbs import verb as verb
     from multidrop.drives import YD1000 as YD1000
     from multidrop.drives import DelixiModbus as DelixiModbus
     from multidrop.drives import DelixiNative as DelixiNative
@@ -33,35 +41,27 @@ if TYPE_CHECKING:
     from multidrop.errors import Refused as Refused
     from multidrop.errors import Unconfirmed as Unconfirmed
     from multidrop.errors import Unsupported as Unsupported
-    from multidrop.ledger import Ledger as Ledger
-    from multidrop.motion import ramp as ramp
-    from multidrop.motion import start_staggered as start_staggered
-    from multidrop.outcome import Effect as Effect
-    from multidrop.outcome import Outcome as Outcome
-    from multidrop.plant import Plant as Plant
-    from multidrop.plant import PlantError as PlantError
-    from multidrop.plant import Polled as Polled
-    from multidrop.plant import PolledDrive as PolledDrive
-    from multidrop.plant import load_plant as load_plant
+    from multidrop.plant.loader import PlantError as PlantError
+    from multidrop.plant.loader import load_plant as load_plant
+    from multidrop.plant.model import Plant as Plant
+    from multidrop.plant.model import Polled as Polled
+    from multidrop.plant.model import PolledDrive as PolledDrive
     from multidrop.poller import Poller as Poller
+    from multidrop.polling.batch import Batch as Batch
     from multidrop.recording import convert as convert
     from multidrop.recording import open_reader as open_reader
     from multidrop.recording import open_writer as open_writer
-    from multidrop.register import Register as Register
-    from multidrop.register import command as command
-    from multidrop.register import reading as reading
-    from multidrop.register import setting as setting
-    from multidrop.statistics import Delays as Delays
-    from multidrop.statistics import Diagnostics as Diagnostics
-    from multidrop.statistics import LineStatistics as LineStatistics
-    from multidrop.statistics import Statistics as Statistics
+    from multidrop.transport.statistics import Delays as Delays
+    from multidrop.transport.statistics import Diagnostics as Diagnostics
+    from multidrop.transport.statistics import LineStatistics as LineStatistics
+    from multidrop.transport.statistics import Statistics as Statistics
 
 refuse_other_interpreters()
 
 # Every public name and the module that it comes from, which is loaded when the name is first used.
 _HOMES = {
-    "audit": ("read_audit",),
-    "batch": ("Batch",),
+    "control.audit_log": ("read_audit",),
+    "polling.batch": ("Batch",),
     "bus": ("Bus",),
     "drive": ("Condition", "Direction", "Drive", "State", "verb"),
     "drives": ("DelixiModbus", "DelixiNative", "ErmanERG220", "InnovertIBD", "InvtCHE", "YD1000"),
@@ -78,14 +78,15 @@ _HOMES = {
         "Unconfirmed",
         "Unsupported",
     ),
-    "ledger": ("Ledger",),
-    "motion": ("ramp", "start_staggered"),
-    "outcome": ("Effect", "Outcome"),
-    "plant": ("Plant", "PlantError", "Polled", "PolledDrive", "load_plant"),
+    "control.eeprom_ledger": ("Ledger",),
+    "control.ramp": ("ramp", "start_staggered"),
+    "control.outcome": ("Effect", "Outcome"),
+    "plant.loader": ("PlantError", "load_plant"),
+    "plant.model": ("Plant", "Polled", "PolledDrive"),
     "poller": ("Poller",),
     "recording": ("convert", "open_reader", "open_writer"),
-    "register": ("Register", "command", "reading", "setting"),
-    "statistics": ("Delays", "Diagnostics", "LineStatistics", "Statistics"),
+    "drive.register": ("Register", "command", "reading", "setting"),
+    "transport.statistics": ("Delays", "Diagnostics", "LineStatistics", "Statistics"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

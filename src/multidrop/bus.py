@@ -12,22 +12,25 @@ from types import TracebackType
 from typing import Any, TypeVar, cast
 from weakref import WeakKeyDictionary
 
-from multidrop.audit import AuditLog
-from multidrop.core import Echo, Message, Respondent
-from multidrop.drive import Drive, Script, State, Write
+from multidrop.control.audit_log import AuditLog
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.control.exit_hook import LastAct, exit_hook
+from multidrop.control.outcome import Outcome
+from multidrop.control.performer import Performer
+from multidrop.control.rules import check_own, check_plain, is_harmless, raw_count
+from multidrop.control.stop_all import Seen, Stopped
+from multidrop.control.writer import Writer
+from multidrop.core import Echo, Message, Peer
+from multidrop.core.fork import register_at_fork
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.drive.script import Script, Write
+from multidrop.drive.state import State
 from multidrop.errors import BusError, Refused
-from multidrop.exchanges import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
-from multidrop.exit_hook import LastAct, exit_hook
-from multidrop.forks import tell_of_forks
-from multidrop.ledger import Ledger
-from multidrop.line import Line, now_ns
-from multidrop.outcome import Outcome
-from multidrop.performer import Performer
-from multidrop.register import Register
-from multidrop.rules import check_own, check_plain, is_harmless, raw_count
-from multidrop.statistics import LineStatistics, look
-from multidrop.stopping import Seen, Stopped
-from multidrop.writing import Writer
+from multidrop.transport.clock import now_ns
+from multidrop.transport.exchange import LEAST_TIMEOUT, READ_ATTEMPTS, Exchanges, exchange
+from multidrop.transport.line import Line
+from multidrop.transport.statistics import LineStatistics, look
 
 __all__ = ["LEAST_TIMEOUT", "READ_ATTEMPTS", "Bus", "exchange"]
 
@@ -41,7 +44,7 @@ class _Claims:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._buses: WeakKeyDictionary[Drive, Bus] = WeakKeyDictionary()
-        tell_of_forks(self)
+        register_at_fork(self)
 
     def forked(self) -> None:
         self._lock = threading.Lock()
@@ -118,7 +121,7 @@ class Bus:
         self._opened_ns = now_ns()
         self._reset_at = look(0.0, {}, self.line.overruns())
         self._at_last: LineStatistics | None = None  # when it was closed
-        tell_of_forks(self)
+        register_at_fork(self)
 
     def forked(self) -> None:
         """In the child nobody stops drives: the line is closed there."""
@@ -198,7 +201,7 @@ class Bus:
                     raise ValueError(f"address {made.address} is taken by {other.name}")
             _claims.claim(made, self)
             made.perform = lambda script: self.perform(made, script)
-            made.introduce = lambda: self.introduce(made)
+            made.check_identity = lambda: self.check_identity(made)
             made.begin_call = lambda verb: self._performer.call(made, verb)
             made.carry_out_move = self._performer.move
             made.carry_out_stop = lambda verb, script, seconds: self._performer.stop(made, script, seconds)
@@ -215,10 +218,10 @@ class Bus:
         """
         self._performer.remove(drive)
         with self._attaching:
-            self.respondent(drive)
+            self.peer(drive)
             self.drives = [other for other in self.drives if other is not drive]
             self._exchanges.remove(drive)
-            self._writer.acquaintance.forget(drive)
+            self._writer.identity_check.forget(drive)
             _claims.free(drive, self)
 
     # ---- reading ----
@@ -280,12 +283,12 @@ class Bus:
 
     # ---- who is there ----
 
-    def introduce(self, drive: Drive) -> None:
+    def check_identity(self, drive: Drive) -> None:
         """Look, once, whether the drive at this address is of its family; Refused when it is another.
 
         The first write does this by itself. The first look also logs what the drive's watchdog does.
         """
-        self._performer.introduce(drive)
+        self._performer.check_identity(drive)
 
     def watchdog(self, drive: Drive) -> str:
         """What becomes of the motor when this client dies, as far as the drive can say."""
@@ -313,7 +316,7 @@ class Bus:
         if raw not in register.broadcast:
             raise Refused(f"{drive.title} has no harmless broadcast of {register.name} = {value}")
         for it in self.drives:
-            self.introduce(it)
+            self.check_identity(it)
         if is_harmless(register, raw):
             self._performer.rise(self.drives)
         try:
@@ -337,16 +340,16 @@ class Bus:
         What was called before and would move a motor ends with Overtaken, and so does what is called
         meanwhile. An interruption has each that does not stand yet sent its stop once more.
         """
-        respondents = self.respondents
-        is_known = self._writer.acquaintance.is_known
-        in_turn = sorted(respondents, key=lambda drive: (not is_known(drive), respondents[drive].failures))
+        peers = self.peers
+        is_known = self._writer.identity_check.is_known
+        in_turn = sorted(peers, key=lambda drive: (not is_known(drive), peers[drive].failures))
         return self._performer.stop_all(in_turn, self._stop_by_broadcast, seconds)
 
     def _stop_by_broadcast(self) -> bool:
         """Whether a stop was broadcast, which it is only where that harms none and all are known."""
         drives = self.drives
         kinds = {(type(drive), drive.settings, drive.framing) for drive in drives}
-        known = all(self._writer.acquaintance.is_known(drive) for drive in drives)
+        known = all(self._writer.identity_check.is_known(drive) for drive in drives)
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or len(kinds) != 1 or not known or control is None or not control.broadcast:
             return False
@@ -381,14 +384,14 @@ class Bus:
         """
         return self._performer.perform(script, self._performer.call(drive))
 
-    def respondent(self, drive: Drive) -> Respondent:
+    def peer(self, drive: Drive) -> Peer:
         """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
-        return self._exchanges.respondent(drive)
+        return self._exchanges.peer(drive)
 
     @property
-    def respondents(self) -> dict[Drive, Respondent]:
+    def peers(self) -> dict[Drive, Peer]:
         """What is known of each drive that is on this bus now."""
-        return self._exchanges.respondents
+        return self._exchanges.peers
 
     # ---- how it went ----
 
@@ -404,5 +407,5 @@ class Bus:
         self._reset_at = self._at_last or self._counted(self.line.overruns())
 
     def _counted(self, overruns: int | None) -> LineStatistics:
-        tallies = {drive.name: it.tally() for drive, it in self.respondents.items()}
-        return look((now_ns() - self._opened_ns) / 1e9, tallies, overruns)
+        counters_by_drive = {drive.name: it.counters() for drive, it in self.peers.items()}
+        return look((now_ns() - self._opened_ns) / 1e9, counters_by_drive, overruns)

@@ -13,15 +13,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from multidrop.batch import Batch
 from multidrop.bus import Bus
-from multidrop.core import Inbox
-from multidrop.forks import tell_of_forks
-from multidrop.ledger import Ledger
-from multidrop.line import Wake, now_ns, sleep
-from multidrop.plant import Plant, PolledDrive
-from multidrop.polled_line import Codes, PolledLine
-from multidrop.statistics import LineStatistics
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.core import RowQueue
+from multidrop.core.fork import register_at_fork
+from multidrop.plant.model import Plant, PolledDrive
+from multidrop.polling.batch import Batch
+from multidrop.polling.polled_line import Codes, PolledLine
+from multidrop.transport.clock import now_ns, sleep
+from multidrop.transport.statistics import LineStatistics
+from multidrop.transport.wakeup import Wake
 
 LOOK_S = 0.05  # the longest that a line waits to be tended, or whoever wants rows to be told of them
 REST_S = 0.5  # the same, where nobody waits for either
@@ -47,7 +48,7 @@ class Poller:
         if not isinstance(plant, Plant):
             raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
         self._codes = Codes()
-        self._inbox = Inbox()
+        self._row_queue = RowQueue()
         self._wake = Wake()
         self._taken_ns = 0  # the newest rows
         self._is_watched = False  # somebody waits for `fileno`
@@ -55,11 +56,11 @@ class Poller:
         self._closing = False
         self._changing = threading.Lock()  # one drive comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
-        tell_of_forks(self)
+        register_at_fork(self)
         try:
             for number, declared in enumerate(plant.lines):
                 bus = Bus(declared.port, echo=declared.echo, ledger=ledger, audit=audit)
-                self._lines.append(PolledLine(declared, number, bus, self._inbox, self._codes))
+                self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._codes))
         except BaseException:
             self.close()
             raise
@@ -113,18 +114,18 @@ class Poller:
         while not self._closing:
             for line in called:
                 line.tend(now_ns())
-            if self._is_watched and self._inbox.chunks:
+            if self._is_watched and self._row_queue.chunks:
                 self._wake.set()
             now = now_ns()
             restless = [line for line in self._lines if not line.is_steady(now)]
             seconds = LOOK_S if restless or self._is_watched else REST_S
-            numbers = self._inbox.await_calls(seconds)
+            numbers = self._row_queue.await_calls(seconds)
             lines = [self._lines[it] for it in numbers if it < len(self._lines)]
             called = dict.fromkeys([*restless, *lines])
 
     def _wake_up(self) -> None:
         """Call the thread by a number that no line has."""
-        self._inbox.call(len(self._lines))
+        self._row_queue.call(len(self._lines))
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
@@ -178,14 +179,14 @@ class Poller:
 
     def take(self) -> Batch | None:
         """The oldest rows that wait, at once; None when there are none, or only just a few new ones."""
-        now, chunks = now_ns(), self._inbox.chunks
+        now, chunks = now_ns(), self._row_queue.chunks
         if chunks < 2:
             if self._is_watched:
                 self._wake.clear()
             if now - self._taken_ns < FILLING_NS and not self._closing:
                 return None
             self._taken_ns = now
-        columns = self._inbox.take()
+        columns = self._row_queue.take()
         return Batch(columns, self._codes.drives, self._codes.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
@@ -212,5 +213,5 @@ class Poller:
             "lines": lines,
             "samples": sum(line["samples"] for line in lines.values()),
             "misses": sum(sum(line["misses"].values()) for line in lines.values()),
-            "dropped": self._inbox.dropped,
+            "dropped": self._row_queue.dropped,
         }

@@ -1,7 +1,7 @@
 /* The C core against the documents' frames and against hostile lengths, without any framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
- *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c csrc/tally.c \
+ *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c csrc/counters.c \
  *      csrc/columns.c -o test_core
  *   ./test_core tests/data/frames.csv
  *

@@ -27,7 +27,7 @@ static void decode(struct reader *reader, int i)
     struct md_columns rows = {.time = time, .sent = sent, .uncertainty = uncertainty, .drive = drive, .reg = reg,
                               .status = status, .value = value, .valid = valid, .room = ROWS};
     struct md_decoder *decoder = &reader->decoders[i];
-    for (int state; (state = md_decode(decoder, &reader->channels[i].heard, &rows)) != MD_ALL_DECODED;) {
+    for (int state; (state = md_decode(decoder, &reader->channels[i].stream, &rows)) != MD_ALL_DECODED;) {
         const struct md_span *span = &decoder->span;
         if (state == MD_NO_ROOM) {
             must(ROWS - rows.rows < (size_t)block.count);
@@ -72,14 +72,14 @@ static void read_all(struct reader *reader)
         must(capture->at >= at && capture->at <= capture->len);
         int is_stuck = state == MD_CHANNEL_FULL && capture->at == at;
         for (size_t i = 0; i < capture->count; i++) {
-            struct md_heard *heard = &reader->channels[i].heard;
-            size_t before = heard->len;
-            heard->is_all = state != MD_CHANNEL_FULL;
+            struct md_stream *stream = &reader->channels[i].stream;
+            size_t before = stream->len;
+            stream->is_all = state != MD_CHANNEL_FULL;
             decode(reader, (int)i);
-            md_forget(heard, &reader->decoders[i].splitter);
-            must(heard->len <= MD_MOST_FRAME && heard->count <= heard->len && (!heard->is_all || heard->len == 0));
-            reader->bytes += before - heard->len;
-            is_stuck &= heard->len == before;
+            md_forget(stream, &reader->decoders[i].splitter);
+            must(stream->len <= MD_MOST_FRAME && stream->count <= stream->len && (!stream->is_all || stream->len == 0));
+            reader->bytes += before - stream->len;
+            is_stuck &= stream->len == before;
         }
         if (is_stuck)
             return; /* a packet longer than the room, which is larger but for here */
@@ -101,15 +101,15 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     reader.capture.bytes = file;
     size_t room = MD_MOST_FRAME + 512 + 16u * data[1];
     for (int i = 0; i < CHANNELS; i++) {
-        struct md_heard heard = {.bytes = malloc(room), .pieces = malloc(room * sizeof(struct md_piece)), .room = room, .most = room};
+        struct md_stream stream = {.bytes = malloc(room), .pieces = malloc(room * sizeof(struct md_piece)), .room = room, .most = room};
         reader.channels[i] = (struct md_channel){.link = links[data[0] >> 2 & 3], .has_sides = data[0] >> 4 & 1,
-                                                 .ticks_per_s = data[0] & 0x20 ? 1u << 20 : 1000000000u, .heard = heard};
+                                                 .ticks_per_s = data[0] & 0x20 ? 1u << 20 : 1000000000u, .stream = stream};
         reader.decoders[i] = (struct md_decoder){.known = reader.known[i], .places = PLACES};
     }
     read_all(&reader);
     for (int i = 0; i < CHANNELS; i++) {
-        free(reader.channels[i].heard.bytes);
-        free(reader.channels[i].heard.pieces);
+        free(reader.channels[i].stream.bytes);
+        free(reader.channels[i].stream.pieces);
     }
     free(file);
     return 0;

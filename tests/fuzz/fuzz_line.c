@@ -112,21 +112,21 @@ static void check_completion(void)
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
 
-static void check_tallies(void)
+static void check_counters(void)
 {
     for (int i = 0; i < DRIVES; i++) {
-        const struct md_tally *tally = &scene.drives[i].tally;
-        uint64_t values = tally->values, ended = tally->answered, delays = 0;
-        for (size_t reason = 0; reason < sizeof tally->missed / sizeof *tally->missed; reason++) {
-            values += tally->missed[reason];
-            ended += tally->ended[reason];
+        const struct md_counters *counters = &scene.drives[i].counters;
+        uint64_t values = counters->values, ended = counters->answered, delays = 0;
+        for (size_t reason = 0; reason < sizeof counters->missed / sizeof *counters->missed; reason++) {
+            values += counters->missed[reason];
+            ended += counters->ended[reason];
         }
         for (size_t code = 0; code < 256; code++)
-            values += tally->refused[code];
+            values += counters->refused[code];
         for (size_t bucket = 0; bucket < MD_DELAY_BUCKETS; bucket++)
-            delays += tally->delays[bucket];
-        must(tally->exchanges == scene.exchanges[i] && values == tally->exchanges && ended == tally->exchanges);
-        must(delays == tally->answered && tally->sent <= tally->exchanges);
+            delays += counters->delays[bucket];
+        must(counters->exchanges == scene.exchanges[i] && values == counters->exchanges && ended == counters->exchanges);
+        must(delays == counters->answered && counters->sent <= counters->exchanges);
         must(scene.drives[i].delay_ns >= 0 && scene.drives[i].deviation_ns >= 0);
     }
 }
@@ -169,7 +169,7 @@ static void end(void)
         late->until_ns = scene.exchange.drive->late_until_ns;
     scene.before = scene.after = 0;
     free(scene.done);
-    check_tallies();
+    check_counters();
     check_tap();
 }
 

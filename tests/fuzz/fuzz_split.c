@@ -1,4 +1,4 @@
-/* Hostile bytes as they are overheard on a line, in pieces, for the splitter.
+/* Hostile bytes as they are sniffed on a line, in pieces, for the splitter.
  *
  * An input is pieces: a byte with its side and pause, one with its length, and its bytes. */
 #include "fuzz.h"
@@ -6,22 +6,22 @@
 enum { MOST = 4096, HEAD = 2 };
 
 struct ear {
-    struct md_heard heard;
+    struct md_stream stream;
     struct md_splitter splitter;
-    size_t passed; /* bytes told so far, of all that was heard */
+    size_t passed; /* bytes told so far, of all that was stream */
 };
 
 static void open_ear(struct ear *ear, size_t room)
 {
-    *ear = (struct ear){.heard = {.room = room, .most = room}};
-    ear->heard.bytes = malloc(room);
-    ear->heard.pieces = malloc(room * sizeof *ear->heard.pieces);
+    *ear = (struct ear){.stream = {.room = room, .most = room}};
+    ear->stream.bytes = malloc(room);
+    ear->stream.pieces = malloc(room * sizeof *ear->stream.pieces);
 }
 
 static void close_ear(struct ear *ear)
 {
-    free(ear->heard.bytes);
-    free(ear->heard.pieces);
+    free(ear->stream.bytes);
+    free(ear->stream.pieces);
 }
 
 /* Spans follow each other without gaps, and frames are what they are said to be. */
@@ -30,14 +30,14 @@ static int next(struct ear *ear, struct md_span *span)
     memset(span, 0xAA, sizeof *span);
     size_t at = ear->splitter.at;
     struct md_message asked = ear->splitter.request, again;
-    if (!md_split(&ear->splitter, &ear->heard, span)) {
-        must(ear->splitter.at == at && ear->heard.len - at <= MD_MOST_FRAME);
-        must(!ear->heard.is_all || at == ear->heard.len);
+    if (!md_split(&ear->splitter, &ear->stream, span)) {
+        must(ear->splitter.at == at && ear->stream.len - at <= MD_MOST_FRAME);
+        must(!ear->stream.is_all || at == ear->stream.len);
         return 0;
     }
-    must(span->len > 0 && span->at == at && ear->splitter.at == at + span->len && at + span->len <= ear->heard.len);
+    must(span->len > 0 && span->at == at && ear->splitter.at == at + span->len && at + span->len <= ear->stream.len);
     ear->passed += span->len;
-    uint8_t *exact = exact_copy(ear->heard.bytes + at, span->len);
+    uint8_t *exact = exact_copy(ear->stream.bytes + at, span->len);
     if (span->kind == MD_REQUEST || span->kind == MD_EITHER) {
         must(md_parse_request(span->framing, exact, span->len, &again) == (int)span->len);
         must(ear->splitter.request.address == again.address && ear->splitter.framing == span->framing);
@@ -50,7 +50,7 @@ static int next(struct ear *ear, struct md_span *span)
     return 1;
 }
 
-/* The next frame and where it begins in all that was heard; junk is passed over. */
+/* The next frame and where it begins in all that was stream; junk is passed over. */
 static int next_frame(struct ear *ear, struct md_span *span, size_t *at)
 {
     while (next(ear, span))
@@ -83,23 +83,23 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (size_t at = 0; at + HEAD < size; at += HEAD + len) {
         struct md_piece piece = piece_of(data, size, at, &len);
         if (len)
-            must(md_hear(&whole.heard, data + at + HEAD, len, piece));
+            must(md_hear(&whole.stream, data + at + HEAD, len, piece));
         total += len;
     }
-    whole.heard.is_all = 1;
+    whole.stream.is_all = 1;
     struct md_span expected, found;
     for (size_t at = 0; at + HEAD < size; at += HEAD + len) {
         struct md_piece piece = piece_of(data, size, at, &len);
         if (len)
-            must(md_hear(&parts.heard, data + at + HEAD, len, piece));
-        parts.heard.is_all = at + HEAD + len + HEAD >= size;
+            must(md_hear(&parts.stream, data + at + HEAD, len, piece));
+        parts.stream.is_all = at + HEAD + len + HEAD >= size;
         while (next_frame(&parts, &found, &part_at)) {
             must(next_frame(&whole, &expected, &whole_at));
             must(part_at == whole_at && found.len == expected.len && found.kind == expected.kind);
             must(found.time_ns == expected.time_ns && found.message.start == expected.message.start);
         }
-        md_forget(&parts.heard, &parts.splitter);
-        must(parts.splitter.at == 0 && parts.heard.len <= MD_MOST_FRAME && parts.heard.count <= parts.heard.len);
+        md_forget(&parts.stream, &parts.splitter);
+        must(parts.splitter.at == 0 && parts.stream.len <= MD_MOST_FRAME && parts.stream.count <= parts.stream.len);
     }
     must(!next_frame(&whole, &expected, &whole_at));
     must(whole.passed == total && parts.passed == total); /* what was skipped was told too */

@@ -18,15 +18,21 @@ import atheris
 from readers import read
 
 import multidrop.capture
-import multidrop.mistakes
-import multidrop.models
-import multidrop.plant
+import multidrop.drives.registry
+import multidrop.plant.model
+import multidrop.plant.toml_check
 import multidrop.recording
 import multidrop.sim.faults
-from multidrop.capture import columns
+from multidrop.capture import decoding
 
 PACKAGES = (multidrop.capture, multidrop.recording)
-MODULES = (multidrop.plant, multidrop.mistakes, multidrop.models, multidrop.sim.faults, tomllib._parser)
+MODULES = (
+    multidrop.plant.model,
+    multidrop.plant.toml_check,
+    multidrop.drives.registry,
+    multidrop.sim.faults,
+    tomllib._parser,
+)
 
 
 def instrument(module: types.ModuleType) -> None:
@@ -40,7 +46,7 @@ def instrument(module: types.ModuleType) -> None:
 
 def main() -> None:
     name, *arguments = sys.argv[1:]
-    columns.ROWS = 2048  # of a batch: less to fill, and more batches; one request may ask for 2000
+    decoding.ROWS = 2048  # of a batch: less to fill, and more batches; one request may ask for 2000
     for package in PACKAGES:
         for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
             instrument(importlib.import_module(found.name))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-SYSTEM = ("engine", "port", "waiter", "bell", "inbox")  # parts of the core that need one
+SYSTEM = ("engine", "port", "waiter", "wakeup", "row_queue")  # parts of the core that need one
 
 
 def command(name: str, program: Path, companion: str, *compiler: str) -> list[str]:

@@ -12,10 +12,11 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
-from multidrop.batch import Row, Rows
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
-from multidrop.plant import Plant, PlantError, load_plant
+from multidrop.plant.loader import PlantError, load_plant
+from multidrop.plant.model import Plant
+from multidrop.polling.batch import Row, Rows
 from multidrop.recording import Metadata, open_reader, open_writer, repair
 from multidrop.sim.faults import load_faults
 
@@ -108,7 +109,7 @@ def _pair(capture: Capture) -> None:
     splitters: list[Splitter] = []
     junk = exchanges = 0
     for _ in capture:
-        for at, heard in enumerate(capture.heard):
+        for at, heard in enumerate(capture.streams):
             if at == len(pairings):
                 pairings.append(Pairing())
                 splitters.append(Splitter())

@@ -58,16 +58,16 @@ def by_compiler(tree: Path) -> str | None:
 def by_test_frame(tree: Path) -> str | None:
     """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
-    return _pytest(tree, *(f"tests/test_{name}.py" for name in ("frame", "split", "learning", "line")))
+    return _pytest(tree, *(f"tests/core/test_{name}.py" for name in ("frame", "split", "learning", "line")))
 
 
 def by_test_schedule(tree: Path) -> str | None:
-    return _pytest(tree, "tests/test_schedule.py")
+    return _pytest(tree, "tests/planning/test_schedule.py")
 
 
 TRIALS: dict[str, tuple[Trial, ...]] = {
     "csrc/frame.c": (by_test_core, by_compiler, by_test_frame),
-    "src/multidrop/schedule.py": (by_test_schedule,),
+    "src/multidrop/planning/schedule.py": (by_test_schedule,),
 }
 
 

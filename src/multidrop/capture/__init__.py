@@ -19,12 +19,12 @@ in packets one by one.
 
 from __future__ import annotations
 
-from multidrop.capture.columns import Decoding
-from multidrop.capture.exchanges import Heard, Junk, Overheard, Pairing
-from multidrop.capture.flight import FlightRecorder
-from multidrop.capture.pcapng import CaptureWriter
-from multidrop.capture.reader import Capture, CaptureError
-from multidrop.capture.tapped import Tapped
+from multidrop.capture.decoding import Decoding
+from multidrop.capture.flight_recorder import FlightRecorder
+from multidrop.capture.pairing import Junk, Pairing, Sniffed, SniffedExchange
+from multidrop.capture.pcapng_reader import Capture, CaptureError
+from multidrop.capture.pcapng_writer import CaptureWriter
+from multidrop.capture.tap import Tapped
 from multidrop.core import Side
 
 __all__ = [
@@ -33,10 +33,10 @@ __all__ = [
     "CaptureWriter",
     "Decoding",
     "FlightRecorder",
-    "Heard",
     "Junk",
-    "Overheard",
     "Pairing",
     "Side",
+    "Sniffed",
+    "SniffedExchange",
     "Tapped",
 ]

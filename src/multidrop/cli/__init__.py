@@ -88,7 +88,7 @@ def _guarded(command: str, words: list[str]) -> int:
         _abandon_output()
         return DONE
     except Refused as refusal:
-        from multidrop.cli.advice import typed
+        from multidrop.cli.support.advice import typed
 
         return _say(typed(str(refusal)), FAILED)
     except (ValueError, TypeError, Unsupported) as mistake:
@@ -150,7 +150,7 @@ class _OnStderr(logging.Handler):
 @contextmanager
 def _telling_what_is_run() -> Iterator[None]:
     """Say which files with models of the user's own are run, which they are for every command."""
-    logger, handler = logging.getLogger("multidrop.models"), _OnStderr()
+    logger, handler = logging.getLogger("multidrop.drives.registry"), _OnStderr()
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.cli.saying import say
-from multidrop.cli.torn import tell_torn
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.truncated import tell_torn
 from multidrop.recording import FORMATS, convert, open_reader
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.overheard import replay, summary
-from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument
-from multidrop.plant import Plant, load_plant
+from multidrop.cli.sniff.sniffed import replay, summary
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.saying import say
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
 from multidrop.recording import open_writer
 
 

@@ -13,11 +13,12 @@ from tempfile import TemporaryDirectory
 
 from multidrop.bus import Bus
 from multidrop.cli.monitor import is_possible, watch
-from multidrop.cli.overwriting import refuse_overwriting
 from multidrop.cli.poll import add_polling_arguments, conclude, follow
+from multidrop.cli.support.files import refuse_overwriting
 from multidrop.drives import MODELS
 from multidrop.errors import BadReply, NoReply, NotDone, Unconfirmed
-from multidrop.plant import Line, load_plant
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import PlantLine
 from multidrop.recording import open_reader
 
 DRIVES = (  # name, model, framing
@@ -78,7 +79,7 @@ def _plant_file(port: Path) -> str:
     return "\n".join(tables)
 
 
-def _start_motors(line: Line) -> None:
+def _start_motors(line: PlantLine) -> None:
     """Every simulated motor at another frequency, so that there is something to be seen."""
     with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):

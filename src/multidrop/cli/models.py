@@ -9,13 +9,15 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument
-from multidrop.cli.values import aligned
-from multidrop.drive import VERBS, Drive, Framing, Option
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import aligned
+from multidrop.core import Framing
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
-from multidrop.models import find_model
-from multidrop.register import Access, Kept, Register, Table
+from multidrop.drives.registry import find_model
 
 WIDTH = 80
 INDENT = 16  # of a family's facts
@@ -179,7 +181,7 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.ram_address is not None:
         yield f"written at {register.ram_address:04X}H, in RAM"
     if register.words > 1:
-        yield f"{register.words} words, {register.wire.name}"
+        yield f"{register.words} words, {register.number_format.name}"
     if register.at_least:
         yield f"at least {register.at_least}"
     if register.at_most:
@@ -263,7 +265,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "at_least": register.at_least or None,
         "at_most": register.at_most or None,
         "values": None if names is None else {member.name: member.value for member in names},
-        "wire": register.wire.name,
+        "wire": register.number_format.name,
         "kept": register.kept.value,
         "ram_address": register.ram_address,
         "default": register.default,

@@ -12,12 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument
-from multidrop.cli.values import Row, aligned
-from multidrop.plant import Line, load_plant
-from multidrop.prediction import Prediction, Rate, predict
-from multidrop.remedies import Remedies, duration_text, remedies
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import Row, aligned
+from multidrop.planning.prediction import Prediction, Rate, predict
+from multidrop.planning.suggestions import Remedies, duration_text, remedies
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import PlantLine
 
 WIDTH = 80
 LONGEST_NAME = 24
@@ -41,12 +42,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class _Plan:
-    line: Line
+    line: PlantLine
     prediction: Prediction
     remedies: Remedies | None  # None: it fits
 
 
-def _plan(line: Line) -> _Plan:
+def _plan(line: PlantLine) -> _Plan:
     wanted = line.planned()
     prediction = predict(wanted, switching=line.switching)
     return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction, line.switching))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.extra import need
-from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.cli.saying import say
-from multidrop.cli.torn import tell_torn
+from multidrop.cli.support.extra import need
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.truncated import tell_torn
 
 SUFFIXES = (".png", ".html")
 
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{out}: a plot's name ends in {' or '.join(SUFFIXES)}")
     need("matplotlib", "plot", "plot")
     refuse_overwriting(out)
-    from multidrop.look import load, plot, plot_page, png
+    from multidrop.report import load, plot, plot_page, png
 
     look = load(arguments.recording)
     tell_torn(look.path, look.rows, look.torn)

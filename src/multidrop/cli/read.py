@@ -7,12 +7,12 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument, add_target_arguments, drive_of
-from multidrop.cli.values import aligned, as_json, as_row
-from multidrop.drive import Drive
+from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import aligned, as_json, as_row
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
 from multidrop.errors import DriveRefused
-from multidrop.register import Register
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

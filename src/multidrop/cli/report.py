@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.extra import need
-from multidrop.cli.overwriting import refuse_overwriting
-from multidrop.cli.saying import say
-from multidrop.cli.torn import tell_torn
+from multidrop.cli.support.extra import need
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.truncated import tell_torn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{out}: a report's name ends in .html")
     need("matplotlib", "plot", "report")
     refuse_overwriting(out)
-    from multidrop.look import load, report_page
+    from multidrop.report import load, report_page
 
     look = load(arguments.recording)
     tell_torn(look.path, look.rows, look.torn)

@@ -10,13 +10,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from multidrop.cli.overwriting import check_writable
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument
-from multidrop.drive import Drive
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.files import check_writable
+from multidrop.cli.support.saying import say
+from multidrop.drive.family import Drive
 from multidrop.drives import MODELS
-from multidrop.line import Line
-from multidrop.models import find_model
+from multidrop.drives.registry import find_model
 from multidrop.scan import (
     ADDRESSES,
     Crowd,
@@ -31,6 +30,7 @@ from multidrop.scan import (
     scan,
     sweeps,
 )
+from multidrop.transport.line import Line
 
 _CLEAR_LINE = "\r\x1b[K"
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from multidrop.cli.saying import say
-from multidrop.plant import Line, load_plant
+from multidrop.cli.support.saying import say
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import PlantLine
 from multidrop.sim import HostileWire, Simulator, Wire, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 
@@ -34,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _wire(line: Line, directory: Path, faults: Faults, unpaced: bool) -> Wire:
+def _wire(line: PlantLine, directory: Path, faults: Faults, unpaced: bool) -> Wire:
     link = directory / line.name
     if link.parent != directory:
         raise ValueError(f"line {line.name!r} has a / in its name, which the link to its port cannot have")

@@ -10,19 +10,21 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from multidrop.bus import Bus
-from multidrop.cli.consent import ask
-from multidrop.cli.saying import say
-from multidrop.cli.target import (
+from multidrop.cli.support.arguments import (
     add_json_argument,
     add_target_arguments,
     add_writing_arguments,
     drive_of,
     duration,
 )
-from multidrop.cli.values import as_json, taken
-from multidrop.drive import Direction, Drive, Script, State, Write
+from multidrop.cli.support.confirm import ask
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import as_json, taken
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.drive.script import Script, Write
+from multidrop.drive.state import Direction, State
 from multidrop.errors import Unsupported
-from multidrop.register import Register
 
 _DIRECTED = ("start", "jog")
 _STOPS = ("stop", "coast", "emergency-stop")

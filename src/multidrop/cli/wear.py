@@ -7,11 +7,12 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-from multidrop.cli.saying import say
-from multidrop.cli.target import add_json_argument
-from multidrop.cli.values import aligned
-from multidrop.ledger import BUDGET, CYCLES, Ledger, Wear, default_path
-from multidrop.line import now_ns, utc_minus_monotonic_ns
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import aligned
+from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_path
+from multidrop.core import utc_minus_monotonic_ns
+from multidrop.transport.clock import now_ns
 
 HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEFT", "LAST")
 

@@ -7,17 +7,17 @@ import json
 import sys
 
 from multidrop.bus import Bus
-from multidrop.cli.consent import ask
-from multidrop.cli.saying import say
-from multidrop.cli.target import (
+from multidrop.cli.support.arguments import (
     add_json_argument,
     add_target_arguments,
     add_writing_arguments,
     drive_of,
 )
-from multidrop.cli.values import as_json, taken
-from multidrop.outcome import Effect
-from multidrop.rules import check_plain, raw_count, refused
+from multidrop.cli.support.confirm import ask
+from multidrop.cli.support.saying import say
+from multidrop.cli.support.values import as_json, taken
+from multidrop.control.outcome import Effect
+from multidrop.control.rules import check_plain, raw_count, refused
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from multidrop.core.columns import COLUMNS, Block, Columns, Field, Names, Wire, raw_value, spell
-from multidrop.core.exchanges import Completion, Exchange, Respondent, completion, new_completion
-from multidrop.core.frames import (
+from multidrop.core.columns import COLUMNS, Columns, Field, Names, NumberFormat, RowLayout, raw_value, spell
+from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
+from multidrop.core.exchange import Completion, Exchange, Peer, completion, new_completion
+from multidrop.core.frame import (
     Framing,
     Message,
     build_reply,
@@ -16,25 +17,24 @@ from multidrop.core.frames import (
     reply_length,
     sum8,
 )
-from multidrop.core.inbox import Inbox
 from multidrop.core.latch import Latch, Permit
-from multidrop.core.overheard import (
+from multidrop.core.port import Echo, Port, now_ns, utc_minus_monotonic_ns
+from multidrop.core.port_settings import REFUSALS, get_settings, set_settings
+from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Result, status_text
+from multidrop.core.row_queue import RowQueue
+from multidrop.core.sniffer import (
     HEARD_ROOM,
     Decoded,
     Decoder,
-    Heard,
+    FrameSpan,
     Kind,
     Side,
-    Span,
     Splitter,
+    Stream,
     Unpacked,
     Unpacker,
 )
-from multidrop.core.ports import Echo, Port, now_ns, utc_minus_monotonic_ns
-from multidrop.core.results import EXCEPTION_STATUS, STATUSES, UNASKED, Result, status_text
-from multidrop.core.settings import REFUSALS, get_settings, set_settings
-from multidrop.core.tally import DELAY_BUCKETS, Tally, delay_edge
-from multidrop.core.taps import Tap, Wrappings
+from multidrop.core.tap import Tap, Wrappings
 
 __all__ = [
     "COLUMNS",
@@ -44,33 +44,33 @@ __all__ = [
     "REFUSALS",
     "STATUSES",
     "UNASKED",
-    "Block",
     "Columns",
     "Completion",
+    "Counters",
     "Decoded",
     "Decoder",
     "Echo",
     "Exchange",
     "Field",
+    "FrameSpan",
     "Framing",
-    "Heard",
-    "Inbox",
     "Kind",
     "Latch",
     "Message",
     "Names",
+    "NumberFormat",
+    "Peer",
     "Permit",
     "Port",
-    "Respondent",
     "Result",
+    "RowLayout",
+    "RowQueue",
     "Side",
-    "Span",
     "Splitter",
-    "Tally",
+    "Stream",
     "Tap",
     "Unpacked",
     "Unpacker",
-    "Wire",
     "Wrappings",
     "build_reply",
     "build_request",

@@ -10,10 +10,10 @@ from struct import calcsize
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
-from multidrop.core.results import Result
+from multidrop.core.result import Result
 
 
-class Wire(IntEnum):
+class NumberFormat(IntEnum):
     """How a number lies in a reply's data; words are big-endian, SWAPPED has the low word first."""
 
     U16 = lib.MD_U16
@@ -28,7 +28,7 @@ class Wire(IntEnum):
     BIT = lib.MD_BIT
 
 
-def raw_value(data: bytes, at: int, wire: Wire) -> float:
+def raw_value(data: bytes, at: int, wire: NumberFormat) -> float:
     """The number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it."""
     return float(lib.md_value(data, len(data), at, wire))
 
@@ -37,7 +37,7 @@ class Field(NamedTuple):
     """Where a register lies in a block's reply, its scale, and the code of its name."""
 
     at: int
-    wire: Wire
+    number_format: NumberFormat
     register: int
     multiplier: float
     divisor: float
@@ -49,7 +49,7 @@ def _shared(fields: tuple[Field, ...]) -> Any:
     return ffi.new("struct md_field[]", fields)
 
 
-class Block:
+class RowLayout:
     """What one exchange's reply holds: fields of a drive, given by the code of its name (struct md_block)."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
@@ -104,11 +104,11 @@ class Columns:
     def __len__(self) -> int:
         return int(self.c.rows)
 
-    def add(self, block: Block, found: Any, utc_minus_monotonic_ns: int) -> bool:
+    def add(self, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:
         """Append the rows of one struct md_completion; False when there is no room for all of them."""
         return bool(lib.md_columns_add(self.c, block.c, found, utc_minus_monotonic_ns))
 
-    def add_miss(self, block: Block, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
+    def add_miss(self, block: RowLayout, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
         """Append rows for values that were due at `due_ns` but never asked for."""
         return bool(lib.md_columns_add(self.c, block.c, miss(result, due_ns), utc_minus_monotonic_ns))
 

@@ -6,23 +6,13 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import (
-    Condition,
-    Direction,
-    Framing,
-    Refused,
-    Script,
-    State,
-    insist,
-    read,
-    verb,
-    write,
-)
-from multidrop.drives.delixi_parameters import KEYPAD, Baudrate, DelixiParameters, parameter
-from multidrop.register import HOLDING, Kept, Register, command, setting
+from multidrop.drive import Condition, Direction, Framing, Refused, Script, State, insist, read, write
+from multidrop.drive.register import HOLDING, Kept, Register, command, setting
+from multidrop.drive.verbs import verb
+from multidrop.drives.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiParameters, parameter
 
 
-class Control(IntEnum):
+class DelixiModbusControl(IntEnum):
     """The words that this library sends: run or jog always with a direction, and never the toggle."""
 
     NOTHING = 0x00
@@ -33,7 +23,7 @@ class Control(IntEnum):
     JOG_REVERSE = 0x23
 
 
-class Format(IntEnum):
+class DelixiModbusFormat(IntEnum):
     """P04.29, in the firmware that speaks standard Modbus."""
 
     ASCII_7N2 = 0
@@ -81,9 +71,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     control = command(
         0x2000,
-        Control,
-        broadcast=(Control.STOP,),
-        harmless=(Control.NOTHING, Control.STOP),
+        DelixiModbusControl,
+        broadcast=(DelixiModbusControl.STOP,),
+        harmless=(DelixiModbusControl.NOTHING, DelixiModbusControl.STOP),
         place="part 2, section 3: 2000H",
     )
     frequency = setting(
@@ -94,14 +84,14 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         place="P00.02",
         note="Every write wears the EEPROM. Used if P00.01 = 1.",
     )
-    format_setting = setting(parameter(4, 29), Format, never=KEYPAD, place="P04.29")
+    format_setting = setting(parameter(4, 29), DelixiModbusFormat, never=KEYPAD, place="P04.29")
 
     _jogged = False  # by this object, since it was last seen to stand
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
         """P04.30, its address, P04.28, its baud rate, or a bus voltage that no address reaches."""
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
-        code = Baudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
+        code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
         return known if code == self.address else known | {self.baudrate_setting: (code, code)}
 
     @verb
@@ -122,7 +112,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
             raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
         yield from self._setpoint_in_force()
         self._jogged = False
-        yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+        yield from write(
+            self.control, DelixiModbusControl.FORWARD if forward else DelixiModbusControl.REVERSE
+        )
         yield from self._started()
 
     @verb
@@ -130,7 +122,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Turn slowly until stopped; without a direction forward, and only from rest."""
         forward = yield from self._forward(direction)
         self._jogged = True
-        yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+        yield from write(
+            self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE
+        )
         yield from self._started()
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
@@ -142,7 +136,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     @verb
     def stop(self) -> Script[None]:
         """Stop, which has happened when the output frequency is 0."""
-        yield from insist(self.control, Control.STOP)
+        yield from insist(self.control, DelixiModbusControl.STOP)
         yield from self._stopped(self._stands, self._limit())
 
     @verb

@@ -15,11 +15,11 @@ from multidrop.drive import (
     State,
     insist,
     read,
-    verb,
     write,
 )
+from multidrop.drive.register import Carrier, Kept, Register, Table, command, reading, setting
+from multidrop.drive.verbs import verb
 from multidrop.drives.delixi_parameters import KEYPAD, DelixiParameters, parameter
-from multidrop.register import Carrier, Kept, Register, Table, command, reading, setting
 
 COMMAND = Table("run command", None, 0x02, Carrier.NUMBER, Kept.RAM)
 STATE = Table("run state", 0x03, None, Carrier.NUMBER)
@@ -28,14 +28,14 @@ PARAMETER_RAM = Table("parameter, not stored", 0x07, 0x05, Carrier.LONG, Kept.RA
 PARAMETER = Table("parameter", 0x07, 0x06, Carrier.LONG, Kept.EEPROM)
 
 
-class Control(IntEnum):
+class DelixiNativeControl(IntEnum):
     STOP = 1
     FORWARD = 2
     REVERSE = 3
     RESET_FAULT = 4
 
 
-class Status(IntEnum):
+class DelixiNativeStatus(IntEnum):
     STOPPED = 1
     FORWARD = 2  # printed "FWD (stopped)", and 3 "REV (stopped)"
     REVERSE = 3
@@ -43,7 +43,7 @@ class Status(IntEnum):
     UNDERVOLTAGE = 5
 
 
-class Format(IntEnum):
+class DelixiNativeFormat(IntEnum):
     """P04.29, in the firmware that speaks Delixi's own protocol."""
 
     N81 = 0
@@ -91,13 +91,13 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     control = command(
         0,
-        Control,
+        DelixiNativeControl,
         table=COMMAND,
-        broadcast=(Control.STOP,),
-        harmless=(Control.STOP,),
+        broadcast=(DelixiNativeControl.STOP,),
+        harmless=(DelixiNativeControl.STOP,),
         place="part 3, section 5: K = 02",
     )
-    status = reading(0, Status, table=STATE, place="part 3, section 5: K = 03")
+    status = reading(0, DelixiNativeStatus, table=STATE, place="part 3, section 5: K = 03")
     frequency = command(
         0x0001,
         "Hz",
@@ -121,7 +121,9 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         place="P00.02",
         note="Used if P00.01 = 1.",
     )
-    format_setting = setting(parameter(4, 29), Format, table=PARAMETER, never=KEYPAD, place="P04.29")
+    format_setting = setting(
+        parameter(4, 29), DelixiNativeFormat, table=PARAMETER, never=KEYPAD, place="P04.29"
+    )
 
     @property
     def telling(self) -> Register[Any]:
@@ -138,20 +140,24 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
         yield from self._may_start()
         yield from self._setpoint_in_force()
-        if direction is None and (yield from read(self.status)) == Status.REVERSE:
+        if direction is None and (yield from read(self.status)) == DelixiNativeStatus.REVERSE:
             direction = Direction.REVERSE
-        word = Control.REVERSE if direction is Direction.REVERSE else Control.FORWARD
+        word = DelixiNativeControl.REVERSE if direction is Direction.REVERSE else DelixiNativeControl.FORWARD
         yield from write(self.control, word)
         yield from self._started()
 
     @verb
     def stop(self) -> Script[None]:
         """Stop, which has happened when neither the state nor the output frequency says otherwise."""
-        yield from insist(self.control, Control.STOP)
+        yield from insist(self.control, DelixiNativeControl.STOP)
         yield from self._stopped(self._stands, self._limit())
 
     def _stands(self) -> Script[bool]:
-        if (yield from read(self.status)) not in (Status.STOPPED, Status.FAULT, Status.UNDERVOLTAGE):
+        if (yield from read(self.status)) not in (
+            DelixiNativeStatus.STOPPED,
+            DelixiNativeStatus.FAULT,
+            DelixiNativeStatus.UNDERVOLTAGE,
+        ):
             return False
         return (yield from read(self.output_frequency)) == 0
 
@@ -160,9 +166,9 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
         """Reset a fault; never starts the motor. Sent once, then looked at."""
         if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
             raise Refused(f"{self.name} runs: it has no fault to reset")
-        yield from write(self.control, Control.RESET_FAULT)
+        yield from write(self.control, DelixiNativeControl.RESET_FAULT)
         status = yield from read(self.status)
-        if status in (Status.FAULT, Status.UNDERVOLTAGE):
+        if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = self.fault.format((yield from read(self.fault)))
             raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
@@ -179,14 +185,14 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             condition, direction = CONDITIONS[status]
             still = condition is Condition.RUNNING and (yield from read(self.output_frequency)) == 0
             return State(condition, direction, note="output frequency 0" if still else "")
-        if status in (Status.FAULT, Status.UNDERVOLTAGE):
+        if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             fault = yield from read(self.fault)
             return State(Condition.FAULT, fault=self.fault.format(fault) if fault else status.name)
         return State(Condition.UNKNOWN, note=f"K = 03 says {int(status):04X}H, which is not explained")
 
 
 CONDITIONS = {
-    Status.STOPPED: (Condition.STOPPED, None),
-    Status.FORWARD: (Condition.RUNNING, Direction.FORWARD),
-    Status.REVERSE: (Condition.RUNNING, Direction.REVERSE),
+    DelixiNativeStatus.STOPPED: (Condition.STOPPED, None),
+    DelixiNativeStatus.FORWARD: (Condition.RUNNING, Direction.FORWARD),
+    DelixiNativeStatus.REVERSE: (Condition.RUNNING, Direction.REVERSE),
 }

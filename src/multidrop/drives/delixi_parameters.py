@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from enum import IntEnum
 
-from multidrop.drive import Drive, Option, Refused, Script, read
-from multidrop.register import Register, Table, reading, setting
+from multidrop.drive import Drive, Refused, Script, read
+from multidrop.drive.register import Register, Table, reading, setting
+from multidrop.drive.verbs import Option
 
 STOP_TIME = 60.0  # s; the deceleration time's number is not known
 
@@ -18,7 +19,7 @@ def parameter(group: int, index: int) -> int:
     return group * 100 + index
 
 
-class Fault(IntEnum):
+class DelixiFault(IntEnum):
     """P05.31. The codes 10 to 14 are printed as digits that may be decimal or hex: both are read."""
 
     NONE = 0
@@ -38,18 +39,18 @@ class Fault(IntEnum):
     FLT_MODULE = 14
 
     @classmethod
-    def _missing_(cls, value: object) -> Fault | None:
+    def _missing_(cls, value: object) -> DelixiFault | None:
         return cls(value - 6) if isinstance(value, int) and 0x10 <= value <= 0x14 else None
 
 
-class RunSource(IntEnum):
+class DelixiRunSource(IntEnum):
     KEYPAD = 0
     TERMINALS = 1
     LINE = 2
     BY_TERMINAL = 3
 
 
-class Baudrate(IntEnum):
+class DelixiBaudrate(IntEnum):
     B1200 = 0
     B2400 = 1
     B4800 = 2  # printed "3800"
@@ -80,11 +81,11 @@ class DelixiParameters(Drive):
         "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
     }
 
-    run_source = setting(parameter(0, 0), RunSource, never=KEYPAD, place="P00.00")
+    run_source = setting(parameter(0, 0), DelixiRunSource, never=KEYPAD, place="P00.00")
     frequency_source = setting(
         parameter(0, 1), never=KEYPAD, place="P00.01", note="1, the digital setting, for P00.02 to be used."
     )
-    baudrate_setting = setting(parameter(4, 28), Baudrate, never=KEYPAD, place="P04.28")
+    baudrate_setting = setting(parameter(4, 28), DelixiBaudrate, never=KEYPAD, place="P04.28")
     address_setting = setting(parameter(4, 30), never=KEYPAD, place="P04.30")
 
     output_frequency = reading(parameter(5, 0), "Hz", step=0.01, place="P05.00")
@@ -124,7 +125,7 @@ class DelixiParameters(Drive):
     fault_record_4 = reading(parameter(5, 28), place="P05.28", note="A code; its names are not stated.")
     overcurrent_record = reading(parameter(5, 29), step=None, place="P05.29")
     overvoltage_record = reading(parameter(5, 30), step=None, place="P05.30")
-    fault = reading(parameter(5, 31), Fault, place="P05.31")
+    fault = reading(parameter(5, 31), DelixiFault, place="P05.31")
 
     def __init_subclass__(cls, *, table: Table | None = None) -> None:
         if table is not None:
@@ -140,7 +141,7 @@ class DelixiParameters(Drive):
         if address != self.address:
             raise Refused(f"{self.name} has {address:g} as P04.30, not its address: it is not a Delixi")
         baudrate = yield from read(self.baudrate_setting)
-        if baudrate != Baudrate[f"B{self.settings.baudrate}"]:
+        if baudrate != DelixiBaudrate[f"B{self.settings.baudrate}"]:
             raise Refused(f"{self.name} has {int(baudrate)} as P04.28, not its baud rate: it is not a Delixi")
 
     def _may_start(self) -> Script[None]:
@@ -150,7 +151,7 @@ class DelixiParameters(Drive):
             raise Refused(
                 f"{self.name} has a fault, {self.fault.format(fault)}: see to it and reset it first"
             )
-        if (yield from read(self.run_source)) != RunSource.LINE:
+        if (yield from read(self.run_source)) != DelixiRunSource.LINE:
             raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
 
     def _limit(self) -> float:

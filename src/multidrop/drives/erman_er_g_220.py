@@ -11,17 +11,16 @@ from multidrop.drive import (
     Direction,
     Drive,
     DriveRefused,
-    Option,
     Refused,
     Script,
     State,
     Unconfirmed,
     insist,
     read,
-    verb,
     write,
 )
-from multidrop.register import COIL, HOLDING, INPUT, Register, Wire, command, reading, setting
+from multidrop.drive.register import COIL, HOLDING, INPUT, NumberFormat, Register, command, reading, setting
+from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 
@@ -31,7 +30,7 @@ class Coil(IntEnum):
     ON = 1
 
 
-class Status(IntEnum):
+class ErmanStatus(IntEnum):
     """Bits 0 and 1 are one number; bit 5 says that the motor is overloaded."""
 
     STOPPED = 0
@@ -50,7 +49,7 @@ OVERLOAD = 0x20
 CONDITIONS = (Condition.STOPPED, Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
 
-class Fault(IntFlag):
+class ErmanFault(IntFlag):
     EMERGENCY_STOP = 1 << 0
     LOW_DC_VOLTAGE = 1 << 1
     HIGH_DC_VOLTAGE = 1 << 2
@@ -149,7 +148,7 @@ class ErmanERG220(Drive):
     heatsink_temperature = reading(
         0x0006,
         "°C",
-        wire=Wire.I16,
+        number_format=NumberFormat.I16,
         table=INPUT,
         place="section 10, state: 6",
         note="Whether it is signed is not stated.",
@@ -157,16 +156,16 @@ class ErmanERG220(Drive):
     output_voltage = reading(0x000C, "V", table=INPUT, place="section 10, state: 12")
     status = reading(
         0x0400,
-        Status,
-        wire=Wire.U32_EITHER,
+        ErmanStatus,
+        number_format=NumberFormat.U32_EITHER,
         table=INPUT,
         place="section 10, state: 1024-1025",
         note="The word order is not stated; all that is defined fits one word.",
     )
     last_fault = reading(
         0x0402,
-        Fault,
-        wire=Wire.U32_EITHER,
+        ErmanFault,
+        number_format=NumberFormat.U32_EITHER,
         table=INPUT,
         place="section 10, state: 1026-1027",
         note="The last fault, which may be past. The word order is not stated.",
@@ -211,7 +210,7 @@ class ErmanERG220(Drive):
         0x0009, Coil, table=COIL, place="section 6, function 01; section 10, commands: 9"
     )
 
-    _reset_fault = Fault(0)  # the last fault when this object reset it
+    _reset_fault = ErmanFault(0)  # the last fault when this object reset it
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:

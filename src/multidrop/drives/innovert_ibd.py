@@ -11,16 +11,15 @@ from multidrop.drive import (
     Drive,
     DriveRefused,
     Framing,
-    Option,
     Refused,
     Script,
     State,
     insist,
     read,
-    verb,
     write,
 )
-from multidrop.register import HOLDING, command, reading, setting
+from multidrop.drive.register import HOLDING, command, reading, setting
+from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 
@@ -39,7 +38,7 @@ def parameter(name: str) -> int:
     return "ABCDEFGH".index(letter.upper()) * 100 + int(number)
 
 
-class Control(IntEnum):
+class IBDControl(IntEnum):
     """The words that this library sends: at most one bit for the direction, and never the toggle."""
 
     NOTHING = 0x00
@@ -82,18 +81,18 @@ class FrequencySource(IntEnum):
     LINE = 5
 
 
-class RunSource(IntEnum):
+class IBDRunSource(IntEnum):
     LINE = 2
 
 
-class Baudrate(IntEnum):
+class IBDBaudrate(IntEnum):
     B4800 = 0
     B9600 = 1
     B19200 = 2
     B38400 = 3
 
 
-class Format(IntEnum):
+class IBDFormat(IntEnum):
     ASCII_8N1 = 0
     ASCII_8E1 = 1
     ASCII_8O1 = 2
@@ -177,7 +176,7 @@ class InnovertIBD(Drive):
     )
     run_source = setting(
         parameter("Prb.02"),
-        RunSource,
+        IBDRunSource,
         never="it gives the command over the motor away; set it on the keypad",
         place="Prb.02",
     )
@@ -190,16 +189,16 @@ class InnovertIBD(Drive):
     output_virtual = setting(parameter("Prd.28"), Output, never=INFERRED, place="Prd.28")
     jog_frequency = setting(parameter("PrE.00"), "Hz", step=None, never=INFERRED, place="PrE.00")
     baudrate_setting = setting(
-        parameter("PrH.00"), Baudrate, never=INFERRED, place="PrH.00", outside=OTHER_MAKE
+        parameter("PrH.00"), IBDBaudrate, never=INFERRED, place="PrH.00", outside=OTHER_MAKE
     )
-    format_setting = setting(parameter("PrH.01"), Format, never=INFERRED, place="PrH.01")
+    format_setting = setting(parameter("PrH.01"), IBDFormat, never=INFERRED, place="PrH.01")
     address_setting = setting(parameter("PrH.02"), never=INFERRED, place="PrH.02")
 
     control = command(
         0x2000,
-        Control,
-        broadcast=(Control.STOP,),
-        harmless=(Control.NOTHING, Control.STOP),
+        IBDControl,
+        broadcast=(IBDControl.STOP,),
+        harmless=(IBDControl.NOTHING, IBDControl.STOP),
         place="2000H, table 3",
     )
     frequency = command(
@@ -238,7 +237,7 @@ class InnovertIBD(Drive):
             address = yield from read(self.address_setting)
         except DriveRefused:
             return False
-        return baudrate == Baudrate[f"B{self.settings.baudrate}"] and address == self.address
+        return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
     def resembles(self) -> Script[bool]:
         """Bits 11 and 12 of PrA.22 are 1, as in the example, 14 and 15 are 0, and what is named is there."""
@@ -254,19 +253,19 @@ class InnovertIBD(Drive):
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start from rest in the direction in force; in another only where `forward_bit` is declared."""
-        yield from self._command(Control.RUN, direction)
+        yield from self._command(IBDControl.RUN, direction)
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn from rest at PrE.00 until stopped, in the direction in force; for another see `start`."""
-        yield from self._command(Control.JOG, direction)
+        yield from self._command(IBDControl.JOG, direction)
 
-    def _command(self, word: Control, direction: Direction | None) -> Script[None]:
-        sent = word if direction is None else Control(word | self._bit(direction))
+    def _command(self, word: IBDControl, direction: Direction | None) -> Script[None]:
+        sent = word if direction is None else IBDControl(word | self._bit(direction))
         yield from self._commanded_by_line()
         if (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
             raise Refused(f"{self.name} has a fault: see to it, then call reset_fault()")
-        if word is Control.RUN:
+        if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
             raise Refused(f"{self.name} turns, and a jog would go on through this: call stop() first")
@@ -286,7 +285,7 @@ class InnovertIBD(Drive):
     def _commanded_by_line(self) -> Script[None]:
         if (yield from read(self.frequency_source)) != FrequencySource.LINE or (
             yield from read(self.run_source)
-        ) != RunSource.LINE:
+        ) != IBDRunSource.LINE:
             raise Refused(f"{self.name} is not commanded by the line: {self.remote}")
 
     def _runs(self) -> Script[bool]:
@@ -295,7 +294,7 @@ class InnovertIBD(Drive):
     @verb
     def stop(self) -> Script[None]:
         """Stop along the ramp: by the outputs, or else when neither current nor speed is shown."""
-        yield from insist(self.control, Control.STOP)
+        yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._is_off if (yield from self._programmed()) else self._stands
         yield from self._stopped(look, limit)
@@ -309,7 +308,7 @@ class InnovertIBD(Drive):
     @verb
     def reset_fault(self) -> Script[None]:
         """Reset a fault; never starts the motor."""
-        yield from write(self.control, Control.RESET_FAULT)
+        yield from write(self.control, IBDControl.RESET_FAULT)
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:

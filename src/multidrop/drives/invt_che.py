@@ -11,17 +11,16 @@ from multidrop.drive import (
     Drive,
     DriveRefused,
     NotDone,
-    Option,
     Refused,
     Script,
     State,
     Unconfirmed,
     insist,
     read,
-    verb,
     write,
 )
-from multidrop.register import HOLDING, Details, Kept, Register, Wire, command, reading, setting
+from multidrop.drive.register import HOLDING, Details, Kept, NumberFormat, Register, command, reading, setting
+from multidrop.drive.verbs import Option, verb
 
 E = TypeVar("E", bound=IntEnum)
 
@@ -34,7 +33,7 @@ SCALE_NEXT = f"{CHE100_NEXT}; scale: Goodrive300L manual, p. 130 (compatible wit
 STOP_TIME = 60.0  # s; the deceleration time's address is not known
 
 
-class Control(IntEnum):
+class CHEControl(IntEnum):
     FORWARD = 1
     REVERSE = 2
     JOG_FORWARD = 3
@@ -45,7 +44,7 @@ class Control(IntEnum):
     STOP_JOG = 8
 
 
-class Status(IntEnum):
+class CHEStatus(IntEnum):
     FORWARD = 1
     REVERSE = 2
     STANDBY = 3
@@ -57,7 +56,7 @@ class Device(IntEnum):
     CHE_1500_HZ = 0x0102
 
 
-class Fault(IntEnum):
+class CHEFault(IntEnum):
     NONE = 0
     OUT1_PHASE_U = 1
     OUT2_PHASE_V = 2
@@ -202,20 +201,20 @@ class InvtCHE(Drive):
 
     control = command(
         0x1000,
-        Control,
+        CHEControl,
         kept=Kept.RAM,
         while_running=True,
-        broadcast=(Control.STOP,),
-        harmless=(Control.STOP, Control.COAST, Control.STOP_JOG),
+        broadcast=(CHEControl.STOP,),
+        harmless=(CHEControl.STOP, CHEControl.COAST, CHEControl.STOP_JOG),
         outside=CHE100,
     )
-    status = reading(0x1001, Status, outside=CHE100)
+    status = reading(0x1001, CHEStatus, outside=CHE100)
     setpoint = setting(
         0x2000,
         "%",
         step=0.01,
         span=(0, 100),
-        wire=Wire.I16,
+        number_format=NumberFormat.I16,
         kept=Kept.RAM,
         while_running=True,
         broadcast=(0,),
@@ -230,8 +229,8 @@ class InvtCHE(Drive):
     output_voltage = reading(0x3003, "V", step=1, outside=SCALE)
     output_current = reading(0x3004, "A", step=0.1, outside=SCALE)
     motor_speed = reading(0x3005, "rpm", step=1, outside=SCALE)
-    output_power = reading(0x3006, "%", step=0.1, wire=Wire.I16, outside=SCALE)
-    output_torque = reading(0x3007, "%", step=0.1, wire=Wire.I16, outside=SCALE)
+    output_power = reading(0x3006, "%", step=0.1, number_format=NumberFormat.I16, outside=SCALE)
+    output_torque = reading(0x3007, "%", step=0.1, number_format=NumberFormat.I16, outside=SCALE)
     pid_setpoint = reading(0x3008, "%", step=0.1, outside=SCALE)
     pid_feedback = reading(0x3009, "%", step=0.1, outside=SCALE)
     inputs = reading(0x300A, outside=CHE100, note="Its bits are not described.")
@@ -247,7 +246,7 @@ class InvtCHE(Drive):
     device = reading(0x3016, Device, outside=CHE100_CODES)
     fault = reading(
         0x5000,
-        Fault,
+        CHEFault,
         outside=f"{CHE100_NEXT}; names: Powtran PI130 manual, p. 123, Goodrive350 manual, p. 193",
         note="The same as P7.15.",
     )
@@ -270,7 +269,7 @@ class InvtCHE(Drive):
         forward = yield from self._forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
-        yield from write(self.control, Control.FORWARD if forward else Control.REVERSE)
+        yield from write(self.control, CHEControl.FORWARD if forward else CHEControl.REVERSE)
         yield from self._started()
 
     @verb
@@ -278,16 +277,16 @@ class InvtCHE(Drive):
         """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
         forward = yield from self._forward(direction)
         self._jogged = True
-        yield from write(self.control, Control.JOG_FORWARD if forward else Control.JOG_REVERSE)
+        yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started()
 
     def _forward(self, direction: Direction | None) -> Script[bool]:
         status = yield from read(self.status)
-        if status == Status.FAULT:
+        if status == CHEStatus.FAULT:
             fault = self.fault.format((yield from read(self.fault)))
             raise Refused(f"{self.name} has a fault, {fault}: see to it, then call reset_fault()")
         if direction is None:
-            return status != Status.REVERSE
+            return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
 
     @verb
@@ -295,33 +294,33 @@ class InvtCHE(Drive):
         """Stop along the ramp; a jog that goes on after it is stopped on its own."""
         limit = self.option.get("stop_time", STOP_TIME)
         try:
-            yield from insist(self.control, Control.STOP)
+            yield from insist(self.control, CHEControl.STOP)
         except DriveRefused:  # as it may in a fault, in which it stands already
             if not (yield from self._stands()):
                 raise
         try:
             yield from self._stopped(self._stands, limit)
         except Unconfirmed:
-            yield from insist(self.control, Control.STOP_JOG)
+            yield from insist(self.control, CHEControl.STOP_JOG)
             yield from self._stopped(self._stands, limit)
 
     @verb
     def coast(self) -> Script[None]:
         """Take the voltage off and let the motor run out."""
-        yield from insist(self.control, Control.COAST)
+        yield from insist(self.control, CHEControl.COAST)
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands(self) -> Script[bool]:
         """The drive gives no voltage: in a fault, neither."""
-        return (yield from read(self.status)) in (Status.STANDBY, Status.FAULT)
+        return (yield from read(self.status)) in (CHEStatus.STANDBY, CHEStatus.FAULT)
 
     @verb
     def reset_fault(self) -> Script[None]:
         """Reset a fault; never starts the motor. Sent once, then looked at."""
-        if (yield from read(self.status)) in (Status.FORWARD, Status.REVERSE):
+        if (yield from read(self.status)) in (CHEStatus.FORWARD, CHEStatus.REVERSE):
             raise Refused(f"{self.name} runs: it has no fault to reset")
-        yield from write(self.control, Control.RESET_FAULT)
-        if (yield from read(self.status)) == Status.FAULT:
+        yield from write(self.control, CHEControl.RESET_FAULT)
+        if (yield from read(self.status)) == CHEStatus.FAULT:
             fault = self.fault.format((yield from read(self.fault)))
             raise NotDone(self.name, "the fault reset", f"the fault stands: {fault}")
 
@@ -341,14 +340,14 @@ class InvtCHE(Drive):
     def state(self) -> Script[State]:
         """Its state word, and its fault by name."""
         status = yield from read(self.status)
-        if status == Status.FAULT:
+        if status == CHEStatus.FAULT:
             fault = yield from read(self.fault)
             return State(Condition.FAULT, fault=self.fault.format(fault))
         return STATES.get(status, State(Condition.UNKNOWN, note=f"1001H = {int(status)} is not explained"))
 
 
 STATES = {
-    Status.FORWARD: State(Condition.RUNNING, Direction.FORWARD),
-    Status.REVERSE: State(Condition.RUNNING, Direction.REVERSE),
-    Status.STANDBY: State(Condition.STOPPED),
+    CHEStatus.FORWARD: State(Condition.RUNNING, Direction.FORWARD),
+    CHEStatus.REVERSE: State(Condition.RUNNING, Direction.REVERSE),
+    CHEStatus.STANDBY: State(Condition.STOPPED),
 }

@@ -14,7 +14,6 @@ from multidrop.drive import (
     Direction,
     Drive,
     DriveRefused,
-    Option,
     Pulse,
     Refused,
     Script,
@@ -23,11 +22,11 @@ from multidrop.drive import (
     insist,
     read,
     until,
-    verb,
     wait,
     write,
 )
-from multidrop.register import Details, Kept, Register, command, reading, setting
+from multidrop.drive.register import Details, Kept, Register, command, reading, setting
+from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command
@@ -41,7 +40,7 @@ AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
 
-class Control(IntFlag):
+class YD1000Control(IntFlag):
     """1000H. Bits 15 and 14 latch until they are written 0 or the power goes."""
 
     COMMAND_VALID = 1 << 15  # this word, not CNOD, commands the motor
@@ -60,12 +59,16 @@ class Control(IntFlag):
     PRESET_SPEED_4 = 1 << 0
 
 
-STOP = Control.COMMAND_VALID | Control.FREQUENCY_VALID  # bits 15 and 14, and not run
+STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # bits 15 and 14, and not run
 
-PRESET_SPEEDS = (Control.PRESET_SPEED_1, Control.PRESET_SPEED_2, Control.PRESET_SPEED_3)  # as 1, 2 and 4
+PRESET_SPEEDS = (
+    YD1000Control.PRESET_SPEED_1,
+    YD1000Control.PRESET_SPEED_2,
+    YD1000Control.PRESET_SPEED_3,
+)  # as 1, 2 and 4
 
 
-class Status(IntFlag):
+class YD1000Status(IntFlag):
     RUN = 1 << 10  # also while braking by direct current
     REVERSE = 1 << 9
     JOG = 1 << 8
@@ -86,7 +89,7 @@ class Outputs(IntFlag):
     OUT2 = 1 << 1
 
 
-class Baudrate(IntEnum):
+class YD1000Baudrate(IntEnum):
     B1200 = 0
     B2400 = 1
     B4800 = 2
@@ -281,12 +284,12 @@ class YD1000(Drive):
     # Section 6.3, commands
     control = command(
         0x1000,
-        Control,
+        YD1000Control,
         kept=Kept.RAM,
         while_running=True,
-        broadcast=(STOP, Control.COMMAND_VALID),
-        harmless=(STOP, Control.COMMAND_VALID, STOP | Control.COAST),
-        never_together=(Control.RESET | Control.RUN, Control.RESET | Control.JOG),
+        broadcast=(STOP, YD1000Control.COMMAND_VALID),
+        harmless=(STOP, YD1000Control.COMMAND_VALID, STOP | YD1000Control.COAST),
+        never_together=(YD1000Control.RESET | YD1000Control.RUN, YD1000Control.RESET | YD1000Control.JOG),
         place="6.3, 8.1 table 1: 1000",
     )
     frequency = setting(
@@ -319,7 +322,7 @@ class YD1000(Drive):
     held_frequency = reading(
         0x1200, "Hz", step=0.01, place="6.5: 1200", note="The output frequency; frozen in a trip."
     )
-    status = reading(0x1201, Status, place="6.5, 8.2 table 2: 1201", note="Frozen in a trip.")
+    status = reading(0x1201, YD1000Status, place="6.5, 8.2 table 2: 1201", note="Frozen in a trip.")
     reference_frequency = reading(0x1202, "Hz", step=0.01, place="6.5: 1202")
     output_current = reading(0x1203, "%", step=0.01, place="6.5: 1203")
     dc_bus_voltage = reading(0x1204, "%", step=0.01, place="6.5: 1204")
@@ -336,7 +339,7 @@ class YD1000(Drive):
 
     # Section 7, communication
     baudrate_setting = setting(
-        0x0800, Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
+        0x0800, YD1000Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
     )
     parity_setting = setting(
         0x0801, Parity, kept=Kept.EEPROM, never=LINE, place="7 (2), F801", note=AFTER_RESET
@@ -383,9 +386,9 @@ class YD1000(Drive):
         The options `preset_speed` and `setpoint_by_fnod` give it another setpoint, `second_ramp` the
         other ramp; a stop is along the first one.
         """
-        how = Control.RUN
+        how = YD1000Control.RUN
         if self.option.get("second_ramp"):
-            how |= Control.SECOND_RAMP
+            how |= YD1000Control.SECOND_RAMP
         if self.option.get("preset_speed"):
             how |= yield from self._preset()
         elif not self._by_fnod():
@@ -395,7 +398,7 @@ class YD1000(Drive):
     def _by_fnod(self) -> bool:
         return bool(self.option.get("setpoint_by_fnod"))
 
-    def _preset(self) -> Script[Control]:
+    def _preset(self) -> Script[YD1000Control]:
         """The bits of the preset speed, once 1202H has shown, at rest, that they select it."""
         number = int(self.option["preset_speed"])
         hz = yield from read(self.registers[f"preset_speed_{number}"])
@@ -409,7 +412,7 @@ class YD1000(Drive):
                 f"{self.name} has {hz:g} Hz as its frequency command without preset speed {number} too, so "
                 "that nothing would show the wrong bits: write another frequency to 1001H first"
             )
-        bits = Control(0)
+        bits = YD1000Control(0)
         for at, bit in enumerate(PRESET_SPEEDS):
             if number >> at & 1:
                 bits |= bit
@@ -428,19 +431,19 @@ class YD1000(Drive):
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
-        yield from self._turn(Control.JOG, direction)
+        yield from self._turn(YD1000Control.JOG, direction)
 
-    def _turn(self, how: Control, direction: Direction | None) -> Script[None]:
+    def _turn(self, how: YD1000Control, direction: Direction | None) -> Script[None]:
         state = yield from self._without_fault()
         if direction is None and state.condition is Condition.RUNNING:
             direction = state.direction
-        reverse = Control.REVERSE if direction is Direction.REVERSE else Control(0)
+        reverse = YD1000Control.REVERSE if direction is Direction.REVERSE else YD1000Control(0)
         yield from write(self.control, self._valid() | how | reverse)
         yield from self._started()
 
-    def _valid(self) -> Control:
+    def _valid(self) -> YD1000Control:
         """Bit 15, and bit 14 unless FNOD is to say where the setpoint comes from."""
-        return Control.COMMAND_VALID if self._by_fnod() else STOP
+        return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
         state = yield from self.state.script()
@@ -451,7 +454,7 @@ class YD1000(Drive):
     def _direction(self) -> Script[Direction]:
         """Of a motor that turns: then 1201H is not frozen."""
         status = yield from read(self.status)
-        return Direction.REVERSE if status & Status.REVERSE else Direction.FORWARD
+        return Direction.REVERSE if status & YD1000Status.REVERSE else Direction.FORWARD
 
     @verb
     def stop(self) -> Script[None]:
@@ -462,7 +465,7 @@ class YD1000(Drive):
     @verb
     def coast(self) -> Script[None]:
         """Take the voltage off and let the motor run out; the coast bit stays set until the next command."""
-        yield from insist(self.control, STOP | Control.COAST)
+        yield from insist(self.control, STOP | YD1000Control.COAST)
         yield from self._stopped(self._stands, STOP_MARGIN)
 
     @verb
@@ -472,7 +475,7 @@ class YD1000(Drive):
         It is a pulse and sent once. When it is not confirmed, the stop along the ramp follows at once.
         """
         try:
-            yield Pulse(self.control, STOP | Control.EMERGENCY_STOP)
+            yield Pulse(self.control, STOP | YD1000Control.EMERGENCY_STOP)
         except (Unconfirmed, DriveRefused):
             yield from self.stop.script()
             return
@@ -502,7 +505,7 @@ class YD1000(Drive):
         if (yield from read(self.output_frequency)) > 0:
             raise Refused(f"{self.name} runs: it has no fault to reset")
         with suppress(Unconfirmed):  # the restart cuts the reply off
-            yield from write(self.control, STOP | Control.RESET)
+            yield from write(self.control, STOP | YD1000Control.RESET)
         yield from wait(RESET_TIME)
         yield from insist(self.control, STOP)
         self._record = yield from read(self.fault_record_1)

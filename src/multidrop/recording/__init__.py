@@ -28,9 +28,9 @@ these. The reader here takes one off.
 
 The metadata is one JSON object. It lies in the schema's metadata under the key `multidrop` (.arrows,
 .parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file; `planned`,
-for each line's name what it should reach (multidrop.forecast says how); and `drives`: for each drive's
-name its line, model, address, settings and framing, and `registers`, for each register's name its unit
-and step.
+for each line's name what it should reach (multidrop.planning.forecast says how); and `drives`: for each
+drive's name its line, model, address, settings and framing, and `registers`, for each register's
+name its unit and step.
 
 pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; a recording whose end is torn they
 refuse until `repair` has cut the torn end off. The reader here needs neither, and leaves it out.
@@ -43,27 +43,27 @@ import os
 from pathlib import Path
 from typing import Any
 
-from multidrop.recording.interface import Metadata, Reader, RecordingError, Writer
+from multidrop.recording.format import Metadata, RecordingError, RecordingReader, RecordingWriter
 
-__all__ = ["FORMATS", "Metadata", "Reader", "RecordingError", "Writer"]
+__all__ = ["FORMATS", "Metadata", "RecordingError", "RecordingReader", "RecordingWriter"]
 __all__ += ["convert", "open_reader", "open_writer", "repair"]
 
 FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix: module
 
 
-def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> Writer:
+def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> RecordingWriter:
     """Begin a recording in a new file; what is in another one is never lost.
 
     Raises ValueError for another suffix or when there is a file at `path`, TypeError for metadata that
     JSON cannot hold, and RecordingError when the file cannot be written.
     """
-    writer: Writer = _format(Path(path)).Writer(Path(path), metadata)
+    writer: RecordingWriter = _format(Path(path)).writer(Path(path), metadata)
     return writer
 
 
-def open_reader(path: str | os.PathLike[str]) -> Reader:
+def open_reader(path: str | os.PathLike[str]) -> RecordingReader:
     """Open a recording, finished or not. Raises ValueError for what is not one, and OSError."""
-    reader: Reader = _format(Path(path)).Reader(Path(path))
+    reader: RecordingReader = _format(Path(path)).reader(Path(path))
     return reader
 
 
@@ -97,7 +97,7 @@ def repair(path: str | os.PathLike[str]) -> int:
 
 
 def _format(path: Path) -> Any:
-    """The module that has the Writer and the Reader."""
+    """The module that has a `writer` and a `reader`."""
     module = FORMATS.get(path.suffix.lower())
     if not module:
         raise ValueError(f"{path}: a recording's name ends in {', '.join(FORMATS)}")

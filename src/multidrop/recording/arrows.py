@@ -14,12 +14,20 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from multidrop.batch import Rows, assemble, schema
-from multidrop.recording import interface
-from multidrop.recording.interface import Metadata, RecordingError, damaged, not_a_recording
-from multidrop.recording.messages import RECORD_BATCH, SCHEMA, Message, Table, messages
-from multidrop.recording.recorded import Recorded
-from multidrop.recording.whole import WholeFile
+from multidrop.polling.batch import Rows, assemble, schema
+from multidrop.recording.append_file import WholeFile
+from multidrop.recording.arrow_ipc import RECORD_BATCH, SCHEMA, FlatTable, IpcMessage, messages
+from multidrop.recording.format import (
+    Metadata,
+    RecordingError,
+    RecordingReader,
+    RecordingWriter,
+    damaged,
+    dump_metadata,
+    load_metadata,
+    not_a_recording,
+)
+from multidrop.recording.rows import Recorded
 
 KEY = "multidrop"  # of the schema's metadata
 
@@ -36,7 +44,7 @@ COLUMNS = [  # name, type, and the first field of the type: bits, precision (dou
 BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
 
 
-class Writer(interface.Writer):
+class ArrowsWriter(RecordingWriter):
     """Writes each batch as one message, in one call of the system."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
@@ -44,7 +52,7 @@ class Writer(interface.Writer):
         from nanoarrow.c_array_stream import CArrayStream
         from nanoarrow.ipc import StreamWriter
 
-        described = schema().modify(metadata={KEY: interface.dump(metadata)})
+        described = schema().modify(metadata={KEY: dump_metadata(metadata)})
         self._message = BytesIO()
         self._encoder = StreamWriter.from_writable(self._message)
         try:
@@ -77,7 +85,7 @@ class Writer(interface.Writer):
             raise RecordingError.of(failure, self.path, self.rows) from failure
 
 
-class Reader(interface.Reader):
+class ArrowsReader(RecordingReader):
     """Reads every whole message; a torn one at the end is left out."""
 
     def __init__(self, path: Path) -> None:
@@ -108,7 +116,7 @@ class Reader(interface.Reader):
                 yield batch
                 rows += len(batch)
 
-    def _read_schema(self, message: Message) -> Metadata:
+    def _read_schema(self, message: IpcMessage) -> Metadata:
         try:
             head = message.header if message.kind == SCHEMA else None
             if not head or [_column(field) for field in head.tables(1)] != COLUMNS:
@@ -116,10 +124,10 @@ class Reader(interface.Reader):
             entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
         except struct.error as mistake:
             raise not_a_recording(self.path, "it does not begin like an Arrow stream") from mistake
-        return interface.load(entries.get(KEY.encode(), b"{}"), self.path)
+        return load_metadata(entries.get(KEY.encode(), b"{}"), self.path)
 
 
-def _column(field: Table) -> tuple[bytes, int, int]:
+def _column(field: FlatTable) -> tuple[bytes, int, int]:
     detail = field.table(3)
     return field.text(0), field.number(2, "<B"), detail.number(0, "<h") if detail else 0
 
@@ -133,7 +141,7 @@ def _check_text(offsets: memoryview, text: memoryview) -> None:
             raise ValueError("its text is not UTF-8")
 
 
-def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
+def _decode(message: IpcMessage, batch: FlatTable, body: memoryview) -> Recorded:
     if message.kind != RECORD_BATCH:
         raise ValueError("there is a message that is not a batch of rows")
     if batch.table(3):
@@ -151,3 +159,6 @@ def _decode(message: Message, batch: Table, body: memoryview) -> Recorded:
             _check_text(*data)
         columns.append((valid or None, *data))
     return Recorded(assemble(rows, *columns))
+
+
+writer, reader = ArrowsWriter, ArrowsReader

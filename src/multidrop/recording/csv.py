@@ -13,11 +13,18 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
-from multidrop.batch import Row, Rows
-from multidrop.recording import interface
-from multidrop.recording.interface import Metadata, RecordingError, not_a_recording
-from multidrop.recording.recorded import from_rows
-from multidrop.recording.whole import WholeFile
+from multidrop.polling.batch import Row, Rows
+from multidrop.recording.append_file import WholeFile
+from multidrop.recording.format import (
+    Metadata,
+    RecordingError,
+    RecordingReader,
+    RecordingWriter,
+    dump_metadata,
+    load_metadata,
+    not_a_recording,
+)
+from multidrop.recording.rows import from_rows
 
 HEADER = ",".join(Row._fields) + "\n"
 # A spreadsheet carries out a text that begins like this, but not with an apostrophe in front.
@@ -34,12 +41,12 @@ def beside(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-class Writer(interface.Writer):
+class CsvWriter(RecordingWriter):
     """Writes each batch's lines in one call of the system."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
-        described = interface.dump(metadata)
+        described = dump_metadata(metadata)
         try:
             self._file = WholeFile(path)
         except OSError as failure:
@@ -84,7 +91,7 @@ def _put(path: Path, text: str) -> None:
         raise
 
 
-class Reader(interface.Reader):
+class CsvReader(RecordingReader):
     """Reads every whole line; without the .csv.json beside it the metadata is empty."""
 
     def __init__(self, path: Path) -> None:
@@ -99,7 +106,7 @@ class Reader(interface.Reader):
             described = beside(path).read_bytes()
         except FileNotFoundError:
             described = b"{}"
-        self.metadata = interface.load(described, beside(path))
+        self.metadata = load_metadata(described, beside(path))
 
     def __iter__(self) -> Iterator[Rows]:
         with self.path.open("rb") as file:
@@ -190,3 +197,6 @@ def _spell_second(second: int) -> str:
 @lru_cache(maxsize=1024)
 def _read_second(text: str) -> int:
     return (datetime.fromisoformat(text).replace(tzinfo=UTC) - EPOCH) // timedelta(seconds=1)
+
+
+writer, reader = CsvWriter, CsvReader

@@ -12,11 +12,19 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
-from multidrop.batch import Rows, schema
-from multidrop.recording import interface
-from multidrop.recording.interface import Metadata, RecordingError, damaged, not_a_recording
-from multidrop.recording.recorded import Recorded
-from multidrop.recording.whole import new_file
+from multidrop.polling.batch import Rows, schema
+from multidrop.recording.append_file import new_file
+from multidrop.recording.format import (
+    Metadata,
+    RecordingError,
+    RecordingReader,
+    RecordingWriter,
+    damaged,
+    dump_metadata,
+    load_metadata,
+    not_a_recording,
+)
+from multidrop.recording.rows import Recorded
 
 KEY = b"multidrop"  # of the schema's metadata
 GROUP_ROWS = 1 << 17  # rows wait in memory until there are so many
@@ -37,13 +45,13 @@ def _pyarrow(path: Path) -> Any:
     return arrow
 
 
-class Writer(interface.Writer):
+class ParquetWriter(RecordingWriter):
     """Gathers rows, and writes them in large groups."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
         self._arrow = _pyarrow(path)
-        described = self._arrow.schema(schema()).with_metadata({KEY: interface.dump(metadata)})
+        described = self._arrow.schema(schema()).with_metadata({KEY: dump_metadata(metadata)})
         self._waiting: list[Any] = []
         try:
             self._file = BufferedWriter(new_file(path))
@@ -83,7 +91,7 @@ class Writer(interface.Writer):
             raise RecordingError(self.path, reason) from failure
 
 
-class Reader(interface.Reader):
+class ParquetReader(RecordingReader):
     """Reads one group of rows at a time."""
 
     torn = 0
@@ -96,7 +104,7 @@ class Reader(interface.Reader):
         wanted = self._arrow.schema(schema())
         if (found.names, found.types) != (wanted.names, wanted.types):
             raise not_a_recording(path, "it is a Parquet file with other columns")
-        self.metadata = interface.load((found.metadata or {}).get(KEY, b"{}"), path)
+        self.metadata = load_metadata((found.metadata or {}).get(KEY, b"{}"), path)
 
     def __iter__(self) -> Iterator[Rows]:
         from nanoarrow import c_array
@@ -125,3 +133,6 @@ class Reader(interface.Reader):
             why = ValueError("what follows cannot be unpacked")
             raise damaged(self.path, rows, why) from failure
         return table.replace_schema_metadata().to_batches()
+
+
+writer, reader = ParquetWriter, ParquetReader

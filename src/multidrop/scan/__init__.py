@@ -1,7 +1,7 @@
 """Finding the drives on a line whose settings nobody knows, by reading and nothing else."""
 
-from multidrop.scan.findings import Crowd, Finding, Found, Noise, Progress, Untried
-from multidrop.scan.planted import plant_text
+from multidrop.scan.plant_writer import plant_text
+from multidrop.scan.results import Crowd, Finding, Found, Noise, Progress, Untried
 from multidrop.scan.scanner import scan
 from multidrop.scan.sweep import ADDRESSES, Question, Sweep, one_of_each_framing, sweeps
 

@@ -14,16 +14,16 @@ from multidrop.core import (
     Exchange,
     Framing,
     Message,
-    Respondent,
+    Peer,
     Result,
     build_request,
     parse_reply,
     reply_length,
 )
-from multidrop.drive import Drive
+from multidrop.drive.family import Drive
 from multidrop.errors import LineError
-from multidrop.scan.findings import Crowd, Finding, Noise, Progress, Untried
-from multidrop.scan.look import MOST_TIMEOUT, TRIES, Look
+from multidrop.scan.probe import MOST_TIMEOUT, TRIES, Probe
+from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
 NOISY = 1 / 3  # of a sweep's addresses: if more bring garbage, it is no drives' doing
@@ -51,7 +51,7 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._respondents: list[Respondent] = []  # the line holds on to them
+        self._peers: list[Peer] = []  # the line holds on to them
         self._found: set[tuple[int, Framing, int]] = set()
         self._told: set[tuple[int, Framing, int]] = set()  # crowds
         self._excess = 0.0  # s that answers took longer than is usual in their families
@@ -73,7 +73,7 @@ class _Scan:
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [it for it in sweep.addresses if _key(sweep, it) not in self._found]
         garbled: list[int] = []
-        listeners: dict[int, Respondent] = {}
+        listeners: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             listeners[address] = self._listener(sweep)
             try:
@@ -91,7 +91,7 @@ class _Scan:
                 del listeners[suspect]
             late += _late(sweep, earlier, completion)
             for suspect in late + [address] * came:
-                closer = Look(self, sweep, suspect)
+                closer = Probe(self, sweep, suspect)
                 if closer.answers and _key(sweep, suspect) not in self._found:
                     self._found.add(_key(sweep, suspect))
                     yield closer.found(self._families)
@@ -113,24 +113,24 @@ class _Scan:
 
     # ---- exchanges ----
 
-    def ask(self, sweep: Sweep, request: Message, respondent: Respondent) -> Completion:
+    def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion:
         """One exchange; what only echoes the request is no reply."""
-        completion = self._once(sweep, sweep.framing, request, respondent)
+        completion = self._once(sweep, sweep.framing, request, peer)
         if completion.raw == build_request(sweep.framing, request):
             # Where a reply may be a copy of its request, the core learns of an echo from another framing.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._listener(sweep))
-            completion = self._once(sweep, sweep.framing, request, respondent)
+            completion = self._once(sweep, sweep.framing, request, peer)
             if completion.raw == build_request(sweep.framing, request):
                 return replace(completion, result=Result.NO_REPLY, raw=b"")
         return completion
 
-    def _once(self, sweep: Sweep, framing: Framing, request: Message, respondent: Respondent) -> Completion:
+    def _once(self, sweep: Sweep, framing: Framing, request: Message, peer: Peer) -> Completion:
         settings = sweep.settings
         exchange = Exchange(
             framing,
             request,
-            respondent,
+            peer,
             baudrate=settings.baudrate,
             format=settings.format,
             character=settings.character,
@@ -138,19 +138,19 @@ class _Scan:
         )
         completion = self._carry_out(exchange)
         if completion.result == Result.LATE_ANSWER_DUE:
-            completion = self._carry_out(exchange, not_before_ns=respondent.late_until_ns)
+            completion = self._carry_out(exchange, not_before_ns=peer.late_until_ns)
         return completion
 
-    def _listener(self, sweep: Sweep) -> Respondent:
+    def _listener(self, sweep: Sweep) -> Peer:
         """Who waits for the beginning of a reply only: what then goes on to come is looked at closer."""
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.question.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character
-        return self.respondent(max(window, settings.character), max(window, settings.character))
+        return self.peer(max(window, settings.character), max(window, settings.character))
 
-    def respondent(self, least: float, most: float) -> Respondent:
-        self._respondents.append(Respondent(least_timeout=least, most_timeout=most))
-        return self._respondents[-1]
+    def peer(self, least: float, most: float) -> Peer:
+        self._peers.append(Peer(least_timeout=least, most_timeout=most))
+        return self._peers[-1]
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:

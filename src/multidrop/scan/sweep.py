@@ -12,10 +12,11 @@ from weakref import WeakKeyDictionary
 
 from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
-from multidrop.drive import Drive
-from multidrop.plan import Block, silence
-from multidrop.register import Access, Carrier, Register, Table
-from multidrop.timing import Settings
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Carrier, Register, Table
+from multidrop.drive.timing import Settings
+from multidrop.planning.blocks import Block
+from multidrop.planning.bus_time import silence
 
 Setting = tuple[Settings, Framing]
 

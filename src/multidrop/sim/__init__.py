@@ -4,9 +4,9 @@ from multidrop.sim.drive import Counters, SimulatedDrive, Written
 from multidrop.sim.encoded import EncodedDrive, encoded, proof
 from multidrop.sim.families import simulated
 from multidrop.sim.faults import Faults, load_faults
-from multidrop.sim.hostile import HostileWire
+from multidrop.sim.faulty_wire import HostileWire
 from multidrop.sim.motor import Motor, Phase, Rating
-from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.motor_drive import PoweredDrive
 from multidrop.sim.simulator import Simulator, serve
 from multidrop.sim.wire import Wire
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.register import HOLDING
-from multidrop.sim.dialect import Reason, Refusal
-from multidrop.sim.memory import Cell
-from multidrop.sim.powered import PoweredDrive
+from multidrop.drive.register import HOLDING
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.protocol import Reason, Refusal
 
 CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
@@ -53,7 +53,7 @@ class SimulatedCHE(PoweredDrive):
     def setpoint(self) -> float:
         return _signed(self.word(SETPOINT)) / FULL * self.motor.maximum_frequency
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
         if cell.address == SETPOINT:  # the library writes no negative one; the drive takes it

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.sim.dialect import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
-from multidrop.sim.memory import Cell
-from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.protocol import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
 
 MOST_GAP = 10e-3  # s between two bytes; of part 3, for want of another
 UNDER_VOLTAGE = 7  # fault number, POFF
@@ -74,7 +74,7 @@ class SimulatedDelixiNative(PoweredDrive):
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == COMMAND
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         if cell.table.write == COMMAND:
             by_line = self.word(RUN_SOURCE) == BY_LINE[RUN_SOURCE]
             if raw not in COMMANDS or not by_line or (raw in STARTS and self.motor.fault):
@@ -83,7 +83,7 @@ class SimulatedDelixiNative(PoweredDrive):
             raise Refusal(Reason.LOCKED)
         return super().accept(cell, raw)
 
-    def changed(self, cell: Cell) -> None:
+    def changed(self, cell: MemoryCell) -> None:
         if cell.name == "stored_frequency":  # whichever was written last counts
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)

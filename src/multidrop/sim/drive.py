@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 from multidrop.core import Framing, Message, raw_value
-from multidrop.drive import Drive
-from multidrop.register import Access, Carrier, Kept
-from multidrop.sim.dialect import DIALECTS, Reason, Refusal
-from multidrop.sim.memory import Cell, Memory, decode, pack
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Carrier, Kept
+from multidrop.sim.memory import Memory, MemoryCell, decode, pack
+from multidrop.sim.protocol import DIALECTS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
@@ -99,10 +99,10 @@ class SimulatedDrive:
     def pass_time(self, now: float) -> None:
         """Bring the drive to the time `now`."""
 
-    def refresh(self, cell: Cell) -> None:
+    def refresh(self, cell: MemoryCell) -> None:
         """Make the cell hold what is to be read from it now."""
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         """What is stored when this is written; raises Refusal."""
         register = cell.register
         if register is None or register.words > 1:
@@ -111,16 +111,16 @@ class SimulatedDrive:
             raise Refusal(Reason.VALUE)
         return raw
 
-    def _accept_long(self, raws: Mapping[Cell, int]) -> None:
+    def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
         """Refuse a value of several words that is outside its span, where all of them are written."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
                 data = b"".join(pack(cell.table, raws[cell]) for cell in cells)
-                if not register.takes(register.decode(raw_value(data, 0, register.wire))):
+                if not register.takes(register.decode(raw_value(data, 0, register.number_format))):
                     raise Refusal(Reason.VALUE)
 
-    def changed(self, cell: Cell) -> None:
+    def changed(self, cell: MemoryCell) -> None:
         """The cell was written, by the line or from outside: act on it."""
 
     def wore(self) -> None:
@@ -224,7 +224,7 @@ class SimulatedDrive:
         self.check_count(function, count)
         return [self._read_one(self.memory.readable(function, start + at)) for at in range(count)]
 
-    def _read_one(self, cell: Cell | None) -> int:
+    def _read_one(self, cell: MemoryCell | None) -> int:
         if cell is None:
             raise Refusal(Reason.READ_ADDRESS)
         self.refresh(cell)
@@ -232,7 +232,7 @@ class SimulatedDrive:
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
         """Write neighbouring cells: all of them, or none when one is refused."""
-        cells: list[Cell] = []
+        cells: list[MemoryCell] = []
         for at in range(len(raws)):
             cell = self.memory.writable(function, start + at)
             if cell is None:
@@ -249,7 +249,7 @@ class SimulatedDrive:
         for cell in cells:
             self.changed(cell)
 
-    def wears(self, cell: Cell, function: int, address: int) -> bool:
+    def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
         """Whether such a write wears the EEPROM; one to a setting of which nothing is known does."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from multidrop.core import raw_value
-from multidrop.drive import Drive
-from multidrop.register import Carrier, Register, Table
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Carrier, Register, Table
 from multidrop.sim.drive import SimulatedDrive
-from multidrop.sim.memory import Cell
+from multidrop.sim.memory import MemoryCell
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
@@ -23,7 +23,7 @@ def proof(drive: Drive, register: Register[Any]) -> float:
     at = range(register.address, register.address + register.words)
     size = 2 if register.table.carrier is Carrier.WORD else 4
     data = b"".join(encoded(drive.address, register.table, it).to_bytes(size) for it in at)
-    raw = raw_value(data, 0, register.wire)
+    raw = raw_value(data, 0, register.number_format)
     return raw * register.scale.numerator / register.scale.denominator
 
 
@@ -40,12 +40,12 @@ class EncodedDrive(SimulatedDrive):
     What is written to it is confirmed and forgotten. No value of it can be taken for another's.
     """
 
-    def refresh(self, cell: Cell) -> None:
+    def refresh(self, cell: MemoryCell) -> None:
         if cell.register and cell.register in self.drive.known_counts():
             cell.raw = _known(self.drive, cell.register)
             return
         bits = 1 if cell.table.carrier is Carrier.BIT else 0x7FFF
         cell.raw = encoded(self.drive.address, cell.table, cell.address) & bits
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         return cell.raw

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from multidrop.core import Message
-from multidrop.register import COIL
-from multidrop.sim.dialect import Reason
+from multidrop.drive.register import COIL
 from multidrop.sim.motor import Phase
-from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.protocol import Reason
 
 COILS = range(13)  # 3 to 8 and 10 to 12 are reserved; a library keeps away from them, the drive does not
 START, STOP, EMERGENCY_STOP, FAULT_RESET = 0, 1, 2, 9

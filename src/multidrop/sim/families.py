@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from multidrop.drive import Drive
+from multidrop.drive.family import Drive
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.erman_er_g_220 import ErmanERG220

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.mistakes import Key, Place, read_document
-from multidrop.plant import duration_of
+from multidrop.plant.loader import duration_of
+from multidrop.plant.toml_check import Key, TomlPlace, read_document
 
 
 def _rate(means: str) -> Any:
@@ -74,7 +74,7 @@ HELP = "The faults' file has these lines, all of which may be left out:\n" + "".
 def load_faults(path: Path | str) -> Faults:
     """The faults that the file describes; ValueError with all that is wrong in it."""
     path = Path(path)
-    place = Place(path)
+    place = TomlPlace(path)
     document = place.attempt(read_document, path, "faults' file")
     given = place.check({} if document is None else document, _KEYS)
     for name in [name for name in given if name in _DURATIONS]:

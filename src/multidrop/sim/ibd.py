@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from multidrop.core import Framing
-from multidrop.sim.memory import Cell
+from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
-from multidrop.sim.powered import PoweredDrive
+from multidrop.sim.motor_drive import PoweredDrive
 
 CONTROL, SETPOINT = 0x2000, 0x2001
 STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .02
@@ -49,7 +49,7 @@ class SimulatedIBD(PoweredDrive):
     def most_gap(self) -> float:
         return 10e-3 if self.drive.framing is Framing.RTU else super().most_gap
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         register = cell.register
         if register is not None and register.span is not None:
             return min(raw, int(register.encode(register.span[1])))

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from multidrop.core import Framing, Wire, raw_value
-from multidrop.drive import Drive
-from multidrop.float32 import nearest_or_infinite
-from multidrop.register import Access, Carrier, Register, Table
+from multidrop.core import Framing, NumberFormat, raw_value
+from multidrop.drive.family import Drive
+from multidrop.drive.float32 import nearest_or_infinite
+from multidrop.drive.register import Access, Carrier, Register, Table
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
 _DELIXI_STORES = 0x06
-_LOW_WORD_FIRST = (Wire.U32_SWAPPED, Wire.I32_SWAPPED, Wire.F32_SWAPPED)
+_LOW_WORD_FIRST = (NumberFormat.U32_SWAPPED, NumberFormat.I32_SWAPPED, NumberFormat.F32_SWAPPED)
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
 _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
 
 
 @dataclass(eq=False)
-class Cell:
+class MemoryCell:
     """One address of one table, and the register that it belongs to, if it is not a reserved one."""
 
     table: Table
@@ -45,16 +45,16 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[Table, int], Cell] = {}
-        self._read: dict[tuple[int, int], Cell | None] = {}  # None: not to be read, gap or not
+        self._cells: dict[tuple[Table, int], MemoryCell] = {}
+        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: not to be read, gap or not
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
-        self._written: dict[tuple[int, int], Cell] = {}
+        self._written: dict[tuple[int, int], MemoryCell] = {}
         self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
         for register in drive.registers.values():
             self._declare(register)
 
-    def _cell(self, table: Table, address: int) -> Cell:
-        return self._cells.setdefault((table, address), Cell(table, address))
+    def _cell(self, table: Table, address: int) -> MemoryCell:
+        return self._cells.setdefault((table, address), MemoryCell(table, address))
 
     def _declare(self, register: Register[Any]) -> None:
         table = register.table
@@ -91,7 +91,7 @@ class Memory:
         """The function codes that write this table."""
         return set() if table.write is None else {table.write, self._also.get(table.write, table.write)}
 
-    def readable(self, function: int, address: int) -> Cell | None:
+    def readable(self, function: int, address: int) -> MemoryCell | None:
         key = function, address
         if key not in self._read:
             tables = (table for code, table, gap in self._gaps if code == function and address in gap)
@@ -101,7 +101,7 @@ class Memory:
             self._read[key] = self._cell(table, address)
         return self._read[key]
 
-    def writable(self, function: int, address: int) -> Cell | None:
+    def writable(self, function: int, address: int) -> MemoryCell | None:
         """The cell that a write there changes, whatever the library itself would write."""
         return self._written.get((function, address))
 
@@ -110,7 +110,7 @@ class Memory:
     def get(self, register: Register[Any]) -> Any:
         """The register's value in its own unit."""
         data = b"".join(pack(register.table, cell.raw) for cell in self.of(register))
-        return register.decode(raw_value(data, 0, register.wire))
+        return register.decode(raw_value(data, 0, register.number_format))
 
     def set(self, register: Register[Any], value: float) -> None:
         """Hold this value: rounded to the register's step, cut off where it does not fit."""
@@ -126,11 +126,11 @@ class Memory:
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
         cells = self.of(register)
-        for cell in cells if register.wire in _LOW_WORD_FIRST else reversed(cells):
+        for cell in cells if register.number_format in _LOW_WORD_FIRST else reversed(cells):
             cell.raw = raw & _MASKS[register.table.carrier]
             raw >>= 16
 
-    def of(self, register: Register[Any]) -> list[Cell]:
+    def of(self, register: Register[Any]) -> list[MemoryCell]:
         """The register's cells, in the order of their addresses."""
         return [self._cells[register.table, register.address + at] for at in range(register.words)]
 
@@ -147,4 +147,4 @@ def pack(table: Table, raw: int) -> bytes:
 
 def decode(register: Register[Any], raw: int) -> Any:
     """The value of a raw count that one cell holds."""
-    return register.decode(raw_value(pack(register.table, raw), 0, register.wire))
+    return register.decode(raw_value(pack(register.table, raw), 0, register.number_format))

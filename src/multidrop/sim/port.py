@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
+from multidrop.control.eeprom_ledger import default_path
 from multidrop.core import get_settings, set_settings
-from multidrop.ledger import default_path
-from multidrop.port_identity import of_address
-from multidrop.simulated_ports import SimulatedPort
-from multidrop.timing import Settings
+from multidrop.drive.timing import Settings
+from multidrop.transport.port_identity import of_address
+from multidrop.transport.simulated_ports import SimulatedPort
 
 MOST_READ = 4096
 
 
-class Port(Protocol):
+class SimulatedEnd(Protocol):
     path: str  # where a client opens it
 
     def fileno(self) -> int:
@@ -36,7 +36,7 @@ class Port(Protocol):
     def close(self) -> None: ...
 
 
-def open_port(where: str, settings: Settings) -> Port:
+def open_port(where: str, settings: Settings) -> SimulatedEnd:
     """A port of the kind that `where` names: see Wire."""
     if where.startswith("socket://"):
         return TCPPort(where)

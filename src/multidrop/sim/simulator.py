@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from types import TracebackType
 
-from multidrop.sim.port import Port
+from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 
 
@@ -26,7 +26,7 @@ class Simulator:
         self._failure: BaseException | None = None
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
         self._planned: dict[int, float] = {}  # of each wire, the wake that counts
-        self._attended: dict[int, tuple[Port, int]] = {}  # of each wire, the port that is listened to
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is listened to
 
     def __enter__(self) -> Simulator:
         self.open()
@@ -54,8 +54,8 @@ class Simulator:
     def open(self) -> None:
         """Open every wire's port, or none; the paths are known then."""
         self._selector = selectors.DefaultSelector()
-        self._ears, self.bell = os.pipe()
-        os.set_blocking(self.bell, False)
+        self._ears, self.wakeup = os.pipe()
+        os.set_blocking(self.wakeup, False)
         self._selector.register(self._ears, selectors.EVENT_READ, None)
         try:
             for number, wire in enumerate(self.wires):
@@ -70,11 +70,11 @@ class Simulator:
             wire.close()
         self._selector.close()
         os.close(self._ears)
-        os.close(self.bell)
+        os.close(self.wakeup)
 
     def interrupt(self) -> None:
         """Make `run` return; from any thread."""
-        os.write(self.bell, b"!")
+        os.write(self.wakeup, b"!")
 
     def run(self) -> None:
         """Run the wires until interrupted. Blocks."""
@@ -143,14 +143,14 @@ def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda 
     simulator = Simulator(wires)
     simulator.open()
     before = signal.signal(signal.SIGTERM, lambda *_: None)
-    # A signal that comes just before it sleeps has no handler called until it wakes: it rings the bell.
-    bell = signal.set_wakeup_fd(simulator.bell)
+    # A signal that comes just before it sleeps has no handler called until it wakes: it rings the wakeup.
+    wakeup = signal.set_wakeup_fd(simulator.wakeup)
     try:
         announce(simulator)
         simulator.run()
     except KeyboardInterrupt:
         pass
     finally:
-        signal.set_wakeup_fd(bell)
+        signal.set_wakeup_fd(wakeup)
         signal.signal(signal.SIGTERM, before)
         simulator.close()

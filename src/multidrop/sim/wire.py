@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from multidrop.core import Framing, build_reply
+from multidrop.drive.timing import Settings
 from multidrop.sim.drive import SimulatedDrive
-from multidrop.sim.port import Port, open_port
+from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
-from multidrop.timing import Settings
 
 CHUNK = 1e-3  # s; characters that end within it are handed over together
 ROUNDING = 1e-6  # of a character, so that a wake finds the byte that it was for
@@ -85,7 +85,7 @@ class Wire:
         self.drives = tuple(drives)
         self.name = name
         self.where = port
-        self.port: Port | None = None  # there while it is open
+        self.port: SimulatedEnd | None = None  # there while it is open
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
         self._ears = self._group()
         self._outgoing: list[Transmission] = []  # by their begin

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 from multidrop.core import Message
-from multidrop.register import HOLDING
-from multidrop.sim.dialect import Reason, Refusal
-from multidrop.sim.memory import Cell, decode
-from multidrop.sim.powered import PoweredDrive
+from multidrop.drive.register import HOLDING
+from multidrop.sim.memory import MemoryCell, decode
+from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.protocol import Reason, Refusal
 
 CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY = 0x1000, 0x1001, 0x1002
 TIMEOUT_SETTING = 0x0803
@@ -69,7 +69,7 @@ class SimulatedYD1000(PoweredDrive):
             return self.word(PRESET_SPEEDS[number - 1]) / 100
         return self.word(COMMUNICATION_FREQUENCY if word & BY_FREQUENCY else PANEL_FREQUENCY) / 100
 
-    def accept(self, cell: Cell, raw: int) -> int:
+    def accept(self, cell: MemoryCell, raw: int) -> int:
         register = cell.register
         if cell.address in PANEL_ONLY:
             return cell.raw
@@ -81,7 +81,7 @@ class SimulatedYD1000(PoweredDrive):
                 raise Refusal(Reason.VALUE)
         return super().accept(cell, raw)
 
-    def wears(self, cell: Cell, function: int, address: int) -> bool:
+    def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
         return cell.address not in PANEL_ONLY and super().wears(cell, function, address)
 
     def pass_time(self, now: float) -> None:
@@ -100,7 +100,7 @@ class SimulatedYD1000(PoweredDrive):
                 self.refresh(cell)
         super().trip(code)
 
-    def refresh(self, cell: Cell) -> None:
+    def refresh(self, cell: MemoryCell) -> None:
         if not (self.motor.fault and cell.address in HELD):
             super().refresh(cell)
 

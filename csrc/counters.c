@@ -1,0 +1,58 @@
+/* What became of a drive's exchanges, counted: a few additions for each, in memory that does not grow.
+ *
+ * Numbers only rise, and nobody else writes them: whoever wants those of a span of time takes the
+ * difference of two looks. Response delays fall into buckets, PARTS of them to each doubling. */
+#include "multidrop.h"
+
+enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
+enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
+
+_Static_assert(sizeof((struct md_counters){0}).missed == (1 - MD_MAYBE_ECHO) * sizeof(uint64_t), "every reason has a place");
+
+static int bucket(int64_t ns)
+{
+    if (ns < INT64_C(1) << FIRST_DOUBLING)
+        return 0;
+    int doubling = 63 - __builtin_clzll((unsigned long long)ns);
+    int part = (int)(ns >> (doubling - PART_BITS)) & (PARTS - 1);
+    int found = (doubling - FIRST_DOUBLING) * PARTS + part;
+    return found < MD_DELAY_BUCKETS ? found : MD_DELAY_BUCKETS - 1;
+}
+
+int64_t md_delay_edge(int bucket)
+{
+    if (bucket <= 0)
+        return 0;
+    return (int64_t)(PARTS + bucket % PARTS) << (FIRST_DOUBLING - PART_BITS + bucket / PARTS);
+}
+
+void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange, const struct md_completion *completion)
+{
+    uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
+    if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
+        values = 0; /* it is asked again */
+    uint8_t exception = completion->reply.exception;
+    counters->exchanges++;
+    counters->sent += completion->sent_ns != 0;
+    counters->stray_bytes += completion->stale + completion->skipped;
+    if (completion->result <= 0)
+        counters->ended[-completion->result]++;
+    if (completion->result < 0)
+        counters->missed[-completion->result] += values;
+    else if (exception) {
+        counters->exceptions++;
+        counters->naks += exception == NAK;
+        counters->busies += exception == BUSY;
+        counters->refused[exception] += (uint32_t)values;
+    } else
+        counters->values += values;
+    counters->answered += completion->result > 0;
+}
+
+void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns)
+{
+    counters->ideal_ns += (uint64_t)ideal_ns;
+    counters->delays[bucket(delay_ns)]++;
+    if (delay_ns > counters->longest_ns)
+        counters->longest_ns = delay_ns;
+}

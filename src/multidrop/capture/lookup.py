@@ -1,0 +1,107 @@
+"""What a request asks for: the plant's registers by name where they are known, else raw ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.core import Framing, Message, NumberFormat
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Carrier, Register
+from multidrop.plant.model import Plant, PlantLine
+
+_TABLES = {
+    0x01: "coil",
+    0x02: "discrete_input",
+    0x03: "holding_register",
+    0x04: "input_register",
+    0x05: "coil",
+    0x06: "holding_register",
+    0x08: "loopback",
+    0x0F: "coil",
+    0x10: "holding_register",
+}
+_BITS = (0x01, 0x02, 0x05, 0x0F)
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply; a request may ask for more, in vain
+_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # function: a table's
+_DELIXI_READS = (0x03, 0x07)
+_DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
+
+
+@dataclass(frozen=True)
+class RegisterPlace:
+    """A register, and where it lies in the data of the exchange; None: not one that is known."""
+
+    name: str
+    at: int
+    number_format: NumberFormat
+    register: Register[Any] | None = None
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """Whom a request asks, and the registers that it reads or writes."""
+
+    drive: str
+    is_write: bool
+    places: tuple[RegisterPlace, ...]
+
+
+def line_of(plant: Plant | None, name: str) -> PlantLine | None:
+    """The plant's line with this name; its only line has any name."""
+    lines = plant.lines if plant else ()
+    named = [line for line in lines if line.name == name]
+    return named[0] if named else lines[0] if len(lines) == 1 else None
+
+
+class Meanings:
+    """What requests on one line mean."""
+
+    def __init__(self, line: PlantLine | None) -> None:
+        drives = [polled.drive for polled in line.drives] if line else []
+        self._drives = {(drive.address, drive.framing): drive for drive in drives}
+
+    def of(self, framing: Framing, request: Message) -> Meaning:
+        """What this request asks for."""
+        drive = self._drives.get((request.address, framing))
+        name = drive.name if drive else f"address {request.address}"
+        writes = _DELIXI_WRITES if framing is Framing.DELIXI else _WRITES
+        is_write = request.function in writes
+        functions = writes.get(request.function, (request.function,))
+        known = _known(drive, request, functions, is_write) if drive else ()
+        return Meaning(name, is_write, known or _raw(framing, request))
+
+
+def _known(
+    drive: Drive, request: Message, functions: tuple[int, ...], is_write: bool
+) -> tuple[RegisterPlace, ...]:
+    found = []
+    for register in drive.registers.values():
+        if (register.table.write if is_write else register.table.read) not in functions:
+            continue
+        if not is_write and not register.readable:
+            continue
+        at = _offset(register, request)
+        if at is not None:
+            found.append(RegisterPlace(register.name, at, register.number_format, register))
+    return tuple(sorted(found, key=lambda place: place.at))
+
+
+def _offset(register: Register[Any], request: Message) -> int | None:
+    """Where in the data it begins, in words or bits; None where it is not wholly in it."""
+    if register.table.carrier is Carrier.NUMBER:
+        return 0
+    end = request.start + max(request.count, 1)
+    for address in (register.address, register.ram_address):
+        if address is not None and request.start <= address and address + register.words <= end:
+            return address - request.start
+    return None
+
+
+def _raw(framing: Framing, request: Message) -> tuple[RegisterPlace, ...]:
+    if framing is Framing.DELIXI:
+        return (RegisterPlace(f"k{request.function}_{request.start:04X}", 0, NumberFormat.U32),)
+    table = _TABLES[request.function]
+    number_format = NumberFormat.BIT if request.function in _BITS else NumberFormat.U16
+    count = min(max(request.count, 1), _MOST[number_format])
+    return tuple(RegisterPlace(f"{table}_{request.start + at}", at, number_format) for at in range(count))

@@ -1,0 +1,117 @@
+"""Spans of what was sniffed, put together: requests with their replies, and what is neither."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from multidrop.core import FrameSpan, Framing, Kind, Message, Side
+
+_MOST_JUNK = 4096  # bytes told at once
+
+
+@dataclass(frozen=True)
+class SniffedExchange:
+    """A request with its reply; one of the two is None where it was not heard or never came.
+
+    `is_sure` is False where the request may be the copy that confirms an earlier one.
+    """
+
+    framing: Framing
+    request: Message | None
+    reply: Message | None
+    time_ns: int
+    reply_time_ns: int
+    is_sure: bool
+    raw: tuple[tuple[Side, bytes, int], ...]  # its frames, with their times
+
+    @property
+    def is_broadcast(self) -> bool:
+        return self.request is not None and self.request.address == 0
+
+
+@dataclass(frozen=True)
+class Junk:
+    """Bytes that are part of no frame."""
+
+    time_ns: int
+    raw: bytes
+
+
+Sniffed = SniffedExchange | Junk
+
+
+class Pairing:
+    """Pairs what was heard on one line, and counts it."""
+
+    def __init__(self) -> None:
+        self.exchanges = self.broadcasts = self.unanswered = self.strays = self.junk_bytes = 0
+        self._asked: FrameSpan | None = None
+        self._junk: list[FrameSpan] = []
+
+    def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
+        """What the spans tell; the last request is told when its reply or another request came."""
+        for span in spans:
+            if span.kind is Kind.JUNK:
+                yield from self._add_junk(span)
+                continue
+            if span.kind is Kind.REPLY and self._asked:
+                asked, self._asked = self._asked, None
+                self.exchanges += 1
+                yield _heard(asked, span)
+                yield from self._told_junk()
+                continue
+            yield from self.rest()
+            if span.kind in (Kind.REPLY, Kind.STRAY):
+                self.strays += 1
+                yield _heard(None, span)
+            elif span.message.address == 0:
+                self.broadcasts += 1
+                yield _heard(span, None)
+            else:
+                self._asked = span
+
+    def rest(self) -> Iterator[Sniffed]:
+        """What waits for more, told as it is: nothing more is to come."""
+        if self._asked:
+            asked, self._asked = self._asked, None
+            self.unanswered += 1
+            yield _heard(asked, None)
+        yield from self._told_junk()
+
+    def counts(self) -> dict[str, int]:
+        """How much was heard so far."""
+        return {
+            "exchanges": self.exchanges,
+            "broadcasts": self.broadcasts,
+            "unanswered": self.unanswered,
+            "strays": self.strays,
+            "unknown_bytes": self.junk_bytes,
+        }
+
+    def _add_junk(self, span: FrameSpan) -> Iterator[Sniffed]:
+        self.junk_bytes += len(span.raw)
+        self._junk.append(span)
+        if sum(len(it.raw) for it in self._junk) >= _MOST_JUNK:
+            yield from self._told_junk()
+
+    def _told_junk(self) -> Iterator[Junk]:
+        if self._junk:
+            junk, self._junk = self._junk, []
+            yield Junk(junk[0].time_ns, b"".join(it.raw for it in junk))
+
+
+def _heard(asked: FrameSpan | None, answer: FrameSpan | None) -> SniffedExchange:
+    first = asked or answer
+    assert first is not None
+    frames = [(Side.ASKING, asked.raw, asked.time_ns)] if asked else []
+    frames += [(Side.ANSWERING, answer.raw, answer.time_ns)] if answer else []
+    return SniffedExchange(
+        first.framing,
+        asked.message if asked else None,
+        answer.message if answer else None,
+        first.time_ns,
+        answer.time_ns if answer else 0,
+        asked is None or asked.kind is Kind.REQUEST,
+        tuple(frames),
+    )

@@ -1,0 +1,141 @@
+"""Writes captures: pcapng whose RTU frames Wireshark decodes without being told how."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+
+from multidrop.core import Side, Wrappings
+from multidrop.recording.append_file import WholeFile
+from multidrop.recording.format import RecordingError
+
+EXPORTED_PDU = 252
+APPLICATION = b"multidrop"  # begins the application's name in captures of ours
+
+_SECTION, _INTERFACE = 0x0A0D0D0A, 1
+_END, _COMMENT = 0, 1
+_IF_NAME, _IF_RESOLUTION = 2, 9
+_SHB_APPLICATION = 4
+_EPB_FLAGS = 2
+_NANOSECONDS = b"\x09"
+
+_DISSECTOR, _IPV4_SOURCE, _IPV4_TARGET, _PORT_TYPE, _SOURCE_PORT, _TARGET_PORT = 12, 20, 21, 24, 25, 26
+_TCP = 2
+
+
+class CaptureWriter:
+    """A capture that is being written; leaving the `with` block closes it. Raises RecordingError.
+
+    `lines` are those of which packets are appended. Each frame is given to the system at once: after a
+    crash all of them are there.
+    """
+
+    def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
+        self.path = Path(path)
+        self._lines: dict[str, int] = {}
+        try:
+            self._file = WholeFile(self.path)
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path) from failure
+        options = [(_SHB_APPLICATION, APPLICATION + b" " + version("multidrop").encode())]
+        if comment:
+            options.insert(0, (_COMMENT, comment.encode()))
+        head = struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)
+        try:
+            self._append(_block(_SECTION, head + _options(*options)))
+            for line in lines:
+                self._declare(line)
+        except RecordingError:
+            self.close()
+            raise
+
+    def write(self, raw: bytes, side: Side, time_ns: int, line: str) -> None:
+        """Append what was on the line at this time (UTC, ns), such as a frame."""
+        if line not in self._lines:
+            self._declare(line)
+        self._append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
+
+    def append(self, packets: bytes) -> None:
+        """Append packets of the lines that were named at the beginning, in their order."""
+        self._append(packets)
+
+    def heed(self, troubles: list[str]) -> None:
+        """A capture has all there is, trouble or not."""
+
+    def _declare(self, line: str) -> None:
+        self._lines[line] = len(self._lines)
+        options = _options((_IF_NAME, line.encode()), (_IF_RESOLUTION, _NANOSECONDS))
+        self._append(_block(_INTERFACE, struct.pack("<HHI", EXPORTED_PDU, 0, 0) + options))
+
+    def _append(self, block: bytes) -> None:
+        try:
+            self._file.append(memoryview(block))
+        except OSError as failure:
+            raise RecordingError.of(failure, self.path) from failure
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> CaptureWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _padded(content: bytes) -> bytes:
+    return content + bytes(-len(content) % 4)
+
+
+def _block(kind: int, body: bytes) -> bytes:
+    size = len(body) + 12
+    return struct.pack("<II", kind, size) + body + struct.pack("<I", size)
+
+
+def _options(*options: tuple[int, bytes]) -> bytes:
+    return b"".join(
+        struct.pack("<HH", code, len(value)) + _padded(value) for code, value in (*options, (_END, b""))
+    )
+
+
+def _tag(code: int, value: bytes) -> bytes:
+    return struct.pack(">HH", code, len(_padded(value))) + _padded(value)
+
+
+def _head(dissector: bytes, sender: tuple[bytes, int] | None, target: tuple[bytes, int]) -> bytes:
+    """What stands before a frame: who takes it apart, and who sent it."""
+    tags = _tag(_DISSECTOR, dissector)
+    if sender:
+        tags += _tag(_IPV4_SOURCE, sender[0]) + _tag(_IPV4_TARGET, target[0])
+        for code, number in ((_PORT_TYPE, _TCP), (_SOURCE_PORT, sender[1]), (_TARGET_PORT, target[1])):
+            tags += _tag(code, struct.pack(">I", number))
+    return tags + _tag(_END, b"")
+
+
+_RTU, _BYTES = b"mbrtu", b"data"  # Wireshark's dissectors
+_MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
+_FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
+_OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
+_INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
+_PACKETS = {  # side: dissector of what is no text, sender, target, what is said of it
+    Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
+    Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
+    Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),
+    Side.FAILED: (_RTU, _FAILED, _MASTER, [(_COMMENT, b"came in place of a reply"), _INBOUND]),
+    Side.NOISE: (_BYTES, _NOISE, _MASTER, [(_COMMENT, b"part of no exchange"), _INBOUND]),
+}
+WRAPPINGS = Wrappings(
+    {
+        (side, is_text): (_head(_BYTES if is_text else dissector, sender, target), _options(*options))
+        for side, (dissector, sender, target, options) in _PACKETS.items()
+        for is_text in (False, True)
+    }
+)

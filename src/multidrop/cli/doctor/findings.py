@@ -1,0 +1,132 @@
+"""What is said of a port, its adapter and its line: a sentence each, and advice where there is any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from multidrop.cli.doctor.adapter import Adapter, RS485Mode
+from multidrop.core import Completion
+from multidrop.drive.family import Drive
+from multidrop.drive.timing import Settings
+
+LATENCY_MS = 1  # a larger latency timer is worth changing
+ROUNDS = 20
+SLOW_S = 0.005  # more than this on top of a drive's usual response delay is worth a word
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found, and what the user should do about it, if anything."""
+
+    topic: str
+    what: str
+    advice: str = ""
+    is_failure: bool = False  # a drive that was named does not answer
+
+
+def adapter_finding(adapter: Adapter) -> Finding:
+    product = f"{adapter.product or 'a USB device'} ({adapter.usb_id})" if adapter.usb_id else "not on USB"
+    driver = f"its driver is {adapter.driver}" if adapter.driver else "the system names no driver for it"
+    return Finding("adapter", f"{product}; {driver}")
+
+
+def latency_finding(adapter: Adapter) -> Finding:
+    milliseconds = adapter.latency_timer
+    if milliseconds is None:
+        return Finding("latency timer", "the driver has none that can be seen")
+    if milliseconds <= LATENCY_MS:
+        return Finding("latency timer", f"{milliseconds} ms: the shortest there is")
+    return Finding(
+        "latency timer",
+        f"{milliseconds} ms: every reply may wait for so long in the adapter",
+        f"echo {LATENCY_MS} | sudo tee {adapter.latency_path} (for good, a udev rule: "
+        f'ACTION=="add", SUBSYSTEM=="usb-serial", ATTR{{latency_timer}}="{LATENCY_MS}")',
+    )
+
+
+def low_latency_finding(low: bool | None) -> Finding:
+    if low is None:
+        return Finding("low latency", "the driver has no such flag")
+    if low:
+        return Finding("low latency", "the flag is set: multidrop sets it whenever it opens the port")
+    return Finding(
+        "low latency",
+        "the flag is not set: the driver did not take it from multidrop",
+        "it may be root's to set: setserial PORT low_latency",
+    )
+
+
+def rs485_finding(mode: RS485Mode | None) -> Finding:
+    if mode is None:
+        return Finding(
+            "RS-485 mode", "the driver has none: the adapter itself must switch between sending and receiving"
+        )
+    if not mode.enabled:
+        return Finding(
+            "RS-485 mode",
+            "the driver has it, and it is off",
+            "if the transceiver hangs on RTS, switch it on in the device tree or with an RS-485 tool; "
+            "an adapter that switches by itself needs nothing",
+        )
+    hears = ", and hears what it sends: multidrop takes the echo out" if mode.hears_itself else ""
+    return Finding("RS-485 mode", f"on: the driver switches the direction{hears}")
+
+
+def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
+    """`found` is what became of a request that nobody should answer; `sent` its bytes."""
+    if found.result > 0:
+        return _answered_finding(found, sent, settings)
+    heard = found.raw
+    if not heard:
+        return Finding("echo", f"none at {settings}: nothing came back of what was sent")
+    if heard == sent:
+        return Finding("echo", f"the adapter hears what it sends at {settings}; multidrop takes it out")
+    return Finding(
+        "echo",
+        f"{len(heard)} bytes came unasked at {settings}: {heard[:16].hex(' ').upper()}",
+        "see whether another program or master talks on this line, and whether its ends are terminated",
+    )
+
+
+def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
+    """A reply to the request itself is no foreign traffic."""
+    reply = found.reply
+    how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
+    echo = "the adapter hears what it sends" if found.skipped == len(sent) else "none"
+    return Finding(
+        "echo",
+        f"{echo} at {settings}; address {reply.address}, which should be nobody's, answers {how}",
+        "either a drive has this address, or a server or gateway answers for drives that are not there: "
+        "then a drive that is missing seems to refuse",
+    )
+
+
+def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: float = 0.0) -> Finding:
+    """What so many requests that were sent came to.
+
+    `delays` are sorted, in s, from the request's last bit to the reply's first, as seen from here. Where
+    the port tells nothing of bits, as a network's, they begin when the request was handed over; `wire` is
+    then how long, in s, request and first character would be on a wire.
+    """
+    if not delays:
+        return Finding(
+            "round trip",
+            f"{drive.name} did not answer once in {asked} request{'s' * (asked != 1)}",
+            "check its address, baud rate, format, wiring and power; `multidrop scan` looks for it",
+            is_failure=True,
+        )
+    least, median, most = delays[0], delays[len(delays) // 2], delays[-1]
+    figures = f"{least * 1e3:.1f} ms at least, {median * 1e3:.1f} in the middle, {most * 1e3:.1f} at most"
+    alone = f"a wire at {drive.settings} alone takes {wire * 1e3:.1f} ms"
+    since = f", from when its request was handed over ({alone})" if wire else ""
+    lost = f"; {asked - len(delays)} of {asked} requests stayed without a good reply"
+    what = f"{drive.name} begins to answer after {figures}{since}{lost if len(delays) < asked else ''}"
+    if median - wire - drive.response_delay > SLOW_S:
+        rest = "the adapter's or the network's" if wire else "the adapter's"
+        return Finding(
+            "round trip",
+            what,
+            f"its family usually takes {drive.response_delay * 1e3:.1f} ms: the rest is {rest}, "
+            "or the drive's own parameter for the response delay",
+        )
+    return Finding("round trip", what)

@@ -1,0 +1,249 @@
+"""How a watched plant looks on a terminal: lines of text for a width and a height, and nothing else.
+
+What matters is in words and marks as well as in colours.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.text import Text
+
+from multidrop.cli.monitor.watched import CURRENT, FREQUENCY, Watched, WatchedPlant
+from multidrop.drive.register import Register
+from multidrop.printable import printable
+
+LEAST_WIDTH, LEAST_HEIGHT = 60, 12
+WIDE = 100  # has room for more columns
+OLD = 5.0  # s: an older value is marked
+BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
+ACKNOWLEDGE = "a acknowledges what FAILED   s stop   S stop all   q quit"
+HELP = "up/down choose   Enter registers   s stop   S stop all   q quit"
+PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter back   s stop   S stop all   q quit"
+
+
+@dataclass
+class Position:
+    """Where the user is."""
+
+    chosen: int = 0  # of the drives
+    page: bool = False  # its registers, and not all drives
+    scrolled: int = 0  # lines of the page
+    question: str = ""  # that waits for an answer
+    message: str = ""
+    failures: list[str] = field(default_factory=list)  # of stops, until they are acknowledged
+    failures_shown: int = 0  # of them, as many as had room
+
+
+def overview(
+    plant: WatchedPlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str
+) -> list[Text]:
+    """All drives, a line each, those around the chosen one where there are more than fit."""
+    width, height = size
+    top = [_title(plant, width, now_ns), *_line_states(plant, width)]
+    columns = _columns(plant, width)
+    top.append(Text(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
+    alarms = _alarms(at, size)
+    room = height - len(top) - len(alarms) - 2
+    first = _first_seen(at.chosen, len(plant.drives), room)
+    rows = [
+        _drive(it, number == at.chosen, columns, width, now_ns, blocks)
+        for number, it in enumerate(plant.drives[first : first + room], first)
+    ]
+    hidden = len(plant.drives) - len(rows)
+    note = f"{hidden} more drives: scroll" if hidden else ""
+    return [*top, *rows, *[Text()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
+
+
+def page(
+    it: Watched, others: Mapping[str, str], at: Position, size: tuple[int, int], now_ns: int
+) -> list[Text]:
+    """Every register of one drive; `others` are those that are not polled, read on the side."""
+    width, height = size
+    drive = it.polled.drive
+    head = (
+        f" {it.name}  {drive.title or drive.model}  address {drive.address}  {drive.settings} {drive.framing}"
+    )
+    top = [
+        Text(head[:width].ljust(width), style="reverse"),
+        Text(_cut(f" {it.state or 'state not polled'}   {it.fault}   {_misses(it.so_far.misses)}", width)),
+        Text(_cut(f" {_pace(it)}", width)),
+    ]
+    names = [name for name, register in drive.registers.items() if register.readable]
+    polled = [poll.register.name for poll in it.polled.polls]
+    names = [*polled, *(name for name in names if name not in polled)]
+    longest = max(map(len, names), default=0)
+    rows = [_register(it, drive.register(name), others, longest, width, now_ns) for name in names]
+    alarms = _alarms(at, size)
+    room = height - len(top) - len(alarms) - 2
+    at.scrolled = max(0, min(at.scrolled, len(rows) - room))
+    seen = rows[at.scrolled : at.scrolled + room]
+    note = f"registers {at.scrolled + 1} to {at.scrolled + len(seen)} of {len(rows)}"
+    return [*top, *seen, *[Text()] * (room - len(seen)), *alarms, *_foot(at, width, PAGE_HELP, note)]
+
+
+# ---- its parts ----
+
+
+def _title(plant: WatchedPlant, width: int, now_ns: int) -> Text:
+    clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
+    text = f" multidrop monitor  {printable(plant.plant.path.name)}"[: width - len(clock)]
+    return Text(text.ljust(width - len(clock)) + clock, style="reverse")
+
+
+def _line_states(plant: WatchedPlant, width: int) -> list[Text]:
+    found = []
+    for line in plant.plant.lines:
+        lately = plant.lately[line.name]
+        text = (
+            f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
+            f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
+        )
+        found.append(Text(_cut(text, width)))
+    return found
+
+
+def _misses(reasons: Mapping[str, int]) -> str:
+    if not reasons:
+        return "no misses"
+    ordered = sorted(reasons.items(), key=lambda it: -it[1])
+    total = sum(reasons.values())
+    return f"{total} missed: " + ", ".join(f"{reason} {count}" for reason, count in ordered)
+
+
+def _pace(it: Watched) -> str:
+    """How often it is asked as of late, and how it has answered so far."""
+    so_far, delays = it.so_far, it.so_far.delays
+    told = [f"{it.lately.exchanges_per_second:.1f} exchanges/s"]
+    if delays.replies:
+        told.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
+    if so_far.late_replies:
+        told.append(f"{so_far.late_replies} late")
+    if so_far.skipped_bytes:
+        told.append(f"{so_far.skipped_bytes} bytes skipped")
+    return "  ".join(told)
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.{0 if seconds >= 0.1 else 1}f}"
+
+
+def _columns(plant: WatchedPlant, width: int) -> dict[str, int]:
+    """Widths by head; what is left over goes to the fault's name and the history."""
+    longest = max(len(it.name) for it in plant.drives)
+    columns = {"DRIVE": max(5, min(longest, 16)), "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10}
+    columns |= {"AGE": 7, "MISSED": 6}
+    if width >= WIDE:
+        columns["DELAY"] = 8
+    left = max(0, width - 1 - sum(columns.values()) - len(columns))
+    more = min(left // 3, 26)
+    columns["FAULT"] += more
+    columns["HISTORY"] = left - more
+    return columns
+
+
+_RIGHT = {"FREQUENCY", "CURRENT", "AGE", "MISSED", "DELAY"}
+
+
+def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str:
+    parts = []
+    for head, width in columns.items():
+        text = _cut(cells.get(head, ""), width)
+        parts.append(text.rjust(width) if head in _RIGHT else text.ljust(width))
+    return f"{mark:1}" + " ".join(parts)
+
+
+def _drive(
+    it: Watched, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
+) -> Text:
+    age = it.age(now_ns)
+    cells = {
+        "DRIVE": it.name,
+        "STATE": it.state,
+        "FREQUENCY": it.shown(FREQUENCY),
+        "CURRENT": it.shown(CURRENT),
+        "FAULT": it.fault or it.why_silent,
+        "AGE": _age(age),
+        "DELAY": f"{_ms(it.so_far.delays.p50)} ms" if it.so_far.delays.replies else "",
+        "MISSED": str(it.so_far.misses.total() or ""),
+        "HISTORY": sparkline(list(it.history), columns["HISTORY"], blocks),
+    }
+    style = "red" if it.fault else "yellow" if it.why_silent or (age is not None and age > OLD) else ""
+    text = _row(columns, cells, ">" if chosen else "!" if it.fault else "")
+    return Text(text[:width].ljust(width if chosen else 0), style=f"{style} reverse" if chosen else style)
+
+
+def _register(
+    it: Watched, register: Register[Any], others: Mapping[str, str], longest: int, width: int, now_ns: int
+) -> Text:
+    name = register.name
+    miss = it.missed.get(name)
+    row = it.newest.get(name)
+    if any(poll.register.name == name for poll in it.polled.polls):
+        value = it.shown(name) or (miss.status if miss else "not yet")
+        age = _age(None if row is None else (now_ns - row.time) / 1e9)
+        note = miss.status if miss and row else ""
+    else:
+        value, age, note = others.get(name, "..."), "", "not polled"
+    value_width = max(12, min(40, width - longest - 30))
+    text = f" {name:<{longest}}  {_cut(value, value_width):>{value_width}}  {age:>6}  {note}"
+    return Text(_cut(text, width), style="yellow" if miss else "dim" if note == "not polled" else "")
+
+
+def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
+    """The failures that nobody has acknowledged, the oldest first, as far as there is room for them whole."""
+    width, height = size
+    most = max(2, (height - 8) // 2)
+    lines: list[str] = []
+    at.failures_shown = 0
+    failures = list(at.failures)  # a stop that ends meanwhile may bring more
+    for failure in failures:
+        wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
+        if lines and len(lines) + len(wrapped) > most - 1:
+            break
+        lines += wrapped[: most - 1]
+        at.failures_shown += 1
+    more = len(failures) - at.failures_shown
+    lines += [f"... and {more} more, after these are acknowledged"] if more else []
+    return [Text(f" ! {line}".ljust(width), style="bold white on red") for line in lines]
+
+
+def _foot(at: Position, width: int, help_text: str, note: str) -> list[Text]:
+    if at.question:
+        return [Text(), Text(_cut(f" {at.question}", width).ljust(width), style="bold reverse")]
+    text = f" {at.message}" if at.message else f" {note}"
+    help_text = ACKNOWLEDGE if at.failures else help_text
+    return [Text(_cut(text, width), style="bold"), Text(_cut(f" {help_text}", width), style="dim")]
+
+
+def _first_seen(chosen: int, count: int, room: int) -> int:
+    return max(0, min(chosen - room // 2, count - room))
+
+
+def _cut(text: str, width: int) -> str:
+    text = printable(text)
+    return text if len(text) <= width else text[: max(0, width - 1)] + "~"
+
+
+def _age(seconds: float | None) -> str:
+    if seconds is None:
+        return "never"
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
+def sparkline(values: Sequence[float | None], width: int, blocks: str = BLOCKS) -> str:
+    """The last `width` values from their smallest to their largest; a gap where one was missed."""
+    values = values[-width:] if width > 0 else []
+    there = [value for value in values if value is not None]
+    low, high = min(there, default=0.0), max(there, default=0.0)
+    low = min(low, 0.0)  # so that a steady value does not look like rest, nor noise like a swing
+    scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
+    return "".join(" " if value is None else blocks[round((value - low) * scale)] for value in values)

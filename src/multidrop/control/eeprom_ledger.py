@@ -1,0 +1,155 @@
+"""Ledger: how often each register that a drive may keep in EEPROM was written, across restarts.
+
+A drive is known by its port, whatever that is called, and its address there.
+It is a file that several processes share. EEPROM bears some 10,000 writes, so a budget keeps them
+for ten years.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from multidrop.transport.port_identity import of_name
+from multidrop.transport.simulated_ports import is_simulated, ledger_of
+
+YEAR = 365 * 86400.0  # s
+CYCLES = 10_000  # that an EEPROM bears (Toshiba's figure for a relative of the YD1000)
+YEARS = 10
+BUDGET = CYCLES // YEARS  # writes of one register in a year
+LATEST = 6e10  # UTC in s: a time beyond it, or as far before 0, is damage
+LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be in EEPROM
+
+
+@dataclass(frozen=True)
+class LedgerCell:
+    """One register of one drive, as a ledger knows it.
+
+    `port` is the port's identity (see port_identity), `spelt` its name, which older entries may have.
+    """
+
+    port: str
+    address: int
+    model: str
+    register: str
+    spelt: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True)
+class Wear:
+    """What a ledger says of a cell at some time."""
+
+    cell: LedgerCell
+    writes: int  # in all
+    this_year: int  # in the year before
+    last: float  # UTC, s, of the latest entry, whatever the clock said at others
+
+
+def default_path() -> Path:
+    """Where state that survives restarts belongs (XDG base directory specification)."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state) / "multidrop" / "wear.sqlite"
+
+
+class Ledger:
+    """The ledger in this file, which is made at its first entry. Times are UTC in s."""
+
+    def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
+        self.path = Path(path) if path else default_path()
+        self.budget = budget
+        self._is_the_user_s = not path
+
+    def at(self, port: str) -> Ledger:
+        """Return the ledger for this port: a simulated one has its own, and never spends the user's."""
+        if self._is_the_user_s and is_simulated(port):
+            return Ledger(ledger_of(port, self.path.parent), budget=self.budget)
+        return self
+
+    def enter(self, cell: LedgerCell, now: float, least_interval: float) -> str:
+        """Count a write that is about to be sent; a reason why it must not be, and then it is not counted.
+
+        The question and the entry are one transaction, so that two processes cannot both have the last
+        of the budget. Raises OSError where the file cannot be kept.
+        """
+        with self._opened() as ledger:
+            ledger.execute("begin immediate")
+            wear = _wear(ledger, cell, _names(ledger, cell), now)
+            since = now - wear.last  # below 0: the clock was set back, and nobody knows how long it is
+            if wear.writes and 0 <= since < least_interval:
+                return (
+                    f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
+                    f"{least_interval:.0f} s at most"
+                )
+            if wear.this_year >= self.budget:
+                return (
+                    f"it was written {wear.this_year} times in a year, and its EEPROM bears {CYCLES} writes "
+                    f"in all: {self.budget} a year for {YEARS} years"
+                )
+            ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
+            ledger.commit()
+        return ""
+
+    def note(self, cell: LedgerCell, now: float) -> None:
+        """Count a stop, which was sent whatever the budget says. Raises OSError where it cannot be kept."""
+        with self._opened() as ledger:
+            ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
+
+    def wear(self, now: float) -> list[Wear]:
+        """Every cell that was ever written, the most worn in the last year first."""
+        if not self.path.exists():
+            return []
+        with self._opened() as ledger:
+            rows = ledger.execute("select distinct port, address, model, register from writes").fetchall()
+            names: dict[LedgerCell, list[str]] = {}
+            for port, *place in rows:
+                names.setdefault(LedgerCell(of_name(port), *place), []).append(port)
+            found = [_wear(ledger, cell, ports, now) for cell, ports in names.items()]
+        return sorted(found, key=lambda it: (-it.this_year, it.cell.port, it.cell.address, it.cell.register))
+
+    @contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as failure:
+            raise self._unkept(failure) from failure
+        try:
+            with closing(sqlite3.connect(self.path, timeout=5.0, isolation_level=None)) as ledger:
+                ledger.execute(
+                    "create table if not exists writes"
+                    " (port text, address integer, model text, register text, time real)"
+                )
+                ledger.execute("create index if not exists cells on writes (port, address, register)")
+                yield ledger
+        except sqlite3.Error as failure:
+            raise self._unkept(failure) from failure
+
+    def _unkept(self, failure: Exception) -> OSError:
+        return OSError(f"the ledger of EEPROM writes {self.path} cannot be kept: {failure}")
+
+
+def _key(cell: LedgerCell) -> tuple[str, int, str, str]:
+    return cell.port, cell.address, cell.model, cell.register
+
+
+def _names(ledger: sqlite3.Connection, cell: LedgerCell) -> list[str]:
+    """Return all names under which the cell's port was entered."""
+    ports = [port for (port,) in ledger.execute("select distinct port from writes")]
+    return [port for port in ports if port in (cell.port, cell.spelt) or of_name(port) == cell.port]
+
+
+def _wear(ledger: sqlite3.Connection, cell: LedgerCell, ports: list[str], now: float) -> Wear:
+    same_port = f"port in ({', '.join('?' * len(ports))})"
+    where = f"{same_port} and address = ? and model = ? and register = ?"
+    key = (*ports, *_key(cell)[1:])
+    writes, latest = ledger.execute(f"select count(*), max(rowid) from writes where {where}", key).fetchone()
+    (this_year,) = ledger.execute(
+        f"select count(*) from writes where {where} and time > ?", (*key, now - YEAR)
+    ).fetchone()
+    (last,) = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone() or (0.0,)
+    if not isinstance(last, float) or not abs(last) < LATEST:
+        raise sqlite3.DataError(f"it has a write of {cell.register} at a time that is none: {last!r}")
+    return Wear(replace(cell, spelt=""), writes, this_year, last)

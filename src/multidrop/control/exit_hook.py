@@ -1,0 +1,168 @@
+"""ExitHook: what every bus that asked for it does before this process ends, however it ends but by SIGKILL.
+
+There is one in a process. A signal only begins the last acts, which run in threads of their own, side by
+side: a handler that waited for them could wait for a lock of the very thread that it interrupts.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from queue import SimpleQueue
+from types import FrameType
+from typing import Any
+
+from multidrop.core.fork import register_at_fork
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+IMPATIENT = 3  # signals within a second, after which nothing is waited for
+HANDLING_S = 0.05  # after which a signal is handled at the latest
+CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
+
+
+class LastAct:
+    """Something that is done once, by a thread that waits for it from now on."""
+
+    def __init__(
+        self, begin: Callable[[], object], work: Callable[[], object], over: Callable[[], None]
+    ) -> None:
+        self._prepare = begin
+        self._work = work
+        self._tell = over
+        self._calls: SimpleQueue[None] = SimpleQueue()  # a signal handler may put to it; not so an Event
+        self._over = threading.Event()
+        self.is_cut_short = False  # nobody waits for it any more
+        threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
+
+    @property
+    def is_over(self) -> bool:
+        return self.is_cut_short or self._over.is_set()
+
+    def begin(self) -> None:
+        """Have it done, without waiting for that."""
+        self._prepare()
+        self._calls.put(None)
+
+    def finish(self) -> None:
+        """Have it done, and wait until it is."""
+        self.begin()
+        while not self.is_over:  # a signal that another thread was given is handled here
+            self._over.wait(HANDLING_S)
+
+    def forget(self) -> None:
+        """In the child of a fork it is its parent's business."""
+        self._over = threading.Event()
+        self.is_cut_short = True
+
+    def _run(self) -> None:
+        self._calls.get()
+        try:
+            self._work()
+        except Exception:
+            logging.getLogger("multidrop").exception("the drives could not be stopped")
+        finally:
+            self._over.set()
+            self._tell()
+
+
+class ExitHook:
+    """Begins all last acts at exit, or on SIGINT or SIGTERM, and holds the signal until they are over.
+
+    Then it has the effect that it had before; so it has where IMPATIENT of them come within a second.
+    """
+
+    def __init__(self) -> None:
+        self._acts: list[LastAct] = []
+        self._before: dict[signal.Signals, Any] = {}
+        self._held: int | None = None  # the first signal that came
+        self._came: list[float] = []  # when it and others did
+        self._telling = threading.Lock()
+        self._has_told = False
+        atexit.register(self._at_exit)
+        register_at_fork(self)
+
+    def forked(self) -> None:
+        self._telling = threading.Lock()
+        for act in self._acts:
+            act.forget()
+        self._acts = []
+
+    def add(self, begin: Callable[[], object], work: Callable[[], object]) -> LastAct:
+        """Have `work` done before the process ends; `begin` at once, also in a signal handler.
+
+        Raises ValueError outside the main thread, the only one that may take signals.
+        """
+        if not self._before:
+            for number in _SIGNALS:
+                self._before[number] = signal.signal(number, self._on_signal)
+        act = LastAct(begin, work, self._one_is_over)
+        self._acts = [*self._acts, act]
+        return act
+
+    def finish(self, act: LastAct) -> None:
+        """Have it done now, and be done with it."""
+        act.finish()
+        self._acts = [other for other in self._acts if other is not act]
+        if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
+            self._let_go()
+
+    def _at_exit(self) -> None:
+        acts = self._acts
+        for act in acts:
+            act.begin()
+        for act in acts:
+            act.finish()
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        """Take no lock here: the main thread may have it."""
+        now = time.monotonic()
+        self._came = [*(at for at in self._came if now - at < 1.0), now]
+        if self._held is None:
+            self._held, self._has_told = number, False
+        for act in self._acts:
+            act.begin()
+        if all(act.is_over for act in self._acts):
+            self._pass_on(number)
+        elif len(self._came) >= IMPATIENT:
+            os.write(2, CUT_SHORT)
+            for act in self._acts:
+                act.is_cut_short = True
+            self._pass_on(number)
+
+    def _one_is_over(self) -> None:
+        """Let the signal that is held have its effect, which is on the main thread's account."""
+        with self._telling:
+            held, ident = self._held, threading.main_thread().ident
+            if self._has_told or held is None or ident is None:
+                return
+            if not all(act.is_over for act in self._acts):
+                return
+            self._has_told = True
+        signal.pthread_kill(ident, held)
+
+    def _pass_on(self, number: int) -> None:
+        self._let_go()
+        self._held, self._came = None, []
+        signal.raise_signal(number)
+
+    def _let_go(self) -> None:
+        before, self._before = self._before, {}
+        for number, handler in before.items():
+            if signal.getsignal(number) == self._on_signal:
+                signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+_hook: ExitHook | None = None
+
+
+def exit_hook() -> ExitHook:
+    """The process's own."""
+    global _hook
+    if _hook is None:
+        _hook = ExitHook()
+    return _hook

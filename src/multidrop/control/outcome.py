@@ -1,0 +1,49 @@
+"""Outcome: exactly what is known of a write's effect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from multidrop.drive.register import Register
+from multidrop.errors import BusError
+
+
+class Effect(Enum):
+    DONE = "done"
+    TAKEN_AS = "taken as"  # the drive holds another value
+    REFUSED = "refused by the drive"
+    UNCONFIRMED = "unconfirmed"  # no answer: it may have happened
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one write: `held` is what the drive then said it holds, None where that cannot be read.
+
+    `failure` is the error that `Bus.write` raises for it.
+    """
+
+    drive: str
+    register: Register[Any]
+    asked: Any
+    effect: Effect
+    held: Any = None
+    failure: BusError | None = None
+
+    @property
+    def value(self) -> Any:
+        """What the drive holds, as far as that is known; raises the failure where there is one."""
+        if self.failure is not None:
+            raise self.failure
+        return self.asked if self.held is None else self.held
+
+    def __str__(self) -> str:
+        return f"{self.drive}: {self.register.name} = {self.register.format(self.asked)}: {self._said()}"
+
+    def _said(self) -> str:
+        if self.failure is not None:
+            return f"{self.effect.value}: {self.failure}"
+        if self.effect is Effect.TAKEN_AS:
+            return f"taken as {self.register.format(self.held)}"
+        return "done (cannot be read back)" if self.held is None else "done (read back)"

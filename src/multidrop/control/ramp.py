@@ -1,0 +1,99 @@
+"""Moving several motors, or one gently: staggered starts, and setpoints in steps."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Kept, Register
+from multidrop.drive.script import Script, read, wait
+from multidrop.drive.state import Direction
+from multidrop.errors import BusError, Refused
+
+__all__ = ["ramp", "start_staggered"]
+
+
+def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
+    """Start drives one after another, `gap` seconds apart.
+
+    At the first that fails the ones already started are stopped, and so is that one; its failure is
+    raised. None is started once its stop was called, on any thread, since this was.
+    """
+    calls = [drive.begin_call("start") for drive in drives]
+    for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
+        try:
+            if number:
+                drive.perform(wait(gap))
+            drive.carry_out_move(drive.start.script(direction), call and call.anew())
+        except BaseException:
+            _stop(drives[: number + 1])
+            raise
+
+
+def _stop(drives: Sequence[Drive]) -> None:
+    """All at once: they may be on several buses, and one may be silent."""
+
+    def stop(drive: Drive) -> None:
+        with suppress(BusError, ValueError):
+            drive.stop()
+
+    threads = [threading.Thread(target=stop, args=[drive]) for drive in drives]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0.5) -> None:
+    """Bring the setpoint to `hz` in steps, one in `every` seconds, at `rate` Hz/s.
+
+    The rate is the drive's own (maximum frequency / acceleration time) where these can be read and
+    none is given, and never above it. Refused for a setpoint that every step would store in EEPROM.
+    """
+    drive.perform(_ramp(drive, hz, rate, every))
+
+
+def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[None]:
+    if not every > 0:
+        raise ValueError(f"every = {every:g} s is not above 0")
+    register = drive.register(drive.setpoint_name)
+    if register.kept is not Kept.RAM and register.access is Access.SETTING and register.name not in drive.ram:
+        raise Refused(f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out")
+    own = yield from _own_rate(drive)
+    if rate is None and own is None:
+        raise Refused(f"the acceleration of {drive.name} cannot be read: give a rate in Hz/s")
+    if rate is not None and not rate > 0:
+        raise ValueError(f"rate = {rate:g} Hz/s is not above 0")
+    if rate is not None and own is not None and rate > own:
+        raise ValueError(f"rate = {rate:g} Hz/s is more than the drive's own, {own:g} Hz/s")
+    step = (rate or own or 0.0) * every
+    at = yield from _present(drive, register)
+    while at != hz:
+        at = min(at + step, hz) if hz > at else max(at - step, hz)
+        yield from drive.set_frequency.script(round(at, 2) if at != hz else hz)
+        if at != hz:
+            yield from wait(every)
+
+
+def _own_rate(drive: Drive) -> Script[float | None]:
+    """Hz/s of the drive's own ramp, where it is known."""
+    most = drive.option.get("maximum_frequency")
+    if most is None and "maximum_frequency" in drive.registers:
+        most = yield from read(drive.register("maximum_frequency"))
+    if most is None or "acceleration_time" not in drive.registers:
+        return None
+    seconds = yield from read(drive.register("acceleration_time"))
+    return most / seconds if most and seconds else None
+
+
+def _present(drive: Drive, register: Register[float]) -> Script[float]:
+    """The setpoint in force, in Hz."""
+    if not register.readable:
+        held = drive.commanded
+        if held is None:
+            raise Refused(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
+        return held
+    held = yield from read(register)
+    return held * drive.option["maximum_frequency"] / 100 if register.unit == "%" else held

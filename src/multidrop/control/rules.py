@@ -1,0 +1,129 @@
+"""The rules of a register: what must hold before anything is written to it.
+
+Whatever is against them is `Refused`, with the register, the rule and the manual's place.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Carrier, Kept, Register
+from multidrop.drive.script import Script, read
+from multidrop.drive.state import Condition
+from multidrop.drive.verbs import VERBS
+from multidrop.errors import Refused, Unsupported
+
+T = TypeVar("T", bound=float)
+
+
+def refused(drive: Drive, register: Register[Any], rule: str) -> Refused:
+    """What says that this rule keeps the register from being written."""
+    return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}")
+
+
+def _refusal(register: Register[Any], rule: str, sentence: str) -> Refused:
+    place = "; ".join(filter(None, (register.place, register.outside)))
+    where = f" (manual: {place})" if place else ""
+    return Refused(sentence + where, register=register.name, rule=rule, place=place)
+
+
+def raw_count(drive: Drive, register: Register[T], value: T) -> float:
+    """The raw count to be sent; Refused what its declaration forbids, TypeError for what is no value."""
+    check_own(drive, register)
+    if register.never:
+        raise refused(drive, register, register.never)
+    if not register.writable:
+        raise refused(drive, register, f"it is a {register.access.value}")
+    try:
+        return register.encode(value)
+    except ValueError as mistake:
+        raise _refusal(register, str(mistake), f"{drive.name}: {mistake}") from mistake
+
+
+def check_own(drive: Drive, register: Register[Any]) -> None:
+    """ValueError for another family's register: the same address means something else there.
+
+    TypeError for what is none, such as a name.
+    """
+    if not isinstance(drive, Drive):
+        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
+    if not isinstance(register, Register):
+        hint = "use its attribute, or drive.register(NAME)"
+        raise TypeError(f"{register!r} is no register of {drive.name}: {hint}")
+    if drive.registers.get(register.name) is not register:
+        family = drive.title or type(drive).__name__
+        raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
+
+
+def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
+    """Refused unless a plain write may do this: nothing but a verb moves a motor or resets a fault.
+
+    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    """
+    if is_harmless(register, raw):
+        return
+    if register.access is Access.COMMAND and not register.commands:
+        drive.check_confirmed(register.name)
+    if not register.commands:
+        return
+    verbs = [f"{name}()" for name in VERBS if name in _MOVING and _has(drive, name)]
+    value = register.format(register.decode(raw))
+    way = f"which verbs alone do: use {', '.join(verbs)}"
+    if not verbs:
+        way = (
+            "and its class does not say that it is harmless: declare harmless = (…), moves = False, or a verb"
+        )
+    raise refused(drive, register, f"{value} commands the motor, {way}")
+
+
+_MOVING = ("start", "stop", "jog", "reset_fault")
+
+
+def _has(drive: Drive, name: str) -> bool:
+    return getattr(type(drive), name) is not getattr(Drive, name)
+
+
+def is_harmless(register: Register[Any], raw: float) -> bool:
+    """Whether it may be sent at any time, to a drive that does not answer too: a stop."""
+    return register.harmless is not None and raw in register.harmless
+
+
+def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
+    """Look at what the rules depend on: other registers, and whether the motor stands."""
+    for name, sign, word in ((register.at_least, 1, "below"), (register.at_most, -1, "above")):
+        bound = (yield from _bound(drive, name)) if name else None
+        if bound is not None and (value - bound) * sign < 0:
+            given, limit = register.format(value), f"{bound:g} {register.unit}".strip()
+            raise refused(drive, register, f"{given} is {word} {name}, which is {limit}")
+    if register.while_running is False:
+        yield from _must_stand(drive, register)
+
+
+def _bound(drive: Drive, name: str) -> Script[float | None]:
+    """The value of an option, None where it was not declared, or of a register."""
+    if name in drive.options:
+        return drive.option.get(name)
+    register: Register[float] = drive.register(name)
+    return (yield from read(register))
+
+
+def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
+    try:
+        state = yield from drive.state.script()
+    except Unsupported:
+        raise refused(
+            drive, register, "it changes only while the motor stands, which the family cannot say"
+        ) from None
+    if state.condition not in (Condition.STOPPED, Condition.FAULT):
+        raise refused(drive, register, f"it changes only while the motor stands; state: {state}")
+
+
+def wears(drive: Drive, register: Register[Any]) -> Kept:
+    """How a write to this register of this drive is kept: RAM is not worn, what is not stated may be."""
+    if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
+        return Kept.RAM
+    is_bit = register.table.carrier is Carrier.BIT
+    if register.kept is Kept.UNKNOWN and (register.access is Access.COMMAND or is_bit):
+        return Kept.RAM  # neither a command nor a coil is a parameter
+    return register.kept

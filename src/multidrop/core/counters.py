@@ -1,0 +1,70 @@
+"""What became of a drive's exchanges, as the core counts it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, Literal, NamedTuple
+
+from multidrop._core import ffi, lib
+from multidrop.core.result import Result
+
+
+class Counters(NamedTuple):
+    """What became of exchanges, by number (struct md_counters); all of them only grow."""
+
+    exchanges: int = 0
+    answered: int = 0
+    values: int = 0
+    sent: int = 0  # requests that began to leave
+    exceptions: int = 0  # exchanges that ended with one
+    naks: int = 0  # with code 07
+    busies: int = 0  # with code 06
+    late: int = 0
+    stray_bytes: int = 0
+    ideal_ns: int = 0
+    longest_ns: int = 0  # response delay
+    timeout_ns: int = 0  # at present
+    ended: Counter[Result] = Counter()  # exchanges without an answer, by reason; broadcasts by INCOMPLETE
+    missed: Counter[Result] = Counter()  # values, by reason
+    refused: Counter[int] = Counter()  # values, by exception code
+    delays: Counter[int] = Counter()  # replies, by the bucket of their response delay
+
+
+DELAY_BUCKETS: int = lib.MD_DELAY_BUCKETS
+
+
+def delay_edge(bucket: int) -> int:
+    """The least response delay of a bucket, in ns; the next bucket's is where it ends."""
+    return int(lib.md_delay_edge(bucket))
+
+
+def read_counters(c: Any, timeout_ns: int, unasked: Counter[Result]) -> Counters:
+    """A struct md_counters, the time-out, and the values that were due and not asked for, by reason."""
+    return Counters(
+        c.exchanges,
+        c.answered,
+        c.values,
+        c.sent,
+        c.exceptions,
+        c.naks,
+        c.busies,
+        c.late,
+        c.stray_bytes,
+        c.ideal_ns,
+        c.longest_ns,
+        timeout_ns,
+        _by_result(c.ended),
+        _by_result(c.missed) + unasked,
+        _by_place(c.refused, "I") if c.exceptions else Counter(),
+        _by_place(c.delays, "Q"),
+    )
+
+
+def _by_result(array: Any) -> Counter[Result]:
+    return Counter({Result(-code): count for code, count in _by_place(array, "Q").items()})
+
+
+def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
+    """The numbers that are not 0."""
+    numbers = memoryview(ffi.buffer(array)).cast(kind)
+    return Counter({at: number for at, number in enumerate(numbers) if number})

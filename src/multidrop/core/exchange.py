@@ -1,0 +1,201 @@
+"""An exchange: who is asked what, what is known of how they answer, and what became of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop._core import ffi, lib
+from multidrop.core.columns import RowLayout
+from multidrop.core.counters import Counters, read_counters
+from multidrop.core.frame import Framing, Message, build_request, from_c, to_c
+from multidrop.core.latch import Permit
+from multidrop.core.port_settings import settings_to_c
+from multidrop.core.result import EXCEPTION_STATUS, Result
+
+MOST_PROOFS: int = lib.MD_MOST_PROOFS
+
+
+class Peer:
+    """What is known of a drive as one who answers (struct md_drive): shared by all its exchanges.
+
+    `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
+    bit to the reply's first; between them it is learnt from the drive's own response delays.
+    """
+
+    def __init__(self, *, least_timeout: float, most_timeout: float) -> None:
+        self.c = ffi.new(
+            "struct md_drive *",
+            {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
+        )
+        self.proofs: tuple[Exchange, ...] = ()
+        self.unasked: Counter[Result] = Counter()  # values that its client did not ask for, by reason
+
+    @property
+    def exchanges(self) -> int:
+        """How many there were."""
+        return int(self.c.counters.exchanges)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether a reply of it was ever good, a refusal included."""
+        return bool(self.c.counters.answered)
+
+    @property
+    def failures(self) -> int:
+        """Exchanges in a row without an answer."""
+        return int(self.c.failures)
+
+    @property
+    def late(self) -> int:
+        """Answers that came after their time-out and were known for what they were."""
+        return int(self.c.counters.late)
+
+    @property
+    def late_until_ns(self) -> int:
+        """So long the answer to an earlier request may still come."""
+        return int(self.c.late_until_ns)
+
+    def inherit(self, before: Peer) -> None:
+        """Take the place of another at its address, whose answers may still come."""
+        lib.md_late_inherit(self.c, before.c)
+
+    def prove_by(self, proofs: Sequence[Exchange]) -> None:
+        """Ask one of these, at most MOST_PROOFS, first where a late answer could be taken for a reply.
+
+        No reply to one of them may pass for the reply to another. Once only, and before it is asked anything:
+        the core looks at them from then on.
+        """
+        self.proofs = tuple(proofs[:MOST_PROOFS])
+        self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
+        self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
+
+    @property
+    def timeout(self) -> float:
+        """In s, how long a reply is waited for at present."""
+        return float(lib.md_present_timeout_ns(self.c)) / 1e9
+
+    @property
+    def response_delay(self) -> float:
+        """In s, smoothed; 0 before the first reply."""
+        return float(self.c.delay_ns) / 1e9
+
+    @property
+    def vain_ns(self) -> int:
+        """How long its next answer is waited for, if it stays silent."""
+        return int(lib.md_vain_ns(self.c))
+
+    def counters(self) -> Counters:
+        """What became of its exchanges so far, and of values that were due and not asked for."""
+        return read_counters(self.c.counters, int(lib.md_present_timeout_ns(self.c)), self.unasked)
+
+
+class Exchange:
+    """One request and all that is needed to carry it out; made once, run as often as wanted.
+
+    Times are in seconds: `character` of one character, `silence` before the request and after
+    its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
+    `insists`: not to wait for an earlier answer, which may then pass for its own. `timeout`: at least so
+    long its reply is waited for; 0 as learnt. `answer`: the one register of its reply lies between these.
+    `block` is what rows are made of. `echo_probe` goes first while it is unknown whether the adapter echoes:
+    unlike this one's, its reply is never a copy of its request. `permit` keeps it from being
+    sent once a stop was called.
+    """
+
+    __slots__ = ("block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
+
+    def __init__(
+        self,
+        framing: Framing,
+        request: Message,
+        peer: Peer,
+        *,
+        baudrate: int,
+        format: str,
+        character: float,
+        silence: float,
+        turnaround: float = 0.1,
+        period: float = 0.0,
+        insists: bool = False,
+        timeout: float = 0.0,
+        answer: tuple[int, int] | None = None,
+        block: RowLayout | None = None,
+        echo_probe: Exchange | None = None,
+        permit: Permit | None = None,
+    ) -> None:
+        least, most = answer or (0, 0)
+        build_request(framing, request)  # raises for what no frame can say
+        self.framing = framing
+        self.request = request
+        self.peer = peer
+        self.block = block
+        self.echo_probe = echo_probe
+        self.permit = permit
+        self.settings = (baudrate, format)
+        self.c: Any = ffi.new(
+            "struct md_exchange *",
+            {
+                "framing": framing,
+                "request": to_c(request)[0],
+                "settings": settings_to_c(baudrate, format),
+                "character_ns": round(character * 1e9),
+                "silence_ns": round(silence * 1e9),
+                "turnaround_ns": round(turnaround * 1e9),
+                "period_ns": round(period * 1e9),
+                "insists": insists,
+                "timeout_ns": round(timeout * 1e9),
+                "least": least,
+                "most": most,
+                "drive": peer.c,
+                "block": block.c if block else ffi.NULL,
+                "echo_probe": echo_probe.c if echo_probe else ffi.NULL,
+                "stops": permit.latch.c if permit else ffi.NULL,
+                "stops_seen": permit.seen if permit else 0,
+            },
+        )
+
+
+@dataclass(frozen=True)
+class Completion:
+    """What became of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
+
+    result: int
+    error: int
+    begun_ns: int
+    sent_ns: int
+    first_ns: int
+    last_ns: int
+    stale: int
+    skipped: int
+    reply: Message
+    raw: bytes
+
+    @property
+    def status(self) -> int:
+        """As a column has it: 0, the reason's number, or EXCEPTION_STATUS + exception code."""
+        if self.result <= 0:
+            return -self.result
+        return EXCEPTION_STATUS + self.reply.exception if self.reply.exception else 0
+
+
+def new_completion() -> Any:
+    """The core's own memory for what becomes of one exchange (struct md_completion)."""
+    return ffi.new("struct md_completion *")
+
+
+def completion(found: Any) -> Completion:
+    """What the core's memory says."""
+    return Completion(
+        found.result,
+        found.error,
+        found.begun_ns,
+        found.sent_ns,
+        found.first_ns,
+        found.last_ns,
+        found.stale,
+        found.skipped,
+        from_c(found.reply),
+        bytes(ffi.buffer(found.raw, found.raw_len)),
+    )

@@ -1,0 +1,65 @@
+"""What the core's thread leaves for a client: rows of what was carried out, and calls to look at a port."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from multidrop._core import ffi, lib
+from multidrop.core.columns import Columns, RowLayout, miss
+from multidrop.core.fork import only_here, register_at_fork
+from multidrop.core.result import Result
+
+CHUNK_ROWS = 1 << 12  # of columns that are taken
+MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
+
+
+class RowQueue:
+    """Rows that nobody has taken yet, and the numbers of ports that need attention (struct md_row_queue)."""
+
+    MOST_NUMBERS: int = lib.MD_MOST_NUMBERS
+    _MOST_AT_ONCE = 1024
+
+    def __init__(self, chunk_rows: int = CHUNK_ROWS, most_chunks: int = MOST_CHUNKS) -> None:
+        self._room = (chunk_rows, most_chunks)
+        self._called = ffi.new("uint32_t[]", self._MOST_AT_ONCE)
+        self._begin()
+        register_at_fork(self)
+
+    def _begin(self) -> None:
+        made = lib.md_row_queue_new(*self._room)
+        if made == ffi.NULL:
+            raise OSError(ffi.errno, "no room for what the core leaves")
+        self.c = ffi.gc(made, only_here(lib.md_row_queue_free))
+        self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
+
+    def forked(self) -> None:
+        """In the child it is empty: what waits is the parent's to take."""
+        self._begin()
+
+    def take(self) -> Columns | None:
+        """The oldest rows that wait; None when there are none."""
+        made = lib.md_row_queue_take(self.c)
+        return None if made == ffi.NULL else Columns.lent(made, self._give_back)
+
+    def add_miss(self, block: RowLayout, result: Result, due_ns: int) -> None:
+        """Rows for values that were due at `due_ns` but never asked for."""
+        lib.md_row_queue_add(self.c, block.c, miss(result, due_ns))
+
+    @property
+    def chunks(self) -> int:
+        """How many columns there are to take; the newest are still being filled."""
+        return int(lib.md_row_queue_chunks(self.c))
+
+    @property
+    def dropped(self) -> int:
+        """Rows for which there was no room."""
+        return int(lib.md_row_queue_dropped(self.c))
+
+    def call(self, number: int) -> None:
+        """Wake whoever waits, as if the port of this number was to be looked at."""
+        lib.md_row_queue_call(self.c, number)
+
+    def await_calls(self, seconds: float) -> list[int]:
+        """Wait for a call, no longer than that; the numbers of the ports that are to be looked at."""
+        count = lib.md_row_queue_await(self.c, round(seconds * 1e9), self._called, self._MOST_AT_ONCE)
+        return ffi.unpack(self._called, count) if count else []

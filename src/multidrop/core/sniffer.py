@@ -1,0 +1,179 @@
+"""What was sniffed on a line or lies in a capture: cut into frames, and made rows of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+from multidrop._core import ffi, lib
+from multidrop.core.columns import Columns, RowLayout
+from multidrop.core.frame import Framing, Message, from_c
+
+
+class Side(IntEnum):
+    """Who sent what was sniffed, where that is known (enum md_side)."""
+
+    EITHER = lib.MD_EITHER_SIDE
+    ASKING = lib.MD_ASKING
+    ANSWERING = lib.MD_ANSWERING
+    FAILED = lib.MD_FAILED  # came in place of a reply, as the master itself says
+    NOISE = lib.MD_NOISE  # not even that: stray bytes, echo, late replies
+
+
+class Kind(IntEnum):
+    """What a span of sniffed bytes is (enum md_kind)."""
+
+    JUNK = lib.MD_JUNK
+    REQUEST = lib.MD_REQUEST
+    EITHER = lib.MD_EITHER  # a request, or its copy that confirms it
+    REPLY = lib.MD_REPLY
+    STRAY = lib.MD_STRAY  # a reply whose request was not heard
+
+
+class FrameSpan(NamedTuple):
+    """Sniffed bytes that belong together; `message` and `framing` mean nothing of junk."""
+
+    kind: Kind
+    framing: Framing
+    time_ns: int
+    message: Message
+    raw: bytes
+
+
+HEARD_ROOM = 1 << 20
+_MOST_PIECES = 1 << 15
+
+
+class Stream:
+    """Bytes of one line in the pieces in which they came (struct md_stream)."""
+
+    def __init__(self, place: Any = None) -> None:
+        self.c = ffi.new("struct md_stream *") if place is None else place
+        self._bytes = ffi.new("uint8_t[]", HEARD_ROOM)
+        self._pieces = ffi.new("struct md_piece[]", _MOST_PIECES)
+        self.c.bytes, self.c.room = self._bytes, HEARD_ROOM
+        self.c.pieces, self.c.most = self._pieces, _MOST_PIECES
+
+    def put(
+        self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
+    ) -> None:
+        """Append what came at this time; after a pause it is a hint where frames begin."""
+        piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
+        if not lib.md_hear(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
+            raise BufferError("more was heard than fits: split it first")
+
+    def end(self, is_end: bool) -> None:
+        """Whether nothing more is to be waited for, as when the line has long been silent."""
+        self.c.is_all = is_end
+
+
+class Splitter:
+    """Cuts what was heard into spans (struct md_splitter)."""
+
+    def __init__(self) -> None:
+        self._c = ffi.new("struct md_splitter *")
+        self._span = ffi.new("struct md_span *")
+
+    def spans(self, stream: Stream) -> Iterator[FrameSpan]:
+        """All that is understood so far; then it is forgotten. Every byte is part of one span."""
+        span = self._span
+        while lib.md_split(self._c, stream.c, span):
+            raw = bytes(ffi.buffer(stream.c.bytes + span.at, span.len))
+            yield FrameSpan(Kind(span.kind), Framing(span.framing), span.time_ns, from_c(span.message), raw)
+        lib.md_forget(stream.c, self._c)
+
+
+class Decoder:
+    """Makes rows of the exchanges that were heard on one line (struct md_decoder)."""
+
+    _PLACES = 1 << 14
+
+    def __init__(self) -> None:
+        self._c = ffi.new("struct md_decoder *")
+        self.forget()
+
+    def forget(self) -> None:
+        """Know no request any more."""
+        self._known = ffi.new("struct md_known[]", self._PLACES)
+        self._blocks: list[RowLayout] = []
+        self._c.known, self._c.places, self._c.taken = self._known, self._PLACES, 0
+        self._c.block = ffi.NULL
+
+    @property
+    def asked(self) -> tuple[Framing, Message]:
+        """The request of which it is to be said what its reply holds."""
+        return Framing(self._c.span.framing), from_c(self._c.span.message)
+
+    def know(self, block: RowLayout | None) -> bool:
+        """What the reply to `asked` holds, None: no rows; False when it knows too much already."""
+        if block:
+            self._blocks.append(block)
+        c = block.c if block else ffi.NULL
+        return bool(lib.md_know(self._c, self._c.span.framing, ffi.addressof(self._c.span, "message"), c))
+
+    def decode(self, stream: Stream, columns: Columns) -> Decoded:
+        """Make rows, and forget what they were made of."""
+        done = Decoded(lib.md_decode(self._c, stream.c, columns.c))
+        if done is Decoded.ALL:
+            lib.md_forget(stream.c, ffi.addressof(self._c, "splitter"))
+        return done
+
+    def counts(self) -> dict[str, int]:
+        """So far: frames, exchanges, replies without a request, bytes that are part of no frame."""
+        c = self._c
+        return {"frames": c.frames, "exchanges": c.exchanges, "strays": c.strays, "unknown_bytes": c.junk}
+
+
+class Decoded(IntEnum):
+    ALL = lib.MD_ALL_DECODED
+    NO_ROOM = lib.MD_NO_ROOM
+    UNKNOWN = lib.MD_UNKNOWN
+
+
+class Unpacked(IntEnum):
+    ALL = lib.MD_UNPACKED
+    FULL = lib.MD_CHANNEL_FULL
+    OTHER_BLOCK = lib.MD_OTHER_BLOCK
+    CUT = lib.MD_CUT
+    NONSENSE = lib.MD_NONSENSE
+
+
+class Unpacker:
+    """Takes packets out of a capture file's bytes (struct md_capture); `at` is how far in the file it is."""
+
+    MOST_CHANNELS = 64
+
+    def __init__(self, at: int, *, is_pcapng: bool, is_big_endian: bool) -> None:
+        self._channels = ffi.new("struct md_channel[]", self.MOST_CHANNELS)
+        self.streams: list[Stream] = []
+        self._c = ffi.new(
+            "struct md_capture *",
+            {"is_pcapng": is_pcapng, "is_big_endian": is_big_endian, "channels": self._channels},
+        )
+        self.look_at(b"", at)
+
+    def look_at(self, piece: bytes, at: int) -> None:
+        """Go on with these bytes of the file, which begin at its byte `at`."""
+        self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
+        self._c.bytes, self._c.len, self._c.at = self._piece, len(piece), 0
+
+    @property
+    def at(self) -> int:
+        return self._begin + int(self._c.at)
+
+    @at.setter
+    def at(self, at: int) -> None:
+        self._c.at = at - self._begin
+
+    def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
+        """The next interface of the file: its link type, whose sent what, and its clock."""
+        channel = self._channels[self._c.count]
+        channel.link, channel.has_sides = link, has_sides
+        channel.ticks_per_s, channel.offset_ns = ticks_per_s, offset_ns
+        self.streams.append(Stream(ffi.addressof(channel, "stream")))
+        self._c.count += 1
+
+    def unpack(self) -> Unpacked:
+        """Append packets to what was heard on their channels, until something is to be done."""
+        return Unpacked(lib.md_unpack(self._c))

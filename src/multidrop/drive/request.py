@@ -1,0 +1,43 @@
+"""Build the request that writes a register."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+from multidrop.core import Message
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Carrier, Register
+
+
+def write_request(drive: Drive, register: Register[Any], raw: float, address: int | None = None) -> Message:
+    """The request that writes a raw count to a register, to its RAM alias where it has one.
+
+    Raises ValueError where the register cannot be written.
+    """
+    table = register.table
+    if not register.writable or table.write is None:
+        raise ValueError(
+            f"{register.name} of {drive.name} cannot be written: it is a {register.access.value}"
+        )
+    to = drive.address if address is None else address
+    at = register.address if register.ram_address is None else register.ram_address
+    if table.carrier is Carrier.NUMBER:
+        return Message(to, table.write, start=int(raw), data=bytes(4))
+    if table.carrier is Carrier.LONG:
+        return Message(to, table.write, at, data=struct.pack(">I", int(raw)))
+    if table.carrier is Carrier.BIT:
+        if table.write == _WRITE_COILS:
+            return Message(to, table.write, at, count=1, data=bytes([int(raw)]))
+        return Message(to, table.write, at, data=b"\xff\x00" if raw else b"\x00\x00")
+    if register.words == 1:
+        word = struct.pack(">H", int(raw) & 0xFFFF)
+        count = 1 if table.write == _WRITE_WORDS else 0
+        return Message(to, table.write, at, count, word)
+    words = struct.pack(">f", raw) if register.is_float else struct.pack(">I", int(raw) & 0xFFFF_FFFF)
+    if register.number_format.name.endswith("_SWAPPED"):
+        words = words[2:] + words[:2]
+    return Message(to, _WRITE_WORDS, at, count=2, data=words)
+
+
+_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once

@@ -1,0 +1,112 @@
+"""Scripts: the steps a verb consists of, written down as a generator without any I/O.
+
+A script yields steps (read, write, wait) and receives what they gave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+from multidrop.drive.register import Register
+from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Unconfirmed
+
+MOST_UNHEARD = 3  # looks in a row
+
+T = TypeVar("T", bound=float)
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Read:
+    register: Register[Any]
+
+
+@dataclass(frozen=True)
+class Write:
+    register: Register[Any]
+    value: Any
+
+
+@dataclass(frozen=True)
+class Insist(Write):
+    """A write that does no harm at any time, nor when it is repeated: a stop, or a command taken back."""
+
+
+@dataclass(frozen=True)
+class Pulse(Insist):
+    """One that is sent once in a call, whatever becomes of it: a stop that is itself a fault."""
+
+
+@dataclass(frozen=True)
+class Wait:
+    seconds: float
+
+
+Step = Read | Write | Wait
+Script = Generator[Step, Any, R]
+
+
+def read(register: Register[T]) -> Script[T]:
+    """The register's value, as `value = yield from read(register)`."""
+    return cast(T, (yield Read(register)))
+
+
+def write(register: Register[T], value: T) -> Script[T]:
+    """Write once; what the drive then holds, where that can be read, else `value`."""
+    return cast(T, (yield Write(register, value)))
+
+
+def wait(seconds: float) -> Script[None]:
+    yield Wait(seconds)
+
+
+def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
+    """Do a script's steps; what it returns. A step's failure is raised in it, and may be mended there."""
+    try:
+        step = next(script)
+        while True:
+            try:
+                result = do(step)
+            except (BusError, ValueError) as failure:
+                step = script.throw(failure)
+            else:
+                step = script.send(result)
+    except StopIteration as end:
+        return cast(R, end.value)
+
+
+def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
+    """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
+    for attempt in range(1, attempts + 1):
+        try:
+            yield Insist(register, value)
+        except (Unconfirmed, DriveRefused):
+            if attempt == attempts:
+                raise
+        else:
+            return
+
+
+def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
+    """Look again and again until it is true; False when `limit` seconds have passed.
+
+    A motor that starts brings noise: a look at a drive that cannot be heard sees nothing, but for the
+    third in a row, whose failure is raised.
+    """
+    waited = 0.0
+    unheard = 0
+    while True:
+        try:
+            if (yield from look()):
+                return True
+            unheard = 0
+        except (NoReply, BadReply):
+            unheard += 1
+            if unheard == MOST_UNHEARD:
+                raise
+        if waited >= limit:
+            return False
+        yield from wait(every)
+        waited += every

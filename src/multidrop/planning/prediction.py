@@ -1,0 +1,165 @@
+"""What a line will reach: bus cycle, utilisation, the rate of each drive; before its port is opened. Pure.
+
+Every exchange is taken to succeed at once, and the host to be late by what is usual. Which exchange
+follows which is asked of the schedule itself, on a line of which only the clock exists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.planning.blocks import Planned
+from multidrop.planning.bus_time import gap, in_order, kind, sending, silence
+from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
+
+LATENESS = 100e-6  # s of each exchange in which a common machine wakes up and writes the request
+ENOUGH = 0.97  # of a wanted rate: it counts as kept
+LEAST_EXCHANGES = 1000  # for so many the schedule is asked
+LEAST_ROUNDS = 3
+FAR_NS = 1 << 62
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Registers of a drive that are wanted every so many s; None: as fast as the line allows."""
+
+    drive: Drive
+    every: float | None
+    registers: tuple[Register[Any], ...]
+    requests: int
+    reached: float  # times per second
+
+    @property
+    def fits(self) -> bool:
+        return self.every is None or self.reached * self.every >= ENOUGH
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Of one line: `cycle` is that of everything polled as fast as the line allows, in s."""
+
+    cycle: float
+    switches: int  # of line settings in it
+    utilisation: float  # over 1: so many times as fast the line would have to be
+    rates: tuple[Rate, ...]
+
+    @property
+    def fits(self) -> bool:
+        return all(rate.fits for rate in self.rates)
+
+    def requests(self, drive: Drive) -> int:
+        """Requests of a bus cycle that go to this drive."""
+        return sum(rate.requests for rate in self.rates if rate.drive is drive)
+
+    def exchanges_per_second(self, drive: Drive) -> float:
+        return sum(rate.requests * rate.reached for rate in self.rates if rate.drive is drive)
+
+
+@dataclass(eq=False, kw_only=True)
+class _Asked(Job):
+    """A job with what became of it on the line of which only the clock exists."""
+
+    planned: Planned
+    own: float  # s from the end of the silence to that of the reply
+    count: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    taken: float = 0.0  # s of the line, the silences before it included
+
+    @property
+    def cost(self) -> float:
+        """Seconds of the line that it takes on average."""
+        return self.taken / self.count if self.count else self.own + silence(self.planned.drive)
+
+    @property
+    def reached(self) -> float:
+        """How many times per second; for a job with a period."""
+        if self.skipped == 0 and self.planned.every:
+            return 1 / self.planned.every
+        return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
+
+
+def predict(
+    exchanges: Sequence[Planned],
+    delays: Mapping[Drive, float] | None = None,
+    switching: float = 0.0,
+    lateness: float = LATENESS,
+) -> Prediction:
+    """What a line reaches on which these are polled.
+
+    `delays` are the response delays in s that were measured, of drives that have any; `switching` is
+    what the port needs to change baud rate or format, as a poll has measured it, and `lateness` what
+    the host adds to each exchange: 0 for what the line alone would reach.
+    """
+    jobs = _jobs(exchanges, delays or {}, switching, lateness)
+    _run(jobs, switching)
+    turn = [job for job in jobs if job.planned.every is None]
+    load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
+    turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
+    groups: dict[tuple[Drive, float | None], list[_Asked]] = {}
+    for job in jobs:
+        groups.setdefault((job.planned.drive, job.planned.every), []).append(job)
+    return Prediction(
+        sum(
+            job.own + gap(jobs[at - 1].planned.drive, job.planned.drive, switching)
+            for at, job in enumerate(jobs)
+        ),
+        sum(job.planned.drive.settings != jobs[at - 1].planned.drive.settings for at, job in enumerate(jobs)),
+        max(load, 1.0) if turn else load,
+        tuple(
+            Rate(
+                drive,
+                every,
+                tuple(register for job in group for register in job.planned.block.registers),
+                len(group),
+                turns if every is None else min(job.reached for job in group),
+            )
+            for (drive, every), group in groups.items()
+        ),
+    )
+
+
+def _jobs(
+    exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching: float, lateness: float
+) -> list[_Asked]:
+    """In the order of the bus cycle."""
+    of_drive: dict[Drive, list[Planned]] = {}
+    for exchange in exchanges:
+        of_drive.setdefault(exchange.drive, []).append(exchange)
+    return [
+        _Asked(
+            drive=drive.address,
+            kind=kind(drive),
+            period_ns=None if it.every is None else round(it.every * 1e9),
+            duration_ns=round((silence(drive) + own) * 1e9),
+            planned=it,
+            own=own,
+        )
+        for drive in in_order(of_drive, switching)
+        for it in of_drive[drive]
+        for own in [lateness + sending(drive, it.block) + delays.get(drive, drive.response_delay)]
+    ]
+
+
+def _run(jobs: Sequence[_Asked], switching: float) -> None:
+    """Carry out one job after another, as the schedule says."""
+    schedule: Schedule[_Asked] = Schedule()
+    for job in jobs:
+        schedule.add(job, 0)
+    gaps = cache(partial(gap, switching=switching))
+    at, before = 0, jobs[-1].planned.drive
+    timed = any(job.period_ns is not None for job in jobs)
+    for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
+        ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
+        silent = gaps(before, job.planned.drive)
+        begin_ns = max(at + round(silent * 1e9), not_before_ns)
+        job.first_ns = job.first_ns if job.count else begin_ns
+        job.last_ns = begin_ns
+        job.count += 1
+        job.taken += silent + job.own
+        at, before = begin_ns + round(job.own * 1e9), job.planned.drive

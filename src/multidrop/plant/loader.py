@@ -1,0 +1,207 @@
+"""Read a plant file: find every mistake in it before anything is done with it, and tell all at once."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from multidrop.core import Echo
+from multidrop.drive.family import Drive
+from multidrop.drive.timing import Settings
+from multidrop.drives import MODELS
+from multidrop.drives.registry import find_model
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.plant.toml_check import Key, TomlPlace, read_document
+
+
+class PlantError(ValueError):
+    """All mistakes of a plant file: each a sentence that says where it is and what would be right."""
+
+    def __init__(self, mistakes: tuple[str, ...]) -> None:
+        super().__init__("\n".join(mistakes))
+        self.mistakes = mistakes
+
+
+def load_plant(path: Path | str) -> Plant:
+    """The plant that the file describes; PlantError when anything in it is wrong."""
+    path = Path(path)
+    place = TomlPlace(path)
+    document = place.attempt(read_document, path, "plant file")
+    tables = [] if document is None else place.check(document, _PLANT).get("line", [])
+    lines = tuple(_line(table, at) for table, at in place.inside("line", tables))
+    if place.mistakes:
+        raise PlantError(tuple(place.mistakes))
+    return Plant(lines, path)
+
+
+def parse_duration(text: str) -> float:
+    """Seconds in a duration that a person wrote, such as "50 ms"; ValueError if it is none."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
+    units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+    seconds = float(match[1]) * units[match[2]] if match else 0
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise ValueError(f'{text!r} is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"')
+    return seconds
+
+
+def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
+    """The duration under this key; None if it is not given, or a mistake."""
+    return place.attempt(_duration_under, key, given[key]) if key in given else None
+
+
+def _duration_under(key: str, text: str) -> float:
+    try:
+        return parse_duration(text)
+    except ValueError as mistake:
+        raise ValueError(f"{key} = {mistake}") from mistake
+
+
+_SHORTEST, _LONGEST = 100e-6, 86400.0  # s
+
+
+_PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
+
+
+_LINE = {
+    "name": Key(str, 'name = "hall-1"', needed=True),
+    "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
+    "baudrate": Key(int, "baudrate = 9600"),
+    "format": Key(str, 'format = "8N1"'),
+    "silence": Key(str, 'silence = "500 us"'),
+    "switching": Key(str, 'switching = "2 ms"'),
+    "echo": Key(str, 'echo = "auto"'),
+    "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
+}
+
+
+_DRIVE = {
+    "name": Key(str, 'name = "pump-1"', needed=True),
+    "model": Key(str, 'model = "innovert-ibd"', needed=True),
+    "address": Key(int, "address = 1", needed=True),
+    "framing": Key(str, 'framing = "rtu"'),
+    "baudrate": Key(int, "baudrate = 9600"),
+    "format": Key(str, 'format = "8N1"'),
+    "ram": Key(list, 'ram = ["frequency"], registers that this drive is known not to store in EEPROM'),
+    "every": Key(str, 'every = "50 ms"'),
+    "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
+}
+
+
+_POLL = {
+    "register": Key(str, 'register = "output_current"', needed=True),
+    "every": Key(str, 'every = "50 ms"'),
+}
+
+
+_NOT_ARGUMENTS = ("name", "model", "every", "poll")  # of a drive's class
+
+
+def _line(table: Any, place: TomlPlace) -> PlantLine:
+    given = place.check(table, _LINE)
+    name, port = given.get("name", ""), given.get("port", "")
+    if name:
+        place.once("line", name, sentence="another line has this name too; every line needs its own")
+    if port:
+        place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
+    settings: dict[str, Any] = {
+        "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
+        "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
+    }
+    silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
+    echo = place.attempt(Echo, given.get("echo", "auto"))
+    inherited = {**settings, "silence": silence}
+    drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
+    polled = tuple(filter(None, drives))
+    return PlantLine(
+        name, port, **settings, drives=polled, switching=switching or 0.0, echo=echo or Echo.AUTO
+    )
+
+
+def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
+    before = len(place.mistakes)
+    model = _model(table, place)
+    given = place.check(table, _DRIVE | _option_keys(model))
+    if "name" in given:
+        place.once("drive", given["name"], sentence="{first} has this name too; every drive needs its own")
+    if "address" in given:
+        sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
+        place.once("address", place.labels[0], given["address"], sentence=sentence)
+    every = duration_of(given, "every", place)
+    if model is None:
+        return None
+    arguments = {key: value for key, value in given.items() if key not in _NOT_ARGUMENTS}
+    inherited = {key: value for key, value in line.items() if value is not None and key not in given}
+    _try_each(model, arguments, inherited, place)
+    polls = _polls(given.get("poll"), model, every, place)
+    if len(place.mistakes) > before:
+        return None
+    drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
+    return PolledDrive(drive, polls) if drive else None
+
+
+def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
+    text = table.get("model") if isinstance(table, dict) else None
+    if not text or not isinstance(text, str):
+        return None
+    return place.attempt(find_model, text, place.path.parent)
+
+
+def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
+    """The options of the family; of all families, as long as it is not known which one it is."""
+    families = [model] if model else list(MODELS.values())
+    return {
+        name: Key((int, float), f"{name} = {option.span[1]:g}")
+        for family in families
+        for name, option in family.options.items()
+    }
+
+
+def _try_each(
+    model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: TomlPlace
+) -> None:
+    """Try one argument at a time, so that every one that the family refuses is reported."""
+    least: dict[str, Any] = {"address": model.addresses[0]}
+    if "framing" in arguments:
+        framing = {"framing": arguments["framing"]}
+        if place.attempt(partial(model, **least, **framing)):
+            least |= framing  # on which the formats depend
+    for key, value in arguments.items():
+        if key != "framing":
+            place.attempt(partial(model, **(least | {key: value})))
+    settings = model(**least).settings
+    right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
+    for key, value in inherited.items():
+        if key not in right:  # what it may be depends on the others
+            continue
+        hint = f" (the line's); add {key} = {right[key]} to this drive"
+        place.attempt(partial(model, **(least | {key: value})), hint=hint)
+
+
+def _polls(
+    entries: list[Any] | None, model: type[Drive], every: float | None, place: TomlPlace
+) -> tuple[Polled, ...]:
+    if entries is None:
+        if not model.readings():
+            place.wrong(f"{model.title or model.__name__} has no readings; say what to poll")
+        return tuple(Polled(register, every) for register in model.readings())
+    found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
+    return tuple(polled for polled in found if polled is not None)
+
+
+def _polled(entry: Any, model: type[Drive], every: float | None, place: TomlPlace) -> Polled | None:
+    if not isinstance(entry, (str, dict)):
+        place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
+        return None
+    given = place.check({"register": entry} if isinstance(entry, str) else entry, _POLL)
+    own = duration_of(given, "every", place) if "every" in given else every
+    register = place.attempt(model.register, given["register"]) if "register" in given else None
+    if register is None:
+        return None
+    place.once(place.labels[:-1], register.name, sentence=f"{register} is polled twice; keep it once")
+    if not register.readable:
+        place.wrong(f"{register} can only be written, not polled; see `multidrop models {model.model}`")
+        return None
+    return Polled(register, own)

@@ -1,0 +1,74 @@
+"""Rows that come out of a recording, in Arrow's layout."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate
+from typing import Any
+
+from multidrop.polling.batch import Row, Rows, assemble
+
+
+class Recorded(Rows):
+    """Rows held by a nanoarrow array of the schema."""
+
+    def __init__(self, rows: Any) -> None:
+        self._array = rows
+
+    def __len__(self) -> int:
+        return int(self._array.length)
+
+    def __iter__(self) -> Iterator[Row]:
+        columns = self._array.view().children
+        return map(Row._make, zip(*map(_values, columns), strict=True))
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} recorded rows>"
+
+    def arrow(self) -> Any:
+        return self._array
+
+
+def _values(column: Any) -> Iterable[Any]:
+    """Each row's value of a column, None where it has none."""
+    if column.n_buffers == 3:
+        return _texts(column)
+    numbers = memoryview(column.buffer(1))[: column.length]
+    if not column.null_count:
+        return numbers
+    valid = column.buffer(0).elements()
+    return (number if there else None for number, there in zip(numbers, valid, strict=False))
+
+
+def _texts(column: Any) -> Iterator[str]:
+    ends, text = memoryview(column.buffer(1)), bytes(column.buffer(2))
+    return (text[ends[at] : ends[at + 1]].decode(errors="replace") for at in range(column.length))
+
+
+def from_rows(rows: Sequence[Row]) -> Recorded:
+    """The same rows in Arrow's layout."""
+    time, monotonic_ns, uncertainty_ns, drive, register, value, status = zip(*rows, strict=True)
+    return Recorded(
+        assemble(
+            len(rows),
+            (None, array("q", time)),
+            (None, array("q", monotonic_ns)),
+            (_bitmap(uncertainty_ns), array("q", [0 if it is None else it for it in uncertainty_ns])),
+            (None, *_spelt(drive)),
+            (None, *_spelt(register)),
+            (_bitmap(value), array("d", [0 if it is None else it for it in value])),
+            (None, *_spelt(status)),
+        )
+    )
+
+
+def _bitmap(values: Sequence[object]) -> bytes:
+    """One bit a value, least significant first: is it there?"""
+    bits = "".join("0" if value is None else "1" for value in reversed(values))
+    return int(bits, 2).to_bytes((len(values) + 7) // 8, "little")
+
+
+def _spelt(texts: Sequence[str]) -> tuple[array[int], bytes]:
+    encoded = [text.encode() for text in texts]
+    return array("i", [0, *accumulate(map(len, encoded))]), b"".join(encoded)

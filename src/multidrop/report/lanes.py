@@ -1,0 +1,160 @@
+"""States as lanes: one for each drive, or for each bit of a register of bits, in the drive's own names.
+
+The same count means different things to different families, so that counts of several drives never
+share an axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Patch
+
+from multidrop.report.load import Array, Selection, Series
+from multidrop.report.style import COLOURS, TEXT, days, label, line_style
+
+HATCHES = ("", "////", "....")  # the colours once more, and again
+MOST_LANES = 64  # in one panel
+NARROWEST = 1 / 1500  # of the time axis: a shorter state is drawn so wide
+LETTER = 1 / 140  # of the time axis, that a letter of a state's name takes
+LANE_INCHES = 0.24
+MOST_TEXTS = 50  # with one name, in one lane
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """What one drive's register, or one bit of it, was from when to when."""
+
+    drive: str
+    title: str
+    is_bit: bool  # its title says all: it is on or off
+    time: Array  # of its rows, ns UTC
+    missed: Array
+    state: tuple[str, ...]  # of each run of rows that are alike
+    begin: Array  # of each of them, ns UTC
+    end: Array
+
+
+def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
+    """Return the lanes of a panel, and how many had no room; bits that were never set give way first."""
+    found = list(chain.from_iterable(map(_lanes, series)))
+    if len(found) > MOST_LANES:
+        found = [lane for lane in found if lane.state] or found
+    return found[:MOST_LANES], max(0, len(found) - MOST_LANES)
+
+
+def _lanes(series: Series) -> Iterable[Lane]:
+    if not series.is_bits:
+        return [_lane(series, series.drive, series.value, series.name_of)]
+    with np.errstate(invalid="ignore"):  # an infinite value is no count
+        is_whole = series.value % 1 == 0
+    is_count = is_whole & (series.value >= 0) & (series.value < 2**32)
+    counts = np.where(is_count, series.value, 0.0).astype(np.int64)
+    seen = int(np.bitwise_or.reduce(counts, initial=0))
+    unnamed = {1 << bit: f"bit {bit}" for bit in range(32) if seen >> bit & 1}
+    return [
+        _lane(
+            series,
+            f"{series.drive} {name.lower()}",
+            np.where(is_count, counts & bit == bit, np.nan),
+            {0.0: "", 1.0: name}.__getitem__,
+        )
+        for bit, name in sorted((unnamed | series.names).items())
+        if bit > 0
+    ]
+
+
+def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
+    """Cut the rows into runs of one value; a state lasts until the next row, whatever that says."""
+    time = series.time
+    differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
+    begins = np.concatenate([[0], np.flatnonzero(differs) + 1])
+    ends = np.concatenate([time[begins[1:]], time[-1:]])
+    names = {one: "" if np.isnan(one) else name_of(one) for one in np.unique(value[begins]).tolist()}
+    states = [names[one] if one == one else "" for one in value[begins].tolist()]
+    told = np.array([bool(state) for state in states])
+    return Lane(
+        series.drive,
+        title,
+        series.is_bits,
+        time,
+        series.missed,
+        tuple(state for state in states if state),
+        time[begins][told],
+        ends[told],
+    )
+
+
+def lanes_inches(lanes: Sequence[Lane]) -> float:
+    """How high a panel of so many lanes is."""
+    return 0.45 + LANE_INCHES * len(lanes)
+
+
+def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Selection) -> None:
+    """Draw a row for each lane, its states as bars; names that fit nowhere are beside the panel."""
+    names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
+    styles = {name: _style(number) for number, name in enumerate(names)}
+    span = max(look.end - look.begin, 1)
+    told: set[str] = set()
+    for row, lane in enumerate(lanes):
+        bit_style = {"facecolor": line_style(look.drives.index(lane.drive))["color"]}
+        for name in _longest_first(lane):
+            begin, end = _merged(lane, name, span)
+            widths = np.maximum(end - begin, span * NARROWEST)
+            bars = list(zip(days(begin), widths / 86400e9, strict=True))
+            axes.broken_barh(bars, (row - 0.36, 0.72), linewidth=0, **styles.get(name, bit_style))
+            if not lane.is_bit:
+                text = label(name).lower()
+                fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
+                told.update([name] if len(fitting) else [])
+                for at in days(fitting):
+                    name_bar(axes, text, at, row)
+        _mark_misses(axes, lane, row, span)
+    untold = [name for name in names if name not in told]
+    if untold:
+        handles = [Patch(label=label(name).lower(), **styles[name]) for name in untold]
+        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, frameon=False)
+    axes.set_yticks(range(len(lanes)), [label(lane.title) for lane in lanes], fontsize=8)
+    axes.set_ylim(len(lanes) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
+
+
+def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
+    """Write a name at the begin of a bar, so that it can be read where the bar is shorter."""
+    box = {"facecolor": "white", "alpha": 0.75, "pad": 0.8, "linewidth": 0}
+    place: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(text, (at, row), fontsize=7.5, clip_on=True, bbox=box, **place)
+
+
+def _style(number: int) -> dict[str, Any]:
+    hatch = HATCHES[number // len(COLOURS) % len(HATCHES)]
+    return {"facecolor": COLOURS[number % len(COLOURS)], "hatch": hatch, "edgecolor": "white"}
+
+
+def _longest_first(lane: Lane) -> list[str]:
+    """The rarest states are drawn last: where states change faster than can be drawn, none is hidden."""
+    lasting = dict.fromkeys(lane.state, 0)
+    for name, length in zip(lane.state, (lane.end - lane.begin).tolist(), strict=True):
+        lasting[name] += length
+    return sorted(lasting, key=lambda name: -lasting[name])
+
+
+def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
+    """From when to when it was in this state, without gaps that are too narrow to be seen."""
+    of = np.array([state == name for state in lane.state])
+    begin, end = lane.begin[of], lane.end[of]
+    apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])
+    return begin[apart], end[np.concatenate([apart[1:], [True]])]
+
+
+def _mark_misses(axes: Axes, lane: Lane, row: int, span: int) -> None:
+    """A tick at the foot of the lane for every row that was missed."""
+    time = np.unique(lane.time[lane.missed] // max(1, span // 4000)) * max(1, span // 4000)
+    if len(time):
+        foot = np.full(len(time), row + 0.4)
+        axes.plot(days(time), foot, "|", color=TEXT, markersize=5, markeredgewidth=1.0)

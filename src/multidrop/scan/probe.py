@@ -1,0 +1,88 @@
+"""A closer look at one address from which something came."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from multidrop.bus import LEAST_TIMEOUT
+from multidrop.core import Completion, Message, Peer, Result
+from multidrop.drive.family import Drive
+from multidrop.errors import BadReply, DriveRefused, NoReply
+from multidrop.scan.identify import recognise
+from multidrop.scan.results import Found
+from multidrop.scan.sweep import Sweep
+
+MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
+TRIES = 3
+
+
+class Scan(Protocol):
+    """What it needs of the scan."""
+
+    def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion: ...
+
+    def peer(self, least: float, most: float) -> Peer: ...
+
+
+class Probe:
+    """A closer look at an address from which something came: does it answer, how, and is it alone?"""
+
+    def __init__(self, scan: Scan, sweep: Sweep, address: int) -> None:
+        self._scan = scan
+        self._sweep = sweep
+        self._address = address
+        self._peer = scan.peer(LEAST_TIMEOUT, MOST_TIMEOUT)
+        self.answers = self.damaged = self.followed = 0
+        self.excess = 0.0
+        self._answered = False  # the last time
+        for _ in range(TRIES):
+            self._ask(sweep.question.to(address))
+        self.response_delay = self._peer.response_delay
+
+    def _ask(self, request: Message) -> Completion:
+        completion = self._scan.ask(self._sweep, request, self._peer)
+        self.followed += self._answered and completion.stale > 0
+        self._answered = completion.result > 0
+        self.answers += self._answered
+        self.damaged += not self._answered and completion.result != Result.NO_REPLY
+        return completion
+
+    def found(self, families: Sequence[type[Drive]]) -> Found:
+        """What is there, as far as it can be told by reading."""
+        # What it does not answer is known soon: how long it takes to answer has been seen.
+        known = max(LEAST_TIMEOUT, 4 * self.response_delay)
+        self._peer = self._scan.peer(min(LEAST_TIMEOUT, known), known)
+        self._answered = False
+        drives, guess = recognise(self._sweep, self._address, families, self._reply)
+        self.excess = self.response_delay - max((it.response_delay for it in drives), default=LEAST_TIMEOUT)
+        return Found(
+            self._address,
+            drives[0].settings if drives else self._sweep.settings,
+            self._sweep.framing,
+            tuple(drive.model or type(drive).__name__ for drive in drives),
+            self.response_delay,
+            "; ".join(filter(None, (guess, self._doubt()))),
+        )
+
+    def _reply(self, drive: Drive, request: Message) -> Message:
+        for _ in range(TRIES):
+            completion = self._ask(request)
+            if completion.result > 0:
+                break
+        if completion.result == Result.NO_REPLY:
+            raise NoReply(drive.name)
+        if completion.result <= 0:
+            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
+        code = completion.reply.exception
+        if code:
+            raise DriveRefused(drive.name, code, drive.exception(code))
+        return completion.reply
+
+    def _doubt(self) -> str:
+        if self.damaged:
+            asked = self.answers + self.damaged
+            return f"{self.damaged} of {asked} replies were damaged: noise, or a second drive at this address"
+        if self.followed > 1:
+            return "more bytes came after its replies: perhaps a second drive at this address"
+        return ""

@@ -1,0 +1,167 @@
+"""HostileWire: a wire between whose client and drives every byte is at the mercy of faults.
+
+Bytes and times come in, bytes and times come out; chance comes from one seed.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from multidrop.sim.drive import SimulatedDrive
+from multidrop.sim.faults import Faults
+from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.receiver import Frame
+from multidrop.sim.wire import Ears, Transmission, Wire
+
+DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
+    "drop": lambda frame, at, bit: frame[:at] + frame[at + 1 :],
+    "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
+    "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
+}
+
+
+class HostileWire(Wire):
+    """A wire with `faults`, which may be changed at any time; `struck` counts what they did.
+
+    To hang up, its port must be a link or a TCP port: a bare pty cannot come back under its name.
+    """
+
+    def __init__(
+        self,
+        drives: Sequence[SimulatedDrive],
+        faults: Faults,
+        *,
+        name: str = "line",
+        port: str = "pty",
+        unpaced: bool = False,
+    ) -> None:
+        super().__init__(drives, name=name, port=port, unpaced=unpaced)
+        if faults.hang_up and port == "pty":
+            raise ValueError(f"{name}: a port that hangs up must be a link or a TCP port, to come back there")
+        self.faults = faults
+        self.struck: Counter[str] = Counter()
+        self._random = random.Random(f"{faults.seed} {name}")
+        self._beside: list[Transmission] = []  # what the client hears that no drive has sent
+        self._held: Transmission | None = None  # a reply that waits for the next one
+        self._back_at: float | None = None  # when the port that is gone comes back
+
+    def _strikes(self, fault: str) -> bool:
+        rate: float = getattr(self.faults, fault)
+        strikes = rate > 0 and self._random.random() < rate
+        self.struck[fault] += strikes
+        return strikes
+
+    def _damaged(self, frame: bytes) -> bytes:
+        """With one damage at most, which every checksum shows."""
+        for fault, damage in DAMAGES.items():
+            if self._strikes(fault):
+                return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
+        return frame
+
+    # ---- from the client to the drives ----
+
+    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
+        if self._strikes("hang_up"):
+            self._hang_up(now)
+            return
+        character = next(
+            (it.receiver.character for it in self._ears if it.settings.baudrate == baudrate),
+            self._ears[0].receiver.character,
+        )
+        if self._strikes("noise"):
+            self._make_noise(now, character)
+        if self._strikes("echo"):
+            self._beside.append(Transmission(chunk, now, character))
+        super().receive(self._damaged(chunk), now, baudrate)
+
+    def _deliver(self, ears: Ears, frames: Sequence[Frame]) -> None:
+        if not frames:
+            return
+        before = self._running()
+        super()._deliver(ears, frames)
+        if self._running() - before and self._strikes("start_noise"):
+            self._make_noise(frames[-1].end, ears.receiver.character)
+
+    def _running(self) -> set[SimulatedDrive]:
+        return {it for it in self.drives if isinstance(it, PoweredDrive) and it.motor.energised}
+
+    def _make_noise(self, begin: float, character: float) -> None:
+        """On both ends of the line."""
+        noise = self._random.randbytes(self._random.randint(1, self.faults.burst))
+        self._beside.append(Transmission(noise, begin, character))
+        for ears in self._ears:
+            super()._deliver(ears, ears.receiver.feed(noise, begin))
+
+    # ---- from the drives to the client ----
+
+    def _send(self, data: bytes, begin: float, character: float) -> None:
+        data = self._damaged(data)
+        if self._held:
+            data = self._held.data + data
+            self._held = None
+        elif self._strikes("merge"):
+            self._held = Transmission(data, begin + self._up_to(self.faults.late), character)
+            return
+        elif self._strikes("delay"):
+            begin += self._up_to(self.faults.late)
+        if self._strikes("twice"):
+            data += data
+        if len(data) > 1 and self._strikes("split"):
+            at = self._random.randrange(1, len(data))
+            super()._send(data[:at], begin, character)
+            begin += at * character + self._up_to(self.faults.pause)
+            data = data[at:]
+        super()._send(data, begin, character)
+
+    def _up_to(self, most: float) -> float:
+        return self._random.uniform(0.0, most)
+
+    def advance(self, now: float) -> bytes:
+        if self._held and now >= self._held.begin:
+            held, self._held = self._held, None
+            super()._send(held.data, held.begin, held.character)
+        heard = super().advance(now) + b"".join(it.take(now) for it in self._beside)
+        self._beside = [it for it in self._beside if it.end > now]
+        if self._back_at is None:
+            return heard
+        if now >= self._back_at:
+            self._come_back()
+        return b""  # nobody listens
+
+    @property
+    def wake(self) -> float | None:
+        times = [super().wake, self._back_at, *(it.next_at for it in self._beside)]
+        if self._held:
+            times.append(self._held.begin)
+        return min((at for at in times if at is not None), default=None)
+
+    # ---- its port ----
+
+    def _hang_up(self, now: float) -> None:
+        self.where = self.path  # a TCP port keeps its number
+        self._name = os.path.realpath(self.path)  # not that of its link
+        self.close()
+        self._back_at = now + self._up_to(self.faults.away)
+
+    def _come_back(self) -> None:
+        self._back_at = None
+        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # else it may be free again
+        try:
+            self.open()
+        finally:
+            for fd in taken:
+                os.close(fd)
+
+
+def _ptys_up_to(name: str) -> list[int]:
+    """Ptys that stand in the way, until none made now has this name: the lowest free number is given."""
+    taken: list[int] = []
+    while name.startswith("/dev/pts/"):
+        taken += os.openpty()
+        if int(Path(os.ttyname(taken[-1])).name) >= int(Path(name).name):
+            break
+    return taken

@@ -1,0 +1,204 @@
+"""How well a line and its drives did: what became of exchanges, response delays, utilisation. Pure.
+
+All of it is derived from numbers that only grow, so that the figures of any span of time are the
+difference of two looks, and taking one costs the line nothing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from operator import add, sub
+
+from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, Counters, Result, delay_edge, status_text
+
+# Bytes came instead of the reply, and no good frame among them.
+_DAMAGED = (Result.BAD_CHECKSUM, Result.BAD_CHARACTER, Result.CUT_SHORT, Result.NO_START)
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """The eight counters of the MODBUS serial-line guide (V1.02, appendix A), from the client's side.
+
+    The guide has a drive count what it hears; here the client counts what it sends to and hears from
+    a drive, or all drives of a line.
+    """
+
+    bus_messages: int
+    """Good frames that were heard: replies, also exceptions and late ones, and confirmations of
+    another write. Frames of other addresses are not known to be whole, and are not counted."""
+
+    bus_communication_errors: int
+    """Exchanges that ended in damage: a bad checksum or character, a reply cut short, no frame at all.
+    Parity and framing errors show as such damage. Noise that begins like a frame of another address
+    cannot be told from one, and is not counted."""
+
+    bus_exception_errors: int
+    """Exception replies. What a drive finds wrong with a broadcast is never told."""
+
+    server_messages: int
+    """Requests that left, broadcasts too (which count for the drive whose register was written).
+    Whether the drive heard them is not known."""
+
+    server_no_responses: int
+    """Broadcasts, and requests to which nothing came within the time-out."""
+
+    server_naks: int
+    """Exception replies with code 07, negative acknowledge."""
+
+    server_busies: int
+    """Exception replies with code 06, busy."""
+
+    bus_character_overruns: int | None
+    """Characters, not messages, that the port lost because they came too fast. Of a line only, and
+    None where the driver does not count them, as on pseudo-terminals and the network. What a drive
+    loses it alone knows."""
+
+
+@dataclass(frozen=True)
+class Delays:
+    """Response delays in s, from a request's last bit to its reply's first.
+
+    Quantiles are within a part in 16 of the truth, above 0.07 ms and below 4 s.
+    """
+
+    replies: int
+    p50: float
+    p90: float
+    p99: float
+    longest: float
+    """Exact since the beginning; of a later span within a part in 8, unless it is the longest ever."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What became of the exchanges with one drive, or with all drives of a line, in so many seconds."""
+
+    seconds: float
+    counters: Counters
+    overruns: int | None = None
+
+    @property
+    def exchanges(self) -> int:
+        """Requests that left, whatever became of them."""
+        return self.counters.sent
+
+    @property
+    def exchanges_per_second(self) -> float:
+        return self.exchanges / self.seconds
+
+    @property
+    def samples(self) -> int:
+        return self.counters.values
+
+    @property
+    def misses(self) -> Counter[str]:
+        """Values that are missing, by the reason that stands in their rows."""
+        found = Counter({status_text(-result): n for result, n in self.counters.missed.items()})
+        found.update({status_text(EXCEPTION_STATUS + code): n for code, n in self.counters.refused.items()})
+        return found
+
+    @property
+    def late_replies(self) -> int:
+        """Replies that came after their time-out, and were recognised."""
+        return self.counters.late
+
+    @property
+    def timeout(self) -> float:
+        """How long a reply is waited for at present, in s; of a line, the longest.
+
+        It follows a drive's own response delay, and grows where answers come late again and again.
+        """
+        return self.counters.timeout_ns / 1e9
+
+    @property
+    def skipped_bytes(self) -> int:
+        """Bytes that were no part of a reply: noise, late replies, an adapter's echo."""
+        return self.counters.stray_bytes
+
+    @property
+    def utilisation(self) -> float:
+        """The time that the answered exchanges had to take of the line, as a part of all time.
+
+        Silence, request, response delay and reply, at the line's settings. A port that is faster than its
+        settings, such as a network's or a pseudo-terminal, needs no more than it took: never more than 1.
+        """
+        return self.counters.ideal_ns / 1e9 / self.seconds
+
+    @property
+    def delays(self) -> Delays:
+        counters = self.counters
+        p50, p90, p99 = (_quantile(counters, part) for part in (0.5, 0.9, 0.99))
+        return Delays(counters.delays.total(), p50, p90, p99, counters.longest_ns / 1e9)
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        counters = self.counters
+        return Diagnostics(
+            bus_messages=counters.answered + counters.late + counters.ended[Result.BAD_ECHO],
+            bus_communication_errors=sum(counters.ended[why] for why in _DAMAGED),
+            bus_exception_errors=counters.exceptions,
+            server_messages=counters.sent,
+            server_no_responses=counters.ended[Result.INCOMPLETE] + counters.ended[Result.NO_REPLY],
+            server_naks=counters.naks,
+            server_busies=counters.busies,
+            bus_character_overruns=self.overruns,
+        )
+
+
+@dataclass(frozen=True)
+class LineStatistics(Statistics):
+    """Those of a line, and of each drive on it by name."""
+
+    drives: Mapping[str, Statistics] = field(default_factory=dict)
+
+    def since(self, earlier: LineStatistics) -> LineStatistics:
+        """Of the time between: `earlier` is an earlier look at the same line."""
+        seconds = max(self.seconds - earlier.seconds, 1e-9)
+        lost = None
+        if self.overruns is not None and earlier.overruns is not None:
+            lost = self.overruns - earlier.overruns
+        counters_by_drive = {
+            name: _difference(
+                it.counters, earlier.drives[name].counters if name in earlier.drives else Counters()
+            )
+            for name, it in self.drives.items()
+        }
+        return look(seconds, counters_by_drive, lost)
+
+
+def look(seconds: float, counters_by_drive: Mapping[str, Counters], overruns: int | None) -> LineStatistics:
+    """What drives' numbers say, by their names, after so many seconds."""
+    drives = {name: Statistics(seconds, counters) for name, counters in counters_by_drive.items()}
+    return LineStatistics(seconds, _together(counters_by_drive.values()), overruns, drives)
+
+
+def _together(counters_by_drive: Iterable[Counters]) -> Counters:
+    found = Counters()
+    for counters in counters_by_drive:
+        longest = max(found.longest_ns, counters.longest_ns)
+        timeout = max(found.timeout_ns, counters.timeout_ns)
+        found = Counters._make(map(add, found, counters))._replace(longest_ns=longest, timeout_ns=timeout)
+    return found
+
+
+def _difference(now: Counters, earlier: Counters) -> Counters:
+    found = Counters._make(map(sub, now, earlier))
+    longest = now.longest_ns
+    if longest == earlier.longest_ns:  # it may have been before
+        longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
+    return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
+
+
+def _quantile(counters: Counters, part: float) -> float:
+    """The middle of the bucket in which it lies."""
+    wanted = part * counters.delays.total()
+    seen = 0
+    for bucket, count in sorted(counters.delays.items()):
+        seen += count
+        if seen >= wanted:
+            least = delay_edge(bucket)
+            most = counters.longest_ns if bucket == DELAY_BUCKETS - 1 else delay_edge(bucket + 1)
+            return min((least + most) / 2, counters.longest_ns) / 1e9
+    return 0.0

@@ -1,0 +1,36 @@
+"""A descriptor that becomes readable when it is set."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+
+
+class Wake:
+    """A descriptor that becomes readable when it is set: for select, poll or an asyncio loop."""
+
+    def __init__(self) -> None:
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._reader, False)
+        os.set_blocking(self._writer, False)
+        self._closed = False
+
+    def fileno(self) -> int:
+        return self._reader
+
+    def set(self) -> None:
+        if not self._closed:
+            with suppress(BlockingIOError):
+                os.write(self._writer, b"\0")
+
+    def clear(self) -> None:
+        if not self._closed:
+            with suppress(BlockingIOError):
+                while os.read(self._reader, 64):
+                    pass
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            os.close(self._reader)
+            os.close(self._writer)

@@ -1,0 +1,39 @@
+/* How far UTC is ahead is asked for again and again, on clocks that are the test's own. */
+#include "multidrop.h"
+
+#include <assert.h>
+#include <stddef.h>
+
+static int64_t ahead_ns;
+
+int64_t md_now_ns(void)
+{
+    return 0;
+}
+
+int64_t md_utc_minus_monotonic_ns(void)
+{
+    return ahead_ns;
+}
+
+int main(void)
+{
+    enum { ROWS = 100 };
+    const int64_t every_ns = 10000000;
+    struct md_field field = {.multiplier = 1, .divisor = 1};
+    struct md_block block = {.fields = &field, .count = 1};
+    struct md_row_queue *row_queue = md_row_queue_new(ROWS, 1);
+    assert(row_queue);
+    for (int64_t n = 0; n < ROWS; n++) {
+        ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* somebody sets the time of day */
+        md_row_queue_add(row_queue, &block, &(struct md_completion){.result = MD_NO_REPLY, .begun_ns = (n + 1) * every_ns});
+    }
+    struct md_columns *columns = md_row_queue_take(row_queue);
+    assert(columns && columns->rows == ROWS);
+    assert(columns->time[ROWS / 2 - 1] - columns->sent[ROWS / 2 - 1] == 1000);
+    assert(columns->time[ROWS / 2 + 10] - columns->sent[ROWS / 2 + 10] == 7000); /* within a tenth of a second */
+    assert(columns->time[ROWS - 1] - columns->sent[ROWS - 1] == 7000);
+    md_row_queue_give_back(row_queue, columns);
+    md_row_queue_free(row_queue);
+    return 0;
+}

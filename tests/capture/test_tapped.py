@@ -1,0 +1,461 @@
+"""Lines that are polled, tapped: what a capture of them says is what was recorded, value for value."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from line_driver import MS, LineDriver
+from lines import PATIENCE, Faulty, LateWire, line, plant, polled, rows_of, served
+from test_capture import decimal, tshark
+from test_cli import Run, run
+from test_cli_poll import recorded
+from test_mixed_line import LATEST, fast_drives, real_drives, real_wires
+
+from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped
+from multidrop.capture import flight_recorder as flight
+from multidrop.capture.anomalies import Watch
+from multidrop.capture.pcapng_writer import WRAPPINGS
+from multidrop.cli.poll.tapping import tapping_text
+from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Result, Splitter, Tap
+from multidrop.drives import InnovertIBD
+from multidrop.plant.model import PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.recording import RecordingError
+from multidrop.sim import EncodedDrive, Simulator, Wire
+
+__all__ = ["run"]  # a fixture
+
+FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 5, "reply cut short": 5})
+NEVER_ON_THE_LINE = {str(it) for it in (Result.NOT_ASKED, Result.LATE_ANSWER_DUE, Result.EXPIRED)}
+
+
+class RoughWire(LateWire):
+    """Noise comes before replies and behind them; they are damaged, cut, lost, doubled, or late."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__([EncodedDrive(drive) for drive in fast_drives()], unpaced=True)
+        self.chance = random.Random(seed)
+
+    def distort(self, reply: bytes) -> bytes:
+        noise = self.chance.randbytes(self.chance.randint(1, 40))
+        at = self.chance.randrange(len(reply))
+        damaged = reply[:at] + bytes([reply[at] ^ 0x20]) + reply[at + 1 :]
+        fates = [reply, noise + reply, reply + noise, damaged, reply[:at], b"", reply + reply, noise]
+        fate = self.chance.choices(fates, [70, 8, 5, 5, 3, 3, 3, 3])[0]
+        if self.chance.random() < 0.05:
+            return self.hold_up(fate, self.chance.uniform(0, LATEST))
+        return fate
+
+
+class EchoingWire(RoughWire):
+    """And behind an adapter that echoes what it sends."""
+
+    _echo = b""
+
+    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
+        self._echo += chunk
+        super().receive(chunk, now, baudrate)
+
+    def advance(self, now: float) -> bytes:
+        echo, self._echo = self._echo, b""
+        return echo + super().advance(now)
+
+    @property
+    def wake(self) -> float | None:
+        return self._now if self._echo else super().wake
+
+
+def rough_wires() -> list[Wire]:
+    return [RoughWire(1)]
+
+
+def echoing_wires() -> list[Wire]:
+    return [EchoingWire(2)]
+
+
+def captured(
+    capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
+) -> tuple[list[Row], list[Row]]:
+    """What a poll has recorded when it has so many rows of each status, and what its capture says."""
+    with served(make) as (path,):
+        known = plant(line(path, *drives, name="hall-1"))
+        poller = Poller(known)
+        rows = []
+        with CaptureWriter(capture, list(poller.buses)) as writer:
+            with Tapped(poller.buses, writer) as tapped, poller:
+                for batch in poller.batches(2 * PATIENCE, every=0.05):
+                    rows += list(batch)
+                    tapped.collect()
+                    if Counter(row.status for row in rows) >= enough:
+                        break
+            rows += rows_of(poller)
+            assert tapped.lost == 0
+    with Capture(capture) as found:
+        decoded = [row for batch in Decoding(found, known) for row in batch]
+        assert found.torn == 0
+    return rows, decoded
+
+
+def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
+    """What is in rows but for the clock that captures do not have, by the time of the request."""
+    found: dict[int, list[tuple[object, ...]]] = {}
+    for row in rows:
+        if row.status not in NEVER_ON_THE_LINE:
+            what = (row.drive, row.register, row.value, row.status, row.uncertainty_ns)
+            found.setdefault(row.time, []).append(what)
+    return {time: sorted(found[time], key=str) for time in found}
+
+
+IN_DOUBT_NS = 100_000_000  # no reply was waited for so long
+
+
+def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
+    """Without values that may answer an earlier question: the time of that is theirs."""
+    return by_exchange([row for row in rows if (row.uncertainty_ns or 0) < IN_DOUBT_NS])
+
+
+def check(rows: list[Row], decoded: list[Row]) -> None:
+    """The same exchanges, but for the last one: it may have been under way when the poll ended.
+
+    A question that only tells whether the adapter echoes, or whether late answers still come, is in the
+    capture alone, and so is what was asked again because of them.
+    """
+    recorded = list(by_time(rows).items())
+    read = by_exchange(decoded)
+    assert [time for time, _ in recorded[:-1] if time not in read] == []
+    assert recorded[:-1] == [(time, read[time]) for time, _ in recorded[:-1]]
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A poll of all variants at the pace of a real line."""
+
+    drives: list[PolledDrive]
+    capture: Path
+    rows: list[Row]
+    decoded: list[Row]
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
+    capture = tmp_path_factory.mktemp("mixed") / "a.pcapng"
+    drives = [polled(drive, drive.readings()[:4]) for drive in real_drives()]
+    return Mixed(drives, capture, *captured(capture, real_wires, drives, Counter(ok=100)))
+
+
+def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
+    check(mixed.rows, mixed.decoded)
+    samples = {row.drive for row in mixed.decoded if row.value is not None}
+    assert samples == {it.drive.name for it in mixed.drives}
+
+
+def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
+    """Each value of an RTU drive: who was asked for what and when, and the registers in the reply."""
+    packets = tshark(mixed.capture)
+    by_time = {it["frame.time_epoch"]: (number, it) for number, it in enumerate(packets, 1)}
+    replies = {it["modbus.request_frame"]: it for it in packets if it["modbus.request_frame"]}
+    drives = {it.drive.name: it.drive for it in mixed.drives}
+    checked = set()
+    for row in mixed.rows:
+        drive = drives[row.drive]
+        register = drive.registers[row.register]
+        if (row.uncertainty_ns or 0) >= IN_DOUBT_NS:
+            continue
+        if (
+            row.value is None
+            or drive.framing is not Framing.RTU
+            or register.number_format is not NumberFormat.U16
+        ):
+            continue
+        number, asked = by_time[epoch(row.time)]
+        answered = replies[str(number)]
+        for packet in (asked, answered):
+            assert packet["frame.interface_name"] == "hall-1"
+            assert decimal(packet["mbrtu.unit_id"]) == [drive.address]
+            assert decimal(packet["modbus.func_code"]) == [register.table.read]
+            assert packet["mbrtu.crc16.status"] == "1"
+        assert int(asked["frame.packet_flags_direction"], 0) == 2
+        assert int(answered["frame.packet_flags_direction"], 0) == 1
+        assert answered["frame.time_epoch"] == epoch(row.time + (row.uncertainty_ns or 0))
+        (first,), (count,) = decimal(asked["modbus.reference_num"]), decimal(asked["modbus.word_cnt"])
+        words = decimal(answered["modbus.regval_uint16"])
+        assert len(words) == count
+        assert words[register.address - first] * float(register.scale) == pytest.approx(row.value)
+        checked.add(row.drive)
+    assert len(checked) >= 4
+
+
+def epoch(time_ns: int) -> str:
+    return f"{time_ns // 10**9}.{time_ns % 10**9:09}"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(rough_wires, id="rough"),
+        pytest.param(echoing_wires, id="echoing", marks=pytest.mark.long),
+    ],
+)
+def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(
+    tmp_path: Path, make: Callable[[], list[Wire]]
+) -> None:
+    drives = [polled(drive, drive.readings()) for drive in fast_drives()]
+    rows, decoded = captured(tmp_path / "a.pcapng", make, drives, FATES)
+    check(rows, decoded)
+
+
+def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Path) -> None:
+    frame = bytes.fromhex("01 03 02 13 88 B5 13")
+    with CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as capture:
+        for side in (Side.FAILED, Side.NOISE):
+            capture.write(frame, side, 1, "hall-1")
+    failed, noise = tshark(tmp_path / "a.pcapng")
+    assert (failed["mbrtu.unit_id"], failed["mbrtu.crc16.status"]) == ("1", "0")
+    assert noise["data.data"] == frame.hex()
+
+
+def test_what_is_not_collected_in_time_is_counted() -> None:
+    """Noise that goes on for as long as there is room, and longer."""
+    driver, tap, told = LineDriver(), Tap(), 0
+    peer = Peer(least_timeout=0.02, most_timeout=0.2)
+    driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
+    driver._line.tap = tap.c
+    while not tap.lost:
+        driver.receive(b"\xff" * 4000)
+        told += 4000
+    assert tap.lost == 4000
+    packets = b"".join(tap.take(WRAPPINGS, 0, 0))
+    assert packets.count(b"\xff" * 4000) == told // 4000 - 1
+    assert list(tap.take(WRAPPINGS, 0, 0)) == []
+    assert tapping_text({"untapped_bytes": tap.lost}) == [
+        "4000 bytes were not captured: this machine was too slow"
+    ]
+
+
+def test_a_capture_has_what_comes_behind_a_reply_amid_much_noise() -> None:
+    """More than the line keeps: noise, the reply, and noise again in one piece with that."""
+    driver, tap = LineDriver(), Tap()
+    peer = Peer(least_timeout=0.02, most_timeout=0.2)
+    driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
+    driver._line.tap = tap.c
+    driver.wait_until_write()
+    driver.receive(b"\xff" * 950)
+    driver.receive(GOOD + b"\xfe" * 400)
+    assert driver.completion.raw == GOOD
+    packets = b"".join(tap.take(WRAPPINGS, 0, 0))
+    assert (packets.count(b"\xff"), packets.count(b"\xfe")) == (950, 400)
+
+
+# ---- the flight recorder ----
+
+
+class Flight:
+    """A flight recorder on a clock that the test sets."""
+
+    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch, **details: Any) -> None:
+        self.seconds = 1000.0
+        monkeypatch.setattr(flight, "now_ns", lambda: round(self.seconds * 1e9))
+        monkeypatch.setattr(flight, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
+        self.recorder = FlightRecorder(directory, ["hall-1"], **details)
+
+    def pass_(self, seconds: float, *troubles: str) -> None:
+        """One byte a second on the line, then trouble."""
+        for _ in range(round(seconds)):
+            self.seconds += 1
+            time_ns = round(self.seconds * 1e9)
+            self.recorder.append(WRAPPINGS.packet(0, Side.NOISE, time_ns, bytes([round(self.seconds) % 256])))
+            self.recorder.heed([])
+        self.recorder.heed(list(troubles))
+
+
+def seconds_in(path: Path) -> list[int]:
+    with Capture(path) as capture:
+        splitter = Splitter()
+        return [
+            span.time_ns // 10**9
+            for _ in capture
+            for heard in capture.streams
+            for span in splitter.spans(heard)
+        ]
+
+
+def test_the_last_minutes_and_what_follows_are_written_when_something_goes_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    it = Flight(tmp_path / "flights", monkeypatch, seconds=20)
+    it.pass_(50)
+    assert it.recorder.written == []
+    it.pass_(0, "hall-1: pump-1: bad checksum", "hall-1: pump-1: bad checksum", "hall-1: pump-2: fell silent")
+    it.pass_(10)
+    (path,) = it.recorder.written
+    assert path == tmp_path / "flights" / "flight-20231114T223052Z.pcapng"
+    assert seconds_in(path) == list(range(1032, 1053))
+    assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
+
+
+def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    it = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
+    (tmp_path / "flight-plan.pcapng").touch()  # somebody's own
+    for _ in range(600):
+        it.pass_(1, "hall-1: pump-1: bad checksum")
+    assert len(it.recorder.written) == 10
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "flight-plan.pcapng", *it.recorder.written[-3:]])
+
+
+def test_no_more_is_kept_in_memory_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    it = Flight(tmp_path, monkeypatch, most_bytes=1000)
+    it.pass_(200, "hall-1: the port was lost")
+    it.recorder.close()
+    (path,) = it.recorder.written
+    assert 800 < path.stat().st_size < 1300
+    seconds = seconds_in(path)
+    assert seconds == list(range(seconds[0], 1201))
+
+
+def test_trouble_that_is_not_written_yet_is_written_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    it = Flight(tmp_path, monkeypatch)
+    it.pass_(3)
+    it.recorder.close()
+    assert it.recorder.written == []
+    it.pass_(3, "hall-1: the port was lost")
+    it.recorder.close()
+    assert [seconds_in(path) for path in it.recorder.written] == [list(range(1001, 1007))]
+
+
+def test_a_directory_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(RecordingError, match="cannot be written"):
+        FlightRecorder(tmp_path / "file" / "flights", [])
+
+
+# ---- what counts as trouble ----
+
+
+ASK = Message(1, 3, 2, 1)
+GOOD = bytes.fromhex("01 03 02 13 88 B5 12")  # Delixi, part 2
+
+
+class Watched:
+    """A drive on a line that is driven at a time that the test sets, and the watch over it."""
+
+    def __init__(self) -> None:
+        self.line = LineDriver()
+        peer = Peer(least_timeout=0.02, most_timeout=0.2)
+        self._exchange = Exchange(
+            Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3
+        )
+        self.port: Any = SimpleNamespace(lost=False)
+        pump: Any = SimpleNamespace(name="pump-1")
+        bus: Any = SimpleNamespace(line=self, drives=[pump], peer=lambda drive: peer)
+        self.watch = Watch("hall-1", bus)
+
+    @property
+    def queue(self) -> Any:
+        return self.port
+
+    def told(self, reply: bytes) -> list[str]:
+        """Of one exchange, after any answer that might still come late."""
+        self.line.now += 1000 * MS
+        self.line.begin(self._exchange)
+        self.line.wait_until_write()
+        self.line.now += 20 * MS
+        self.line.receive(reply)
+        self.line.wait_until_done()
+        return list(self.watch.look())
+
+
+def test_damaged_and_late_replies_are_trouble() -> None:
+    pump = Watched()
+    assert pump.told(GOOD) == []
+    assert pump.told(GOOD[:-1]) == ["hall-1: pump-1: reply cut short"]
+    assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
+    assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
+    assert pump.told(bytes.fromhex("01 83 03 01 31")) == []  # it only refuses
+    assert list(pump.watch.look()) == []
+    assert pump.told(b"") == []
+    pump.line.receive(GOOD)
+    assert pump.told(GOOD) == ["hall-1: pump-1: late reply"]
+
+
+def test_a_drive_that_falls_silent_is_trouble_once() -> None:
+    pump = Watched()
+    assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # it was never there
+    assert pump.told(GOOD) == []
+    assert [pump.told(b"") for _ in range(5)] == [[], [], ["hall-1: pump-1: fell silent"], [], []]
+    assert pump.told(GOOD) == []
+
+
+def test_a_lost_port_is_trouble_once() -> None:
+    pump = Watched()
+    open_port = pump.port
+    for lost in (SimpleNamespace(lost=True), None):
+        pump.port = lost
+        assert list(pump.watch.look()) == ["hall-1: the port was lost"]
+        assert list(pump.watch.look()) == []
+        pump.port = open_port
+        assert list(pump.watch.look()) == []
+
+
+# ---- on the command line ----
+
+
+def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None:
+    capture = tmp_path / "a.pcapng"
+    words = ["poll", mixed_plant, "--seconds", 1, "--capture", capture]
+    status, out, err = run(*words, "--out", tmp_path / "polled.csv")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[-1] == f"captured in {capture}"
+    assert run("decode", capture, "--plant", mixed_plant, "--out", tmp_path / "decoded.csv")[0] == 0
+    check(recorded(tmp_path / "polled.csv"), recorded(tmp_path / "decoded.csv"))
+    assert run(*words) == (
+        2,
+        "",
+        f"multidrop: {capture} is there already: name another file, or remove it first\n",
+    )
+    assert run("poll", mixed_plant, "--flight-recorder", capture)[::2] == (
+        2,
+        f"multidrop: {capture} is a file: name a directory for the flight recorder\n",
+    )
+    assert run("poll", mixed_plant, "--capture", "a.csv")[::2] == (
+        2,
+        "multidrop: a.csv: a capture's name ends in .pcapng\n",
+    )
+
+
+def test_a_flight_is_written_when_a_drive_s_replies_are_damaged(
+    tmp_path: Path, run: Run, mixed_plant: Path, wire: Faulty
+) -> None:
+    wire.fate = lambda reply: reply[:-1] + bytes([reply[-1] ^ 1])
+    flights = tmp_path / "flights"
+    status, out, _ = run("poll", mixed_plant, "--seconds", 1, "--flight-recorder", flights, "--json")
+    assert status == 1
+    (path,) = json.loads(out)["flight_recordings"]
+    assert [Path(path)] == list(flights.iterdir())
+    assert b"hall-1: pump-1: bad checksum" in Path(path).read_bytes()[:300]
+    assert "unknown: 01 03" in run("decode", path)[1]
+
+
+@pytest.fixture
+def wire() -> Iterator[Faulty]:
+    it = Faulty([EncodedDrive(InnovertIBD(1))], lambda reply: reply, unpaced=True)
+    with Simulator([it]):
+        yield it
+
+
+@pytest.fixture
+def mixed_plant(tmp_path: Path, wire: Faulty) -> Path:
+    path = tmp_path / "plant.toml"
+    drive = 'name = "pump-1"\nmodel = "innovert-ibd"\naddress = 1\n'
+    path.write_text(f'[[line]]\nname = "hall-1"\nport = "{wire.path}"\n[[line.drive]]\n{drive}')
+    return path

@@ -1,0 +1,468 @@
+"""The command line as a whole: help, statuses, sentences; and `models`."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from multidrop.cli import COMMANDS, main
+from multidrop.cli.support.advice import typed
+from multidrop.cli.support.signals import Interruption
+from multidrop.drives import MODELS
+from multidrop.drives.registry import find_model
+
+TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
+find_model(TOY)  # is told when its file is run, which is once a process
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Status, output and errors of a command."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        status = main([str(word) for word in words])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def test_help_lists_every_command(run: Run) -> None:
+    status, out, err = run("--help")
+    assert (status, err) == (0, "")
+    assert all(f"\n  {name} " in out for name in COMMANDS)
+
+
+def test_no_command_is_a_mistake_that_gets_the_help(run: Run) -> None:
+    assert run()[0] == 2
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_within_80_columns(
+    run: Run, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    status, out, err = run(name, "--help")
+    assert (status, err) == (0, "")
+    assert out.startswith(f"usage: multidrop {name} ")
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_help_imports_no_command_and_nothing_heavy() -> None:
+    code = (
+        "import sys; before = {*sys.modules}; from multidrop.cli import main; main(['--help']); "
+        "print(*({*sys.modules} - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not loaded & {
+        "multidrop.core",
+        "multidrop.drive.family",
+        "serial",
+        "nanoarrow",
+        "numpy",
+        "pyarrow",
+        "tomllib",
+    }
+    assert not {name for name in loaded if name.startswith("multidrop.cli.")}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["raed"], "there is no command 'raed'; did you mean read?"),
+        (["zzz"], "there is no command 'zzz'; see `multidrop --help`"),
+        (
+            ["read", "/dev/ttyX"],
+            "the following arguments are required: MODEL, ADDRESS; see `multidrop read --help`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "one"],
+            "argument ADDRESS: 'one' is not a number such as 1; see `multidrop read --help`",
+        ),
+        (["read", "/dev/ttyX", TOY, "99"], "address 99 is not one of TOY T1: 1 to 31"),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "output_curent"],
+            "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "control"],
+            f"control can only be written; see `multidrop models {TOY}`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--baudrate", "38400"],
+            "baud rate 38400 is not one of TOY T1: 9600, 19200",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--option", "rated"],
+            "argument --option: 'rated' is not NAME=VALUE with a number as its value; "
+            "see `multidrop read --help`",
+        ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--option", "rated-frequency=5"],
+            "rated_frequency = 5.0 is outside 10 to 400 Hz",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "frequency", "fast"],
+            "frequency takes a number in Hz, not 'fast'",
+        ),
+        (["write", "/dev/ttyX", TOY, "1", "frequency", "60"], "frequency = 60 is outside 0 to 50 Hz"),
+        (["write", "/dev/ttyX", TOY, "1", "frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
+        (["start", "/dev/ttyX", TOY, "1", "--frequency", "60"], "frequency = 60 is outside 0 to 50 Hz"),
+        (["start", "/dev/ttyX", TOY, "1", "--frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
+        (
+            ["write", "/dev/ttyX", "yd1000", "1", "meter_selection", "0.5"],
+            "meter_selection takes a whole number, not 0.5",
+        ),
+        (
+            ["read", "sockt://10.0.0.7:4001", TOY, "1"],
+            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as socket://10.0.0.7:4001 or "
+            "rfc2217://10.0.0.7:4001",
+        ),
+        (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
+        (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
+        (
+            ["models", "innovert-ibt"],
+            "there is no model 'innovert-ibt'; did you mean innovert-ibd? (or write path/to/file.py:Class)",
+        ),
+    ],
+)
+def test_a_mistake_is_a_sentence_and_status_2(run: Run, words: list[str], sentence: str) -> None:
+    assert run(*words) == (2, "", f"multidrop: {sentence}\n")
+
+
+def test_its_version_is_the_package_s(run: Run) -> None:
+    assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
+
+
+@pytest.mark.parametrize("seconds", ["ten", "0", "-1", "nan", "inf"])
+def test_what_is_no_time_to_poll_for_is_a_sentence(run: Run, seconds: str) -> None:
+    status, out, err = run("poll", "plant.toml", f"--seconds={seconds}")
+    assert (status, out) == (2, "")
+    assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
+
+
+def test_a_report_is_a_page_by_its_name(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").touch()
+    status, _, err = run("report", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
+    assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name ends in .html\n")
+
+
+def test_a_line_that_no_link_can_be_named_after_is_not_simulated(run: Run, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
+    )
+    status, _, err = run("simulate", plant, "--ports", tmp_path / "ports")
+    assert (status, err) == (
+        2,
+        "multidrop: line 'hall/1' has a / in its name, which the link to its port cannot have\n",
+    )
+
+
+def test_a_file_is_no_directory_of_ports(run: Run, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        '[[line]]\nname = "a"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
+    )
+    assert run("simulate", plant, "--ports", plant) == (
+        2,
+        "",
+        f"multidrop: {plant} is a file: name a directory with --ports, which is made if need be\n",
+    )
+
+
+def test_a_ledger_that_is_named_must_be_there(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    sentence = f"there is no ledger {tmp_path}/none; without --ledger it is /state/multidrop/wear.sqlite"
+    assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
+
+
+def test_a_sheet_says_where_a_register_is_written_without_wear(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from multidrop.drives.invt_che import InvtCHE, parameter\n\n\n"
+        'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
+        '    ramp = parameter(11, "s", step=0.1, span=(0, 3600))\n'
+    )
+    status, out, _ = run("models", f"{tmp_path / 'mine.py'}:Mine")
+    assert status == 0
+    assert "        kept: EEPROM; written at 800BH, in RAM" in out
+
+
+def test_a_sheet_says_what_its_class_says_of_moving_the_motor(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "moved.py").write_text(
+        "from multidrop import Drive, command, setting\n\n\n"
+        'class Moved(Drive):\n    """Moved."""\n\n'
+        "    speed = command(1, moves=False)\n    jog_bit = setting(2, moves=True)\n    unsaid = command(3)\n"
+    )
+    family = f"{tmp_path / 'moved.py'}:Moved"
+    _, out, _ = run("models", family)
+    _, _, registers = out.partition("holding registers")
+    remarks = [line.strip() for line in registers.splitlines() if line.startswith(" " * 8)]
+    assert remarks == ["a write moves nothing", "kept: not stated; a write may move the motor"]
+    _, out, _ = run("models", family, "--json")
+    told = {register["name"]: register["moves"] for register in json.loads(out)["registers"]}
+    assert told == {"speed": False, "jog_bit": True, "unsaid": None}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["write", "/dev/ttyX", TOY, "1", "output_current", "1"],
+            "output_current of toy@1 is not written: it is a reading",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "sealed", "1"],
+            "sealed of toy@1 is not written: it is the maker's",
+        ),
+        (
+            ["write", "/dev/ttyX", TOY, "1", "frequency", "5"],
+            "Write frequency = 5.00 Hz to toy@1 on /dev/ttyX? There is no terminal to ask on: "
+            "add --yes if it is meant",
+        ),
+        (
+            ["start", "/dev/ttyX", TOY, "1"],
+            "Start the motor of toy@1 on /dev/ttyX? There is no terminal to ask on: add --yes if it is meant",
+        ),
+    ],
+)
+def test_what_a_rule_forbids_is_a_sentence_and_status_1(run: Run, words: list[str], sentence: str) -> None:
+    assert run(*words) == (1, "", f"multidrop: {sentence}\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (["set-frequency", "/dev/ttyX", "invt-che", "1", "20"], "P0.04: add --option maximum_frequency=HZ"),
+        (
+            ["start", "/dev/ttyX", "innovert-ibd", "1", "--direction", "forward"],
+            "which of bits 2 and 3 turns it forward, and add --option forward_bit=N",
+        ),
+        (
+            ["write", "/dev/ttyX", "yd1000", "1", "control", "run"],
+            "use `multidrop start`, `multidrop stop`, `multidrop jog`, `multidrop reset-fault` (manual",
+        ),
+    ],
+)
+def test_what_a_rule_forbids_comes_with_what_is_to_be_typed(run: Run, words: list[str], advice: str) -> None:
+    status, out, err = run(*words)
+    assert (status, out) == (1, "")
+    assert advice in err
+
+
+@pytest.mark.parametrize(
+    ("sentence", "command"),
+    [
+        ("see to it, then call reset_fault()", "see to it, then run `multidrop reset-fault`"),
+        (
+            "then call reset_fault(), or declare acknowledged_fault = 64",
+            "then run `multidrop reset-fault` and add --option acknowledged_fault=64",
+        ),
+        ('declare ram = ["frequency"]', "add --ram frequency"),
+        ("and declare confirmed = 1 if it is an IBD", "and add --option confirmed=1 if it is an IBD"),
+        ("its setpoint is 0: call set_frequency before start", "its setpoint is 0: add --frequency HZ"),
+        ("use emergency_stop()", "use `multidrop emergency-stop`"),
+        ("it is a reading", "it is a reading"),
+    ],
+)
+def test_advice_for_a_program_becomes_a_command_s(sentence: str, command: str) -> None:
+    assert typed(sentence) == command
+
+
+@pytest.mark.parametrize(
+    ("port", "sentence"),
+    [
+        ("/dev/no-such-port", "/dev/no-such-port: there is no such port"),
+        ("/dev/null", "/dev/null: it is not a serial port"),
+    ],
+)
+def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sentence: str) -> None:
+    assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
+
+
+# ---- models ----
+
+
+def test_models_lists_the_families(run: Run) -> None:
+    status, out, _ = run("models")
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()[1:-2]] == list(MODELS)
+    _, out, _ = run("models", "--json")
+    assert [family["model"] for family in json.loads(out)] == list(MODELS)
+
+
+def test_a_family_s_sheet_has_every_fact(run: Run) -> None:
+    _, out, _ = run("models", TOY)
+    for line in (
+        "addresses       1-31",
+        "baud rates      9600, 19200 (the first is the default)",
+        "rtu formats     8N1, 8E1, 8O1, 8N2",
+        "rtu silence     3.5 characters, above 19200 bit/s 1.75 ms, before and after a",
+        "ascii silence   none",
+        "verbs           start, stop, set-frequency, state",
+        "  02H  illegal address",
+        "  rated_frequency  rated frequency of the motor (10 to 400 Hz)",
+        "holding registers (read 03H, 10 at most; write 06H)",
+        "  0003H  mystery            reading  scale not stated",
+        "        the manual gives no scale",
+        "  000AH  acceleration_time  setting  0.1 s             0.1 to 600",
+        "        kept: EEPROM; only while stopped",
+        "        kept: not stated; never written: it is the maker's",
+        "        0 NONE, 1 OVERCURRENT",
+        "- the scale of `mystery`.",
+    ):
+        assert any(shown.startswith(line) for shown in out.splitlines()), f"{line!r} is not in\n{out}"
+
+
+def test_a_family_s_json_has_every_register(run: Run) -> None:
+    _, out, _ = run("models", TOY, "--json")
+    sheet = json.loads(out)
+    by_name = {register["name"]: register for register in sheet["registers"]}
+    assert len(by_name) == sheet["register_count"] == 9
+    assert by_name["acceleration_time"]["span"] == [0.1, 600]
+    assert by_name["fault"]["values"] == {"NONE": 0, "OVERCURRENT": 1}
+    assert by_name["mystery"]["step"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "facts"),
+    [
+        (
+            "erman-er-g-220",
+            [
+                "b.010 address (1 from the factory), set while the motor stands",
+                "remote b.001 must be 2 and b.002 5 (RS-485)",
+                "broadcast the manual calls address 0 one, and does not say that nobody answers: none",
+                "coils (read 01H, 12 at most; write 05H)",
+                "verbs alone write it, but for ON",
+                "(0 to 4294967295)",
+            ],
+        ),
+        (
+            "invt-che",
+            [
+                "PC.00 address (1 from the factory), PC.01 baud rate",
+                "PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2",
+                "remote P0.01 must be 2",
+                "verbs alone write it, but for STOP, COAST, STOP_JOG",
+            ],
+        ),
+        (
+            "innovert-ibd",
+            [
+                "rtu silence 10 ms before and after",
+                "ascii silence none",
+                "PrH.02 address",
+                "remote set Prb.01",
+            ],
+        ),
+        ("delixi-modbus", ["P04.30 address", "P00.00 must be 2 (RS-485), and P00.01 1", "0 ASCII_7N2"]),
+        ("delixi-native", ["delixi formats 8N1", "delixi silence none", "P00.00 must be 2", "0 N81, 1 E81"]),
+        (
+            "yd1000",
+            [
+                "24 characters (27.5 ms at 9600 bit/s) until measured; none after 500 ms",
+                "F802 address",
+                "at least minimum_frequency; at most maximum_frequency",
+                "but for COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
+                "never together: RESET and RUN, RESET and JOG",
+                "what it is from the factory is not stated",
+            ],
+        ),
+    ],
+)
+def test_a_sheet_has_what_is_to_be_set_on_the_drive_and_what_bounds_a_value(
+    run: Run, name: str, facts: list[str]
+) -> None:
+    """In a family's own words (section 3 of ERMAN's manual, 4.3 and 6.1 of the YD1000's notes)."""
+    _, out, _ = run("models", name)
+    shown = " ".join(out.split())
+    assert [fact for fact in facts if fact not in shown] == []
+    assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
+
+
+def test_a_family_s_json_has_what_bounds_a_value(run: Run) -> None:
+    _, out, _ = run("models", "yd1000", "--json")
+    sheet = json.loads(out)
+    by_name = {register["name"]: register for register in sheet["registers"]}
+    upper = by_name["upper_limit_frequency"]  # 0.5 to FH
+    assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
+    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # LL to UL
+    limits = {("minimum_frequency", "upper_limit_frequency")}
+    assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
+    assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
+    assert by_name["control"]["never_together"] == [0x2400, 0x2100]
+    assert by_name["acceleration_time"]["harmless"] is None
+    assert sheet["response_delay_s"] == pytest.approx(24 * 11 / 9600)
+    assert sheet["needed_silence_s"]["rtu"] == pytest.approx(24 * 11 / 9600)
+    assert "F802" in sheet["line_parameters"]
+    assert "reset_fault" in sheet["remote"]
+    _, out, _ = run("models", "delixi-native", "--json")
+    assert json.loads(out)["needed_silence_s"] == {"delixi": 0}
+    _, out, _ = run("models", "erman-er-g-220", "--json")
+    assert "address 0" in json.loads(out)["no_broadcasts"]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
+    _, out, _ = run("models", name)
+    too_wide = [line for line in out.splitlines() if len(line) > 80]
+    assert not too_wide
+    assert all(register in out for register in MODELS[name].registers)
+
+
+# ---- signals ----
+
+
+def test_a_thread_that_is_not_the_main_one_can_run_a_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """Signals are the main thread's business."""
+    found: list[int] = []
+    before = signal.getsignal(signal.SIGTERM)
+    thread = threading.Thread(target=lambda: found.append(main(["models", TOY])))
+    thread.start()
+    thread.join()
+    assert found == [0]
+    assert "TOY T1" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
+    with Interruption() as interruption:
+        assert not interruption.came
+        signal.raise_signal(signal.SIGINT)
+        assert interruption.came
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+
+
+# ---- output that cannot be written ----
+
+
+def test_a_full_disk_under_the_output_is_a_sentence() -> None:
+    code = "import sys; from multidrop.cli import main; sys.exit(main(['models', 'yd1000']))"
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "multidrop: No space left on device\n")
+
+
+def test_a_reader_who_has_seen_enough_is_no_failure() -> None:
+    code = "import sys; from multidrop.cli import main; sys.exit(main(['models', 'yd1000']))"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as command:
+        assert command.stdout is not None
+        command.stdout.close()
+        command.stdout = None
+        assert command.communicate()[1] == b""
+    assert command.returncode == 0

@@ -1,0 +1,400 @@
+"""Commands for one drive, carried out on a simulated one."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from lines import Faulty, until
+from motors import Heard
+from test_cli import TOY, Run, run
+from toy import Status, Toy
+
+from multidrop.control import eeprom_ledger as ledger
+from multidrop.core import Message
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import PoweredDrive, simulated
+from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.simulator import Simulator
+from multidrop.sim.wire import Wire
+
+__all__ = ["run"]  # a fixture
+
+DOG = "watchdog: The document names no watchdog: the motor runs on when the client dies."
+
+
+class Stubborn(SimulatedDrive):
+    """Never takes more than 20 s of acceleration, and does not tell its fault."""
+
+    def accept(self, cell: MemoryCell, raw: int) -> int:
+        return min(raw, 200) if cell.name == "acceleration_time" else super().accept(cell, raw)
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start <= 4 < start + count:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().read(function, start, count)
+
+
+@pytest.fixture
+def toy() -> SimulatedDrive:
+    return SimulatedDrive(Toy(1))
+
+
+@pytest.fixture
+def port(toy: SimulatedDrive) -> Iterator[str]:
+    """A line with two drives, at 1 and 2."""
+    toy["output_frequency"] = 49.9
+    toy["output_current"] = 3.25
+    toy["mystery"] = 777
+    toy["status"] = Status.RUNNING
+    toy["acceleration_time"] = 10.0
+    with Simulator([Wire([toy, Stubborn(Toy(2))], unpaced=True)]) as simulator:
+        yield simulator.wires[0].path
+
+
+def test_read_prints_all_readings_and_settings_with_units(run: Run, port: str) -> None:
+    assert run("read", port, TOY, 1) == (
+        0,
+        "output_frequency      49.9  Hz\n"
+        "output_current        3.25  A\n"
+        "mystery                777  (scale not stated)\n"
+        "fault                 NONE\n"
+        "status             RUNNING\n"
+        "acceleration_time     10.0  s\n"
+        "sealed                   0\n",
+        "",
+    )
+
+
+def test_read_prints_what_was_named_in_that_order(run: Run, port: str) -> None:
+    status, out, _ = run("read", port, TOY, 1, "output_current", "output_frequency")
+    assert (status, out) == (0, "output_current    3.25  A\noutput_frequency  49.9  Hz\n")
+
+
+def test_read_as_json(run: Run, port: str) -> None:
+    _, out, _ = run("read", port, TOY, 1, "output_current", "mystery", "fault", "status", "--json")
+    assert json.loads(out) == {
+        "drive": "toy@1",
+        "model": "toy",
+        "address": 1,
+        "values": {
+            "output_current": {"value": 3.25, "unit": "A"},
+            "mystery": {"value": None, "raw": 777},
+            "fault": {"value": "NONE", "raw": 0},
+            "status": {"value": ["RUNNING"], "raw": 1},
+        },
+    }
+
+
+def test_a_number_that_the_document_does_not_name_is_shown_as_such(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
+    for cell in toy.memory.of(Toy.fault):
+        cell.raw = 99
+    assert run("read", port, TOY, 1, "fault")[1] == "fault  99  (the document has no name for it)\n"
+    assert json.loads(run("read", port, TOY, 1, "fault", "--json")[1])["values"] == {
+        "fault": {"value": None, "raw": 99}
+    }
+
+
+def test_what_a_drive_refuses_to_tell_does_not_hide_the_rest(run: Run, port: str) -> None:
+    status, out, err = run("read", port, TOY, 2, "status", "fault")
+    assert (status, out) == (1, "status  none\nfault         refused: illegal address\n")
+    assert err == ""
+
+
+MUTE = """\
+from enum import IntEnum
+from multidrop.drive.family import Drive, verb, write
+from multidrop.drive.register import command, reading
+
+class Word(IntEnum):
+    STOP = 0
+
+class Mute(Drive):
+    model = "mute"
+    speed = reading(1, "rpm")
+    control = command(0x14, Word)
+
+    @verb
+    def stop(self):
+        yield from write(Mute.control, Word.STOP)
+"""
+
+
+def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
+    run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
+) -> None:
+    (tmp_path / "mute.py").write_text(MUTE)
+    words = ("stop", port, f"{tmp_path}/mute.py:Mute", 1)
+    status, out, err = run(*words)
+    is_run = f"multidrop: {tmp_path}/mute.py is run as Python: a model of one's own is a program\n"
+    assert (status, err) == (0, is_run)
+    assert out.startswith("mute@1: stop done; state: the family cannot say")
+    assert json.loads(run(*words, "--json")[1])["state"] is None
+    assert [(it.address, it.raw) for it in toy.counters.writes] == [(0x14, 0), (0x14, 0)]
+
+
+def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: SimulatedDrive) -> None:
+    toy["status"] = Status(0)
+    assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes") == (
+        0,
+        "toy@1: acceleration_time = 12.5 s: done (read back)\n",
+        "",
+    )
+    assert toy["acceleration_time"] == 12.5
+    assert run("write", port, TOY, 1, "frequency", "25", "--yes") == (
+        0,
+        "toy@1: frequency = 25.00 Hz: done (cannot be read back)\n",
+        "",
+    )
+    assert toy["frequency"] == 25
+
+
+def test_what_changes_only_while_the_motor_stands_is_refused_while_it_runs(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
+    status, out, err = run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")
+    assert (status, out) == (1, "")
+    assert "acceleration_time of toy@1 is not written: it changes only while the motor stands" in err
+    assert toy["acceleration_time"] == 10.0
+
+
+def test_write_as_json(run: Run, port: str) -> None:
+    _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json", "--yes")
+    assert json.loads(out) == {
+        "drive": "toy@1",
+        "register": "frequency",
+        "value": 25.0,
+        "unit": "Hz",
+        "outcome": "done",
+    }
+
+
+def test_a_drive_that_clamps_is_told_and_status_1(run: Run, port: str) -> None:
+    assert run("write", port, TOY, 2, "acceleration_time", "30", "--yes") == (
+        1,
+        "",
+        "toy@2: acceleration_time = 30.0 s: taken as 20.0 s\n",
+    )
+
+
+def test_a_value_between_two_steps_is_told_as_it_is_taken(run: Run, port: str, toy: SimulatedDrive) -> None:
+    """Before it is sent, and in what is said to be done."""
+    note = "multidrop: frequency has steps of 0.01 Hz: 12.345 is taken as 12.34 Hz\n"
+    assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
+        0,
+        "toy@1: frequency = 12.34 Hz: done (cannot be read back)\n",
+        note,
+    )
+    assert run("set-frequency", port, TOY, 1, "12.345", "--yes") == (
+        0,
+        "toy@1: set-frequency done at frequency = 12.34 Hz; state: running\n",
+        note,
+    )
+    status, out, err = run("start", port, TOY, 1, "--frequency", "12.345", "--yes", "--json")
+    assert (status, err) == (0, note)
+    assert json.loads(out)["setpoint"] == {"register": "frequency", "value": 12.34, "unit": "Hz"}
+    assert {it.raw for it in toy.counters.writes if it.name == "frequency"} == {1234}
+    status, out, err = run("write", port, TOY, 1, "frequency", "12.345")
+    assert (status, out) == (1, "")
+    assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
+
+
+def test_a_percentage_that_stands_for_a_frequency_is_told(run: Run) -> None:
+    che = InvtCHE(1, maximum_frequency=50)
+    with Simulator([Wire([simulated(che)], unpaced=True)]) as simulator:
+        words = ("invt-che", 1, "12.3456", "--option", "maximum_frequency=50", "--yes")
+        status, out, _ = run("set-frequency", simulator.wires[0].path, *words)
+    assert status == 0
+    assert "set-frequency done at setpoint = 24.69 %;" in out
+
+
+def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None:
+    assert run("start", port, TOY, 1, "--direction", "reverse", "--yes") == (
+        0,
+        f"toy@1: start done; state: running; {DOG}\n",
+        "",
+    )
+    assert toy["control"] == 3
+    assert run("set-frequency", port, TOY, 1, "33.5", "--yes")[0] == 0
+    assert toy["frequency"] == 33.5
+    assert run("stop", port, TOY, 1)[0] == 0  # is never asked for
+    assert toy["control"] == 0
+
+
+def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> None:
+    """What another command wrote is not known to this one."""
+    with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
+        words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
+        sentence = "multidrop: innovert-ibd@1 cannot say its setpoint: add --frequency HZ\n"
+        assert run("start", *words) == (1, "", sentence)
+        assert run("start", *words, "--frequency", 20)[0] == 0
+
+
+def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
+    assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
+    assert [it.name for it in toy.counters.writes] == ["frequency", "control"]
+
+
+@pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
+def test_a_person_at_a_terminal_is_asked(
+    run: Run,
+    port: str,
+    toy: SimulatedDrive,
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    writes: int,
+) -> None:
+    terminal = io.StringIO(answer + "\n")
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stdin", terminal)
+    status, _, err = run("start", port, TOY, 1)
+    assert err.startswith(f"Start the motor of toy@1 on {port}? [y/N] ")
+    assert (status == 0) == bool(writes)
+    assert len(toy.counters.writes) == writes
+
+
+def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Path) -> None:
+    log = tmp_path / "audit.jsonl"
+    run("set-frequency", port, TOY, 1, 20, "--yes", "--audit", log)
+    run("start", port, TOY, 1, "--yes", "--audit", log)
+    run("stop", port, TOY, 1, "--audit", log)
+    records = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [(it["drive"], it["write"], it["sent"][:17], it["outcome"]) for it in records] == [
+        ("toy@1", "frequency = 20.00 Hz", "01 06 00 15 07 D0", "done"),
+        ("toy@1", "control = RUNNING", "01 06 00 14 00 01", "done"),
+        ("toy@1", "control = none", "01 06 00 14 00 00", "done"),
+    ]
+
+
+def test_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None:
+    status, out, _ = run("wear")
+    assert (status, out.endswith("no register that may be in EEPROM was written yet\n")) == (0, True)
+    toy["status"] = Status(0)
+    assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")[0] == 0
+    status, out, err = run("write", port, TOY, 1, "acceleration_time", "13", "--yes")
+    assert (status, out) == (1, "")
+    assert "is written once in 60 s at most" in err
+    assert "was written yet" in run("wear")[1]  # a simulated drive's EEPROM is none
+    assert not ledger.Ledger().enter(
+        ledger.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
+    )
+    head, row, *_ = run("wear")[1].splitlines()
+    assert head.split() == ["PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS", "YEAR", "LEFT", "LAST"]
+    assert row.split()[:7] == ["/dev/ttyS7", "1", "toy", "acceleration_time", "1", "1", "999"]
+    (wear,) = json.loads(run("wear", "--json")[1])
+    assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
+
+
+def test_nothing_but_start_writes_to_a_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+    run("state", port, TOY, 1)
+    run("read", port, TOY, 1)
+    assert not toy.counters.writes
+
+
+def test_state_in_words_and_as_json(run: Run, port: str) -> None:
+    assert run("state", port, TOY, 1) == (0, f"running\n{DOG}\n", "")
+    _, out, _ = run("state", port, TOY, 1, "--json")
+    assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}
+
+
+@pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
+def test_silence_is_a_sentence_that_says_what_to_check(
+    run: Run, port: str, words: tuple[object, ...]
+) -> None:
+    sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
+    assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
+
+
+def test_a_damaged_reply_is_a_sentence(run: Run, toy: SimulatedDrive) -> None:
+    wire = Faulty([toy], lambda reply: reply[:-1] + b"\0", unpaced=True)
+    with Simulator([wire]):
+        assert run("state", wire.path, TOY, 1) == (
+            1,
+            "",
+            "multidrop: toy@1: bad checksum (received 01 03 02 00 00 B8 00)\n",
+        )
+
+
+def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
+    holder = (
+        "import serial, sys; port = serial.Serial(sys.argv[1], exclusive=True);"
+        "print('held', flush=True); sys.stdin.read()"
+    )
+    words = [sys.executable, "-c", holder, port]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        assert run("read", port, TOY, 1) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+        other.communicate()
+
+
+# ---- interruptions ----
+
+
+@pytest.fixture
+def che() -> Iterator[tuple[Heard, list[object]]]:
+    """What a CHE hears, and the words that name it."""
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        yield Heard(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
+
+
+def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
+    """Ctrl-C, at the first request of this kind, whose reply is not lost."""
+    pressed: list[Message] = []
+
+    def loses(request: Message) -> bool:
+        if when(request) and not pressed:
+            pressed.append(request)
+            os.kill(os.getpid(), signal.SIGINT)
+        return False
+
+    return loses
+
+
+def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
+    run: Run, che: tuple[Heard, list[object]]
+) -> None:
+    heard, words = che
+    heard.loses = pressing(lambda request: request in heard.starts)
+    status, _, err = run("start", *words, "--frequency", 20, "--yes")
+    assert status == 130
+    assert len(heard.starts) == 1
+    assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
+    assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
+
+
+def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard, list[object]]) -> None:
+    heard, words = che
+    assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
+    begun = len(heard.writes)
+    heard.loses = pressing(lambda request: request.start == 0x1000)
+    status, _, err = run("stop", *words)
+    assert status == 130
+    until(lambda: len(heard.writes) >= begun + 2)  # the drive may hear it when the client has left
+    assert [it.data for it in heard.writes[begun:]] == [b"\0\5"] * 2
+    assert "the stop was sent" in err
+    assert "multidrop: to stop it, type: multidrop stop " in err
+
+
+def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: tuple[Heard, list[object]]) -> None:
+    heard, words = che
+    heard.loses = lambda request: True
+    status, _, err = run("stop", *words, "--seconds", 1)
+    assert status == 1
+    assert "it was never confirmed" in err
+    assert {it.data for it in heard.writes} == {b"\0\5"}

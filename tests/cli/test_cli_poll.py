@@ -1,0 +1,365 @@
+"""Commands that run for a while: demo, poll, simulate; and convert. Each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import pytest
+from batches import METADATA, counting
+from lines import Faulty, line, polled
+from terminals import MULTIDROP, on_terminal
+from test_cli import TOY, Run, run
+from toy import Toy
+
+from multidrop.bus import Bus
+from multidrop.capture import Capture, Decoding
+from multidrop.cli.demo import DRIVES, _start_motors
+from multidrop.core import Result
+from multidrop.errors import NoReply
+from multidrop.polling.batch import Row
+from multidrop.recording import open_reader, open_writer
+from multidrop.sim import Simulator, simulated
+
+__all__ = ["run"]  # a fixture
+
+TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a model of one's own is a program\n"
+
+
+def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+    """A command to its end; `most_bytes`: as if the disk had only so much room."""
+
+    def limit() -> None:
+        if most_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+    done = subprocess.run(
+        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=180, preexec_fn=limit
+    )
+    done.stderr = done.stderr.replace(TOY_IS_RUN, "", 1)
+    return done
+
+
+@contextmanager
+def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
+    """A command under way, and what it prints."""
+    with subprocess.Popen([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout
+        finally:
+            process.kill()
+
+
+def plant_file(directory: Path, *, dead: bool = False) -> Path:
+    """One line with a living drive, and one that nobody simulates."""
+    line = f'[[line]]\nname = "hall-1"\nport = "{directory}/ports/hall-1"\n'
+    drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
+    path = directory / f"{'with-dead' if dead else 'living'}.toml"
+    path.write_text(line + drive.format("pump-1", TOY, 1) + (drive.format("pump-9", TOY, 9) if dead else ""))
+    return path
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Path]:
+    """A plant file whose port is there, with one of its two drives."""
+    with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports", "--unpaced") as (_, out):
+        assert out.readline() == f"ready hall-1 {tmp_path}/ports/hall-1\n"
+        yield plant_file(tmp_path, dead=True)
+
+
+def recorded(path: Path) -> list[Row]:
+    return [row for rows in open_reader(path) for row in rows]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, number: int) -> None:
+    link = tmp_path / "ports" / "hall-1"
+    with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports") as (process, out):
+        out.readline()
+        assert link.is_symlink()
+        process.send_signal(number)
+        assert process.wait(timeout=60) == 0
+    assert not link.is_symlink()
+
+
+def test_simulate_does_not_replace_a_file_in_its_way(run: Run, tmp_path: Path) -> None:
+    link = tmp_path / "ports" / "hall-1"
+    link.parent.mkdir()
+    link.write_text("mine")
+    assert run("simulate", plant_file(tmp_path), "--ports", link.parent) == (
+        2,
+        "",
+        f"multidrop: {link} is there already: remove it, or choose another directory with --ports\n",
+    )
+    assert link.read_text() == "mine"
+
+
+def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
+    faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
+    faults.write_text("drop = 1\n")
+    words = ["simulate", plant_file(tmp_path), "--ports", ports, "--unpaced", "--faults", faults]
+    with running(*words) as (_, out):
+        out.readline()
+        with Bus(str(ports / "hall-1")) as bus, pytest.raises(NoReply):
+            bus.read(bus.attach(Toy, 1), Toy.output_current)
+
+
+LATE_OR_SILENT = {str(it) for it in (Result.NO_REPLY, Result.LATE_ANSWER_DUE, Result.NOT_ASKED)}
+
+
+def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.arrows"
+    done = multidrop("poll", plant, "--seconds", 1.5, "--out", out, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    summary = json.loads(done.stdout)
+    rows = recorded(out)
+    samples = [row for row in rows if row.value is not None]
+    assert {row.drive for row in samples} == {"pump-1"}
+    assert len(samples) == summary["samples"] > 0
+    misses = [row for row in rows if row.value is None]
+    assert Counter(row.status for row in misses) == summary["lines"]["hall-1"]["misses"]
+    assert {"no reply"} <= {row.status for row in misses if row.drive == "pump-9"} <= LATE_OR_SILENT
+    assert {row.status for row in misses if row.drive == "pump-1"} <= LATE_OR_SILENT  # by a busy machine
+    assert len(misses) == summary["misses"]
+    assert summary["lines"]["hall-1"]["exchanges"] > 0
+    assert summary["lines"]["hall-1"]["drives"]["pump-1"]["samples_per_second"] > 0
+    assert summary["lines"]["hall-1"]["utilisation"] > 0
+
+
+def test_a_recording_says_what_its_registers_are(plant: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.arrows"
+    multidrop("poll", plant, "--seconds", 0.5, "--out", out)
+    drive = open_reader(out).metadata["drives"]["pump-1"]
+    assert (drive["line"], drive["model"], drive["address"], drive["settings"]) == (
+        "hall-1",
+        "toy",
+        1,
+        "9600 8N1",
+    )
+    place = {"function": 3, "address": 2, "words": 1}
+    assert drive["registers"]["output_current"] == {
+        "unit": "A",
+        "step": 0.01,
+        "values": None,
+        "bits": False,
+        **place,
+    }
+    assert drive["registers"]["mystery"] == {
+        "bits": False,
+        "unit": "",
+        "step": None,
+        "values": None,
+        **place,
+        "address": 3,
+    }
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Path, number: int) -> None:
+    out = tmp_path / "out.csv"
+    with running("poll", plant, "--out", out, "--json") as (process, printed):
+        while not out.exists() or out.stat().st_size < 2000:
+            assert process.poll() is None
+        process.send_signal(number)
+        text = printed.read()
+        assert process.wait(timeout=60) == 0
+    assert len(recorded(out)) == json.loads(text)["samples"] + json.loads(text)["misses"]
+
+
+def test_poll_tells_a_person_the_same(plant: Path) -> None:
+    done = multidrop("poll", plant, "--seconds", 1)
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("hall-1: ")
+    assert lines[1].split() == ["DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES"]
+    assert lines[2].split()[::3] == ["pump-1", "none"]
+    assert lines[3].split()[:5] == ["pump-9", "0.0", "0.0", "no", "reply"]
+    assert max(map(len, lines)) <= 80
+
+
+def test_nothing_read_at_all_is_status_1(plant: Path) -> None:
+    text = plant.read_text().replace("address = 1\n", "address = 8\n")
+    plant.write_text(text)
+    done = multidrop("poll", plant, "--seconds", 1, "--json")
+    assert (done.returncode, json.loads(done.stdout)["samples"]) == (1, 0)
+
+
+def test_a_plant_file_s_mistakes_are_all_told(run: Run, tmp_path: Path) -> None:
+    path = plant_file(tmp_path)
+    path.write_text(
+        path.read_text().replace("port =", "prot =").replace("address = 1", "address = 99\nevery = 5\n")
+        + 'poll = ["control", "output_curent"]\n'
+    )
+    status, out, err = run("poll", path)
+    assert (status, out) == (2, "")
+    assert [line.removeprefix(f'multidrop: {path}: line "hall-1"') for line in err.splitlines()] == [
+        ": unknown key 'prot'; did you mean 'port'?",
+        ', drive "pump-1": every = 5 is not right; write every = "50 ms"',
+        ', drive "pump-1": address 99 is not one of TOY T1: 1 to 31',
+        ', drive "pump-1", poll number 1: '
+        "control can only be written, not polled; see `multidrop models toy`",
+        ', drive "pump-1", poll number 2: '
+        "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
+    ]
+
+
+def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "out.csv"
+    out.write_text("mine")
+    sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
+    assert run("poll", plant_file(tmp_path), "--out", out) == (2, "", sentence)
+    assert run("convert", out, out) == (2, "", sentence)
+    assert out.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("out", "status", "sentence"),
+    [
+        ("out.txt", 2, "a recording's name ends in .arrows, .csv, .parquet"),
+        ("none/out.arrows", 1, "cannot be written: No such file or directory"),
+    ],
+)
+def test_a_place_that_takes_no_recording_is_a_sentence(
+    plant: Path, tmp_path: Path, out: str, status: int, sentence: str
+) -> None:
+    done = multidrop("poll", plant, "--seconds", 1, "--out", tmp_path / out)
+    assert (done.returncode, done.stderr) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
+
+
+def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
+    plant: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.arrows"
+    done = multidrop("poll", plant, "--seconds", 30, "--out", out, most_bytes=20_000)
+    rows = len(recorded(out))
+    assert rows > 0
+    assert done.returncode == 1
+    assert done.stderr.startswith(
+        f"multidrop: {out}: cannot be written: File too large; the {rows} rows before"
+    )
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_port_that_is_not_there_is_a_sentence(run: Run, tmp_path: Path) -> None:
+    sentence = f"multidrop: {tmp_path}/ports/hall-1: there is no such port\n"
+    out = tmp_path / "out.csv"
+    assert run("poll", plant_file(tmp_path), "--seconds", 1, "--out", out) == (1, "", sentence)
+    assert not out.exists()
+
+
+def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
+    multidrop("poll", plant, "--seconds", 1, "--out", tmp_path / "a.arrows")
+    rows = recorded(tmp_path / "a.arrows")
+    status, out, _ = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
+    assert (status, out) == (0, f"{len(rows)} rows in {tmp_path}/b.csv\n")
+    assert recorded(tmp_path / "b.csv") == rows
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        for at in range(3):
+            writer.write(counting(100, 100 * at))
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size - 7)
+    whole = sum(map(len, open_reader(path)))
+    torn = open_reader(path).torn
+    assert 0 < torn < path.stat().st_size
+    sentence = (
+        f"multidrop: the end of {path} is missing: {whole} rows were read, and its last {torn} bytes, "
+        "which are no whole rows, were left out\n"
+    )
+    out = tmp_path / "b.parquet"
+    assert run("convert", path, out) == (0, f"{whole} rows in {out}\n", sentence)
+    assert run("plot", path) == (0, f"{tmp_path}/a.png\n", sentence)
+    assert run("report", path) == (0, f"{tmp_path}/a.html\n", sentence)
+
+
+def test_convert_of_no_recording_is_a_mistake(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.arrows").write_text("hello")
+    status, out, err = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
+    assert (status, out) == (2, "")
+    assert err.startswith(f"multidrop: {tmp_path}/a.arrows is not a recording: ")
+    assert run("convert", tmp_path / "none.csv", tmp_path / "b.csv")[0] == 2
+
+
+def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
+    """It takes the place of an earlier demo's recording, and is captured."""
+    out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
+    with open_writer(out, {"drives": dict.fromkeys(name for name, *_ in DRIVES)}):
+        pass
+    done = multidrop("demo", "--seconds", 4, "--out", out, "--capture", capture, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    summary = json.loads(done.stdout)
+    drives = open_reader(out).metadata["drives"]
+    assert {(it["model"], it["framing"]) for it in drives.values()} == {
+        ("erman-er-g-220", "rtu"),
+        ("invt-che", "rtu"),
+        ("innovert-ibd", "rtu"),
+        ("innovert-ibd", "ascii"),
+        ("delixi-modbus", "rtu"),
+        ("delixi-modbus", "ascii"),
+        ("delixi-native", "delixi"),
+        ("yd1000", "rtu"),
+    }
+    rows = recorded(out)
+    assert {row.drive for row in rows if row.value is not None} == set(drives)
+    assert summary["misses"] == sum(row.value is None for row in rows)  # none, unless the machine is busy
+    with Capture(capture) as found:
+        assert sum(map(len, Decoding(found))) > 0
+
+
+def test_a_demo_goes_on_without_a_motor_that_does_not_answer() -> None:
+    """As on a machine that has much else to do."""
+    toy = Toy(1)
+    with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
+        _start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))
+
+
+def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:
+    out = tmp_path / "demo.arrows"
+    with open_writer(out, {"drives": {"pump-1": {}}}):
+        pass
+    mine = out.read_bytes()
+    sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
+    assert run("demo", "--seconds", 1, "--out", out) == (2, "", sentence)
+    assert out.read_bytes() == mine
+
+
+# ---- on a terminal ----
+
+
+def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
+    out = tmp_path / "demo.arrows"
+    with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
+        terminal.wait_for(">erman")
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=60) == 0
+    assert "delixi-native" in {row.drive for row in recorded(out)}
+
+
+def test_on_a_terminal_the_newest_values_stand_in_a_table(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "2", size=(120, 24)) as terminal:
+        terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
+        terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
+        terminal.wait_for("output_frequency: no")  # of the other: no reply, or not asked
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=60) == 0
+        assert b"\x1b[3F\x1b[J" in terminal.written  # the table and its head, over themselves
+
+
+def test_a_table_is_cut_to_its_terminal(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
+        terminal.wait_for("... and 3 drives more")
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=60) == 0
+        table = terminal.text.replace("\r\n", "\n").removeprefix(TOY_IS_RUN).partition("hall-1: ")[0]
+        assert max(map(len, table.splitlines())) < 40

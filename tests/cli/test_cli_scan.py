@@ -1,0 +1,221 @@
+"""`multidrop scan` on a simulated line: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from disks import read_only_directory
+from terminals import on_terminal
+from test_cli import TOY, Run, run
+from toy import Toy
+
+import multidrop.cli.scan
+from multidrop.cli.scan import sentence
+from multidrop.core import Framing
+from multidrop.drive.timing import Settings
+from multidrop.drives.delixi_modbus import DelixiModbus
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.plant.loader import load_plant
+from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+__all__ = ["run"]  # a fixture
+
+USUAL = Settings(9600, "8N1")
+BRISKLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3", "--quick")
+
+
+@pytest.fixture
+def port(request: pytest.FixtureRequest) -> Iterator[str]:
+    drives = [simulated(InvtCHE(1)), simulated(InnovertIBD(2, framing="ascii")), SimulatedDrive(Toy(3))]
+    with Simulator([Wire(drives, unpaced=True, port=getattr(request, "param", "pty"))]) as sim:
+        yield sim.wires[0].path
+
+
+def test_it_says_what_it_finds(run: Run, port: str) -> None:
+    status, out, err = run("scan", port, *BRISKLY)
+    assert status == 0
+    told = out.splitlines()
+    assert told[0].startswith("address 1: invt-che at 9600 8N1 rtu, ")
+    assert told[1].startswith("address 3: an unknown Modbus device at 9600 8N1 rtu, ")
+    assert told[2].startswith("address 2: innovert-ibd at 9600 8N1 ascii, ")
+    assert told[3].startswith("3 drives found in ")
+    assert "9600 8N1 rtu; " in err
+    assert " s left" in err
+
+
+def test_json_is_one_object(run: Run, port: str) -> None:
+    status, out, _ = run("scan", port, *BRISKLY, "--model", "invt-che", "--json")
+    told = json.loads(out)
+    assert status == 0
+    assert told["finished"]
+    assert [(it["address"], it["models"], it["framing"]) for it in told["drives"]] == [
+        (1, ["invt-che"], "rtu"),
+        (3, [], "rtu"),
+    ]
+
+
+def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path) -> None:
+    out = tmp_path / "found.toml"
+    words = (
+        *BRISKLY,
+        "--model",
+        TOY.replace(":Toy", ":Unsure"),
+        "--model",
+        "invt-che",
+        "--model",
+        "innovert-ibd",
+        "--out",
+        out,
+    )
+    assert run("scan", port, *words)[0] == 0
+    (line,) = load_plant(out).lines
+    assert line.port == port
+    assert [(it.drive.address, it.drive.model) for it in line.drives] == [
+        (1, "invt-che"),
+        (2, "innovert-ibd"),
+        (3, "toy"),
+    ]
+    status, told, _ = run("poll", out, "--seconds", 1, "--json")
+    assert status == 0
+    polled = json.loads(told)["lines"]["line-1"]["drives"]
+    assert set(polled) == {"invt-che-1", "innovert-ibd-2", "toy-3"}
+    assert all(it["samples"] for it in polled.values())
+    status, _, err = run("scan", port, *words)
+    assert status == 2
+    assert "is there already" in err
+
+
+def test_nobody_there_is_a_failure(run: Run, port: str, tmp_path: Path) -> None:
+    out = tmp_path / "none.toml"
+    words = ("--baudrates", "19200", "--formats", "8O2", "--addresses", "9", "--quick", "--out", out)
+    status, text, _ = run("scan", port, *words)
+    assert status == 1
+    assert text.startswith("no drives found in ")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
+def test_a_serial_server_is_asked_at_its_own_baud_rate(run: Run, port: str) -> None:
+    status, _, err = run("scan", port, "--quick")
+    assert status == 2
+    assert "name it, such as --baudrates 9600" in err
+    status, out, _ = run("scan", port, "--quick", "--baudrates", "9600", "--addresses", "1-2")
+    assert status == 0
+    assert "address 1: invt-che" in out
+    assert "address 2: innovert-ibd" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--addresses", "0-5"), "'0-5' is not addresses from 1 to 247"),
+        (("--addresses", "1-" + "9" * 400), "is not addresses from 1 to 247"),
+        (("--addresses", "1-99999999999"), "'1-99999999999' is not addresses from 1 to 247"),
+        (("--addresses", "one"), "'one' is not addresses from 1 to 247"),
+        (("--baudrates", "fast"), "'fast' is not baud rates such as 9600,19200"),
+        (("--baudrates", "300"), "baud rate 300 is none that these families have"),
+        (("--formats", "9N1"), "format 9N1 is none that these families have"),
+        (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
+    ],
+)
+def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], sentence: str) -> None:
+    status, out, err = run("scan", "/dev/nowhere", *words)
+    assert (status, out) == (2, "")
+    assert sentence in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_plant_file_that_cannot_be_written_is_told_before_the_port_is_opened(
+    run: Run, tmp_path: Path
+) -> None:
+    for out, status, reason in (
+        (tmp_path / "none" / "found.toml", 2, "No such file or directory"),
+        (tmp_path, 2, "Is a directory"),
+    ):
+        assert run("scan", "/dev/nowhere", "--out", out) == (status, "", f"multidrop: {out}: {reason}\n")
+    with read_only_directory() as directory:
+        status, _, err = run("scan", "/dev/nowhere", "--out", directory / "found.toml")
+    assert (status, err) == (1, f"multidrop: {directory}/found.toml: Permission denied\n")
+
+
+def test_a_scan_that_fails_leaves_no_plant_file(run: Run, tmp_path: Path) -> None:
+    sentence = "multidrop: /dev/nowhere: there is no such port\n"
+    assert run("scan", "/dev/nowhere", "--out", tmp_path / "found.toml") == (1, "", sentence)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_port_that_is_not_there_is_one_sentence(run: Run) -> None:
+    assert run("scan", "/dev/nowhere") == (1, "", "multidrop: /dev/nowhere: there is no such port\n")
+
+
+def test_every_finding_is_a_sentence() -> None:
+    found = Found(5, USUAL, Framing.RTU, ("yd1000", "delixi-modbus"), 0.0051, "1 of 9 replies were damaged")
+    assert sentence(found) == (
+        "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, 5.1 ms to answer (1 of 9 replies were damaged)"
+    )
+    assert "several drives seem to have this address" in sentence(Crowd(5, USUAL, Framing.RTU))
+    assert "at 30 of 31 addresses" in sentence(Noise(USUAL, Framing.RTU, 30, 31))
+    assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
+
+
+def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
+    families = {it.model: it for it in (InvtCHE, InnovertIBD, DelixiModbus)}
+    found = [
+        Found(4, USUAL, Framing.RTU, (), 0.005),
+        Found(2, Settings(9600, "8N2"), Framing.RTU, ("invt-che", "delixi-modbus"), 0.005, "damaged"),
+        Found(2, Settings(19200, "8N1"), Framing.ASCII, ("innovert-ibd",), 0.005),
+    ]
+    path = tmp_path / "found.toml"
+    path.write_text(plant_text('/dev/tty"S0', found, families))
+    (line,) = load_plant(path).lines
+    assert line.port == '/dev/tty"S0'
+    (polled,) = line.drives
+    assert (polled.drive.address, polled.drive.model, str(polled.drive.settings)) == (
+        2,
+        "invt-che",
+        "9600 8N2",
+    )
+    comments = [it for it in path.read_text().splitlines() if it.startswith("#")]
+    assert comments[:2] == ["# damaged", "# it may as well be delixi-modbus"]
+    assert "# invt-che-2 has this address too" in comments[2]
+    assert 'name = "innovert-ibd-2"' in comments[4]
+    assert comments[-1] == "# address 4: an unknown Modbus device at 9600 8N1 rtu"
+
+
+def test_a_plant_file_needs_a_drive() -> None:
+    with pytest.raises(ValueError, match="nothing to write a plant file of"):
+        plant_text("port", [Found(4, USUAL, Framing.RTU, (), 0.005)], {})
+
+
+# ---- that takes its time ----
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_what_was_found_is_kept_when_it_is_interrupted(
+    run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    def interrupted(*_: object) -> Iterator[Finding]:
+        yield Found(1, USUAL, Framing.RTU, ("invt-che",), 0.005)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(multidrop.cli.scan, "scan", interrupted)
+    plant = tmp_path / "found.toml"
+    status, out, err = run("scan", port, *BRISKLY, "--out", plant, *words)
+    assert (status, err) == (130, "multidrop: interrupted\n")
+    assert [it.drive.address for it in load_plant(plant).lines[0].drives] == [1]
+    assert json.loads(out)["finished"] is False if words else "1 drive found" in out
+
+
+def test_on_a_terminal_progress_is_one_line(port: str) -> None:
+    with on_terminal("scan", port, *BRISKLY) as terminal:
+        terminal.wait_for("address 2; ")
+        terminal.wait_for("3 drives found in ")
+        assert terminal.process.wait(timeout=60) == 0
+        lines = terminal.text.splitlines()
+    assert next(it for it in lines if "innovert-ibd" in it).startswith("address 2: ")
+    assert terminal.written.count(b"\r\x1b[K") > 3

@@ -1,0 +1,445 @@
+"""`sniff` and `decode`: live, behind a network, from captures, and what goes wrong."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import signal
+import socket
+import subprocess
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from frames import PRINTED
+from lines import PATIENCE, until
+from taps import tapped
+from test_cli import Run, run
+from test_cli_poll import MULTIDROP, multidrop, recorded
+from test_line_ports import SerialServer, pyserials_own
+
+from multidrop.capture import CaptureWriter, Side
+from multidrop.capture.pairing import Pairing
+from multidrop.cli.sniff.listening import Listener
+from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
+from multidrop.drive.timing import Settings
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import EncodedDrive, Simulator, Wire
+
+__all__ = ["run"]  # a fixture
+
+DRIVES = (InnovertIBD(1), InvtCHE(2), InnovertIBD(3, framing="ascii"), DelixiNative(4))
+PLANT = """
+[[line]]
+name = "hall-1"
+port = "{port}"
+baudrate = 9600
+format = "8N1"
+[[line.drive]]
+name = "fan-1"
+model = "innovert-ibd"
+address = 1
+[[line.drive]]
+name = "fan-2"
+model = "invt-che"
+address = 2
+[[line.drive]]
+name = "pump-3"
+model = "innovert-ibd"
+framing = "ascii"
+address = 3
+[[line.drive]]
+name = "pump-4"
+model = "delixi-native"
+address = 4
+poll = ["output_frequency", "status"]
+"""
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[str, str]]:
+    """The ports of a master and of a listener, on a line with drives of three framings."""
+    drives = [EncodedDrive(drive) for drive in DRIVES]
+    simulator = Simulator([Wire(drives, unpaced=True)])
+    with simulator, tapped(simulator.wires[0].path, 9600) as ports:
+        yield ports
+
+
+def plant(directory: Path, port: str) -> Path:
+    path = directory / "plant.toml"
+    path.write_text(PLANT.format(port=port))
+    return path
+
+
+class Sniffer:
+    """`multidrop sniff` under way; its objects are there when the block is left."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.process = process
+
+    @property
+    def exchanges(self) -> list[dict[str, Any]]:
+        return [it for it in self.told if it.get("result") == "ok"]
+
+    @property
+    def summary(self) -> dict[str, int]:
+        return dict(self.told[-1]["summary"])
+
+
+@contextmanager
+def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
+    command = [*MULTIDROP, "sniff", port, "--json", *map(str, words)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"listening on {port}, Ctrl-C ends\n"
+        sniffer = Sniffer(process)
+        out = process.stdout
+        reader = threading.Thread(target=lambda: sniffer.told.extend(map(json.loads, out)))
+        reader.start()
+        try:
+            yield sniffer
+        finally:
+            process.send_signal(signal.SIGINT)
+            reader.join(timeout=20)
+            process.kill()
+
+
+def test_a_poll_s_values_are_heard_captured_and_decoded(
+    line: tuple[str, str], tmp_path: Path, run: Run
+) -> None:
+    port, tap = line
+    file = plant(tmp_path, port)
+    with sniffing(tap, "--plant", file, "--out", tmp_path / "a.pcapng") as sniffer:
+        done = multidrop("poll", file, "--seconds", 2, "--out", tmp_path / "polled.arrows")
+        assert done.returncode == 0, done.stderr
+    assert run("decode", tmp_path / "a.pcapng", "--plant", file, "--out", tmp_path / "decoded.arrows")[0] == 0
+
+    def values(path: Path) -> dict[tuple[str, str], list[float]]:
+        found: dict[tuple[str, str], list[float]] = {}
+        for row in recorded(path):
+            if row.value is not None:
+                found.setdefault((row.drive, row.register), []).append(row.value)
+        return found
+
+    polled, decoded = values(tmp_path / "polled.arrows"), values(tmp_path / "decoded.arrows")
+    assert {drive for drive, _ in polled} == {"fan-1", "fan-2", "pump-3", "pump-4"}
+    assert set(polled) <= set(decoded)
+    for name, column in polled.items():
+        assert decoded[name][: len(column)] == column  # the last one may have come too late for the poll
+        assert len(decoded[name]) <= len(column) + 1
+    assert {it["line"] for it in sniffer.exchanges} == {"hall-1"}
+
+
+def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
+    with Listener(line[1], Settings(9600, "8N1")) as listener, pytest.raises(OSError, match="Bad file"):
+        os.write(listener.fileno(), b"\x01")
+
+
+def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> None:
+    master, slave = pty.openpty()
+    with sniffing(os.ttyname(slave)) as sniffer:
+        os.write(master, READ.request_frame)
+        until(lambda: sniffer.told)
+        (told,) = sniffer.told
+        assert (told["result"], told["frames"]) == ("no reply", [READ.request_frame.hex(" ").upper()])
+    assert sniffer.summary["unanswered"] == 1
+    os.close(master)
+    os.close(slave)
+
+
+# ---- behind a network ----
+
+
+class FarLine:
+    """A line at the far end of a connection: says the same again and again, and keeps what it is told."""
+
+    def __init__(self, said: bytes) -> None:
+        self._said = said
+        self.told = b""
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        connection, _ = self._server.accept()
+        with connection, suppress(OSError):
+            connection.settimeout(0.005)
+            while True:
+                connection.sendall(self._said)
+                with suppress(TimeoutError):
+                    more = connection.recv(1024)
+                    if not more:
+                        return
+                    self.told += more
+
+    def close(self) -> bytes:
+        """What it was told in the end."""
+        self._thread.join(timeout=PATIENCE)
+        self._server.close()
+        return self.told
+
+
+@pytest.mark.parametrize("kind", ["socket", "rfc2217"])
+@pyserials_own
+def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:
+    far = FarLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
+    server = SerialServer(far.url) if kind == "rfc2217" else None
+    url = server.url if server else far.url
+    status, out, err = run("sniff", url, "--baudrate", 19200, "--format", "8E1", "--seconds", 2, "--json")
+    assert (status, err) == (0, f"listening on {url}, Ctrl-C ends\n")
+    told = [json.loads(line) for line in out.splitlines()]
+    assert {it["line"] for it in told[:-1]} == {url}
+    assert told[-1]["summary"]["exchanges"] > 10
+    heard = [it.get("frames", [])[1:] for it in told[2:-2]]  # it may begin, and end, amid a frame
+    pair = [[it.frame.hex(" ").upper()] for it in (READ, WRITE)]
+    assert heard in ((len(heard) * pair)[: len(heard)], (len(heard) * pair)[1 : len(heard) + 1])
+    if server:
+        assert (server.port.baudrate, server.port.parity) == (19200, "E")
+        server.close()
+    assert far.close() == b""
+
+
+def test_a_url_s_port_has_no_write() -> None:
+    far = FarLine(b"")
+    with Listener(far.url, Settings(9600, "8N1")) as listener:
+        (port,) = (it for it in vars(listener._source).values() if hasattr(it, "write"))
+        with pytest.raises(OSError, match="only listened to: 01 is not sent"):
+            port.write(b"\x01")
+    assert far.close() == b""
+
+
+def test_a_network_that_goes_away_ends_it_with_a_sentence(run: Run) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        threading.Thread(target=lambda: server.accept()[0].close(), daemon=True).start()
+        status, _, err = run("sniff", url)
+    assert (status, err.splitlines()[-1]) == (1, f"multidrop: {url}: the port was lost (hung up)")
+
+
+# ---- replay ----
+
+PAIRS = {it.frame: it for it in PRINTED if it.request is not None}
+READ = PAIRS[bytes.fromhex("01 03 02 13 88 B5 12")]
+WRITE = PAIRS[bytes.fromhex("01 06 00 02 13 88 25 5C")]
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    path = tmp_path / "a.pcapng"
+    with CaptureWriter(path) as it:
+        time = 1_700_000_000_000_000_000
+        for exchange in (READ, WRITE):
+            it.write(exchange.request_frame, Side.ASKING, time, "hall-1")
+            it.write(exchange.frame, Side.ANSWERING, time + 5_300_000, "hall-1")
+        it.write(b"\xff\x00", Side.EITHER, time + 6_000_000, "hall-1")
+        it.write(READ.request_frame, Side.ASKING, time + 7_000_000, "hall-1")
+    return path
+
+
+def delixi_plant(directory: Path) -> Path:
+    path = directory / "plant.toml"
+    drive = 'name = "pump"\nmodel = "delixi-modbus"\naddress = 1\n'
+    path.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
+    return path
+
+
+@pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
+def test_a_capture_is_told_in_engineering_units(run: Run, capture: Path, command: list[str]) -> None:
+    status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
+    assert (status, err) == (0, "")
+    assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
+        "pump  reads output_frequency = 50.00 Hz  (5.3 ms)",
+        "pump  writes frequency = 50.00 Hz  (5.3 ms)",
+        "unknown: FF 00",
+        "pump  reads output_frequency: no reply",
+    ]
+    assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
+
+
+def test_without_a_plant_raw_registers_are_told(run: Run, capture: Path) -> None:
+    out = run("decode", capture)[1]
+    assert "  address 1  reads holding_register_500 = 5000  " in out
+    objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
+    assert objects[0] == {
+        "line": "hall-1",
+        "time": "2023-11-14T22:13:20.000000000Z",
+        "framing": "rtu",
+        "address": 1,
+        "function": 3,
+        "frames": ["01 03 01 F4 00 01 C4 04", "01 03 02 13 88 B5 12"],
+        "drive": "address 1",
+        "access": "read",
+        "result": "ok",
+        "reply_after_ns": 5_300_000,
+        "values": {"holding_register_500": 5000},
+    }
+    assert objects[-1]["summary"]["exchanges"] == 2
+
+
+def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[bytes, Side]:
+    build = build_request if asked else build_reply
+    return build(framing, Message(*message)), Side.ASKING if asked else Side.ANSWERING
+
+
+def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
+    """What `decode` says of a capture of these, one in every ms, without its times of day."""
+    with CaptureWriter(path) as it:
+        for number, (raw, side) in enumerate(frames):
+            it.write(raw, side, number * 1_000_000, "hall-1")
+    status, out, err = run("decode", path, *words)
+    assert status == 0
+    assert not err or err.endswith("/meter.py is run as Python: a model of one's own is a program\n")
+    return [line.partition("  ")[2] or line for line in out.splitlines()]
+
+
+def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
+    delixi = (4, 0x02, 1, 0, bytes(4))
+    frames = [
+        frame(False, 1, 0x03, 0, 0, b"\x13\x88"),
+        *(frame(True, 1, 0x03, 500, 1), frame(False, 1, 0x03, 0, 0, b"", 0x02)),
+        frame(True, 0, 0x06, 8193, 0, b"\x13\x88"),
+        *(frame(True, 1, 0x08, 0, 0, b"\xa5\x37"), frame(False, 1, 0x08, 0, 0, b"\xa5\x37")),
+        *(frame(True, *delixi, framing=Framing.DELIXI), frame(False, *delixi, framing=Framing.DELIXI)),
+        frame(True, 1, 0x06, 2, 0, b"\0\x01"),
+    ]
+    assert told(run, tmp_path / "a.pcapng", frames) == [
+        "address 1  function 03: reply without its request: 01 03 02 13 88 B5 12",
+        "address 1  reads holding_register_500: refused, code 02H  (1.0 ms)",
+        "all drives  writes holding_register_8193 = 5000 (broadcast)",
+        "address 1  reads loopback_0 = 42295  (1.0 ms)",
+        "address 4  writes k2_0001 = 1  (1.0 ms)",
+        "address 1  writes holding_register_2 = 1: no reply",
+        "3 exchanges, 1 broadcast, 1 request without a reply, 1 reply without a request, 0 unknown bytes",
+    ]
+
+
+def test_noise_is_told_though_it_does_not_end() -> None:
+    heard, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
+    for time in range(4):
+        heard.put(b"\xff" * 1500, time)
+        told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(heard))])
+    assert told == [[], [], [(0, 4500)], []]
+    assert [(it.time_ns, len(it.raw)) for it in pairing.rest()] == [(3, 1500)]
+
+
+METER = """\
+from multidrop.core import NumberFormat
+from multidrop.drive.family import Drive
+from multidrop.drive.register import HOLDING, reading
+
+class Meter(Drive):
+    model = "meter"
+    most_registers = {HOLDING: 4}
+    power = reading(7, "kW", number_format=NumberFormat.F32, table=HOLDING)
+"""
+
+
+def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> None:
+    """The floating-point format's own, as a meter without a sensor says it."""
+    (tmp_path / "meter.py").write_text(METER)
+    drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
+    plant = tmp_path / "plant.toml"
+    plant.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
+    frames = [frame(True, 1, 0x03, 7, 2), frame(False, 1, 0x03, 0, 0, bytes.fromhex("7F C0 00 00"))]
+    assert told(run, tmp_path / "a.pcapng", frames, "--plant", plant)[0] == "meter  reads power ?  (1.0 ms)"
+    (line, _) = run("decode", tmp_path / "a.pcapng", "--plant", plant, "--json")[1].splitlines()
+    assert json.loads(line)["values"] == {"power": None}
+
+
+def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:
+    again = capture.parent / "again.pcapng"
+    first = run("sniff", "--replay", capture, "--out", again)
+    assert first[0] == 0
+    assert run("decode", again) == first
+
+
+def test_columns_of_a_capture_are_counted(run: Run, capture: Path) -> None:
+    out = capture.parent / "a.csv"
+    assert run("decode", capture, "--out", out) == (
+        0,
+        f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n",
+        "",
+    )
+    assert [row.value for row in recorded(out)] == [5000, 5000]
+
+
+# ---- what goes wrong gets one sentence ----
+
+
+def test_what_cannot_be_listened_to_is_told_in_a_sentence(run: Run, tmp_path: Path) -> None:
+    ordinary = tmp_path / "file"
+    ordinary.write_text("hello")
+    for port, sentence in (
+        (tmp_path / "none", "there is no such port"),
+        (ordinary, "it is not a serial port"),
+        (tmp_path, "it is not a serial port"),
+        ("socket://127.0.0.1:9", "nothing listens there"),
+    ):
+        assert run("sniff", port) == (1, "", f"multidrop: {port}: {sentence}\n")
+    port, sentence = "socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"
+    assert run("sniff", port) == (2, "", f"multidrop: {port}: {sentence}\n")
+
+
+def test_a_port_in_use_is_told_in_a_sentence(run: Run) -> None:
+    master, slave = pty.openpty()
+    fcntl.flock(slave, fcntl.LOCK_EX)
+    port = os.ttyname(slave)
+    assert run("sniff", port) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+    os.close(master)
+    os.close(slave)
+
+
+def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever is root has every permission: the system's refusal is played."""
+
+    def refuse(path: str, flags: int) -> int:
+        raise PermissionError(13, "Permission denied", path)
+
+    monkeypatch.setattr("multidrop.cli.sniff.listening.os.open", refuse)
+    assert run("sniff", "/dev/ttyS0") == (
+        1,
+        "",
+        "multidrop: /dev/ttyS0: no permission to open it (is the user in the group that owns it?)\n",
+    )
+
+
+def test_mistaken_calls_are_told_in_a_sentence(run: Run, tmp_path: Path, capture: Path) -> None:
+    none, text = tmp_path / "none.pcapng", tmp_path / "text"
+    text.write_text("hello, world")
+    cut = tmp_path / "cut.pcapng"
+    cut.write_bytes(capture.read_bytes()[:-5])
+    for words, status, sentence in (
+        (["sniff"], 2, "name a PORT to listen to, or a capture with --replay FILE"),
+        (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name ends in .pcapng"),
+        (["decode", none], 2, f"{none}: No such file or directory"),
+        (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
+        (
+            ["decode", capture, "--out", capture],
+            2,
+            f"{capture} is there already: name another file, or remove it first",
+        ),
+        (["decode", cut], 0, f"{cut} is cut: its last 103 bytes are no whole packet, and were left out"),
+    ):
+        found, _, err = run(*words)
+        assert (found, err) == (status, f"multidrop: {sentence}\n")
+
+
+def test_a_port_that_vanishes_ends_it_with_a_sentence(run: Run) -> None:
+    master, slave = pty.openpty()
+    threading.Timer(0.3, os.close, [master]).start()
+    port = os.ttyname(slave)
+    status, _, err = run("sniff", port)
+    os.close(slave)
+    assert status == 1
+    assert err.splitlines()[-1].startswith(f"multidrop: {port}: the port was lost (")

@@ -1,0 +1,382 @@
+"""`multidrop doctor`: what it reads out of the system, and what it says of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import struct
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_cli import Run, run
+from test_line_ports import SerialServer, pyserials_own, vanishing_pty
+
+from multidrop.cli.doctor.adapter import (
+    RS485_ENABLED,
+    RS485_RX_DURING_TX,
+    Adapter,
+    RS485Mode,
+    decoded_rs485,
+    find_adapter,
+    low_latency,
+    rs485_mode,
+)
+from multidrop.cli.doctor.findings import (
+    ROUNDS,
+    adapter_finding,
+    echo_finding,
+    latency_finding,
+    low_latency_finding,
+    round_trip_finding,
+    rs485_finding,
+)
+from multidrop.core import Completion, Framing, Message, Result, build_reply
+from multidrop.drive.timing import Settings
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.sim import Simulator, Wire, simulated
+
+__all__ = ["run"]  # a fixture
+
+USUAL = Settings(9600, "8N1")
+SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
+REFUSAL = bytes.fromhex("F7 83 04 61 1E")
+
+
+def heard(raw: bytes, result: int = Result.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
+    """What became of the request that nobody should answer."""
+    reply = Message(0xF7, 3, exception=exception)
+    return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)
+
+
+@pytest.fixture
+def sysfs(tmp_path: Path) -> Path:
+    """As Linux shows an FTDI adapter: links from classes to the tree of devices."""
+    usb = tmp_path / "devices/pci0000:00/usb1/1-2"
+    port = usb / "1-2:1.0/ttyUSB0"
+    (port / "tty/ttyUSB0").mkdir(parents=True)
+    for name, text in {
+        "idVendor": "0403",
+        "idProduct": "6001",
+        "manufacturer": "FTDI",
+        "product": "FT232R USB UART",
+    }.items():
+        (usb / name).write_text(text + "\n")
+    (port / "latency_timer").write_text("16\n")
+    driver = tmp_path / "bus/usb-serial/drivers/ftdi_sio"
+    driver.mkdir(parents=True)
+    (port / "driver").symlink_to(driver)
+    devices = tmp_path / "bus/usb-serial/devices"
+    devices.mkdir()
+    (devices / "ttyUSB0").symlink_to(port)
+    tty = tmp_path / "class/tty/ttyUSB0"
+    tty.mkdir(parents=True)
+    (tty / "device").symlink_to(port)
+    return tmp_path
+
+
+@pytest.fixture
+def port(request: pytest.FixtureRequest) -> Iterator[str]:
+    drives = [simulated(InvtCHE(1)), simulated(InnovertIBD(2, framing="ascii"))]
+    with Simulator([Wire(drives, unpaced=True, port=getattr(request, "param", "pty"))]) as sim:
+        yield sim.wires[0].path
+
+
+# ---- what the system says ----
+
+
+def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
+    it = find_adapter("/dev/ttyUSB0", sysfs)
+    assert (it.name, it.driver, it.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
+    assert (it.usb_id, it.latency_timer) == ("0403:6001", 16)
+
+
+def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
+    link = sysfs / "by-id"
+    link.symlink_to("/dev/ttyUSB0")
+    assert find_adapter(str(link), sysfs).driver == "ftdi_sio"
+
+
+def test_a_port_of_which_nothing_is_known(sysfs: Path) -> None:
+    assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
+
+
+def test_the_rs485_struct_is_linux_s() -> None:
+    # linux/serial.h: flags, two delays in ms, five words of padding
+    assert decoded_rs485(struct.pack("=8I", 0x01, 0, 0, 0, 0, 0, 0, 0)) == RS485Mode(True, False)
+    assert decoded_rs485(struct.pack("=8I", 0x13, 5, 5, 0, 0, 0, 0, 0)) == RS485Mode(True, True)
+    assert decoded_rs485(bytes(32)) == RS485Mode(False, False)
+    assert (RS485_ENABLED, RS485_RX_DURING_TX) == (1, 16)
+
+
+def test_a_pty_has_neither_flag_nor_mode() -> None:
+    master, slave = os.openpty()
+    try:
+        assert low_latency(slave) is None
+        assert rs485_mode(slave) is None
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+# ---- what is said of it ----
+
+
+def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
+    finding = latency_finding(find_adapter("/dev/ttyUSB0", sysfs))
+    assert finding.what == "16 ms: every reply may wait for so long in the adapter"
+    assert f"echo 1 | sudo tee {sysfs}/bus/usb-serial/devices/ttyUSB0/latency_timer" in finding.advice
+    assert 'ATTR{latency_timer}="1"' in finding.advice
+
+
+@pytest.mark.parametrize(
+    ("finding", "what", "advised"),
+    [
+        (latency_finding(Adapter("ttyUSB0", latency_timer=1)), "1 ms: the shortest there is", False),
+        (latency_finding(Adapter("ttyS0")), "the driver has none that can be seen", False),
+        (adapter_finding(Adapter("ttyS0")), "not on USB; the system names no driver for it", False),
+        (
+            adapter_finding(Adapter("ttyUSB0", "ch341", "QinHeng", "1a86:7523")),
+            "QinHeng (1a86:7523); its driver is ch341",
+            False,
+        ),
+        (low_latency_finding(None), "the driver has no such flag", False),
+        (
+            low_latency_finding(True),
+            "the flag is set: multidrop sets it whenever it opens the port",
+            False,
+        ),
+        (low_latency_finding(False), "the flag is not set: the driver did not take it from multidrop", True),
+        (
+            rs485_finding(None),
+            "the driver has none: the adapter itself must switch between sending and receiving",
+            False,
+        ),
+        (rs485_finding(RS485Mode(False, False)), "the driver has it, and it is off", True),
+        (rs485_finding(RS485Mode(True, False)), "on: the driver switches the direction", False),
+        (
+            rs485_finding(RS485Mode(True, True)),
+            "on: the driver switches the direction, and hears what it sends: multidrop takes the echo out",
+            False,
+        ),
+        (
+            echo_finding(heard(b""), SENT, USUAL),
+            "none at 9600 8N1: nothing came back of what was sent",
+            False,
+        ),
+        (
+            echo_finding(heard(SENT), SENT, USUAL),
+            "the adapter hears what it sends at 9600 8N1; multidrop takes it out",
+            False,
+        ),
+        (echo_finding(heard(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+        (
+            echo_finding(heard(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
+            "none at 9600 8N1; address 247, which should be nobody's, answers with exception 04",
+            True,
+        ),
+        (
+            echo_finding(heard(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
+            "the adapter hears what it sends at 9600 8N1; address 247, which should be nobody's, answers "
+            "with a value",
+            True,
+        ),
+    ],
+)
+def test_each_is_a_sentence_and_advice_only_where_there_is_something_to_do(
+    finding: object, what: str, advised: bool
+) -> None:
+    assert finding.what == what
+    assert bool(finding.advice) == advised
+
+
+def test_a_slow_round_trip_is_told_apart_from_a_usual_one() -> None:
+    drive = InvtCHE(1)
+    usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
+    assert usual.what.endswith("after 5.0 ms at least, 5.0 in the middle, 5.0 at most")
+    assert usual.advice == ""
+    slow = round_trip_finding(drive, [0.005] * 3 + [0.0201] * 10, 17)
+    assert "20.1 in the middle" in slow.what
+    assert slow.what.endswith("4 of 17 requests stayed without a good reply")
+    assert "usually takes 5.0 ms" in slow.advice
+    assert "did not answer once in 4 requests" in round_trip_finding(drive, [], 4).what
+
+
+def test_a_network_s_round_trip_has_the_wire_in_it() -> None:
+    told = round_trip_finding(InvtCHE(1), [0.0004, 0.0005, 0.0006], 3, 0.0094)
+    assert told.what.endswith(
+        "after 0.4 ms at least, 0.5 in the middle, 0.6 at most, from when its request was handed over "
+        "(a wire at 9600 8N1 alone takes 9.4 ms)"
+    )
+    assert told.advice == ""
+    assert round_trip_finding(InvtCHE(1), [0.0140], 1, 0.0094).advice == ""
+    assert "the adapter's or the network's" in round_trip_finding(InvtCHE(1), [0.0240], 1, 0.0094).advice
+
+
+# ---- the command ----
+
+
+def test_on_a_pty_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    status, out, err = run("doctor", port)
+    assert (status, err) == (0, "")
+    told = " ".join(out.split())
+    assert f"{port} is a pseudo-terminal" in told
+    assert "there is none, and so no driver" in told
+    assert "multidrop locks it against programs that heed such locks, makes it raw" in told
+    assert "none at 9600 8N1: nothing came back" in told
+    assert "not measured: a drive must answer -> name one with --model and --address" in told
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
+def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    status, out, _ = run("doctor", port)
+    told = " ".join(out.split())
+    assert status == 0
+    assert "is a TCP connection" in told
+    assert "at the far end" in told
+
+
+@pyserials_own
+@pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
+def test_on_a_port_of_pyserial_s_it_says_what_does_not_apply(run: Run, port: str) -> None:
+    server = SerialServer(port)
+    status, out, _ = run("doctor", server.url)
+    server.close()
+    told = " ".join(out.split())
+    assert status == 0
+    assert f"{server.url} is a pyserial rfc2217 port, which is copied to by two threads" in told
+    assert "at the far end" in told
+
+
+def test_a_port_that_is_lost_under_the_look_for_an_echo_is_told(run: Run) -> None:
+    port, hang_up = vanishing_pty()
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    out = run("doctor", port)[1]
+    thread.join()
+    assert "not tried: the port was lost (" in " ".join(out.split())
+
+
+def test_what_asks_a_driver_tells_a_port_that_is_gone_from_one_that_lacks_it() -> None:
+    master, slave = os.openpty()
+    os.close(master)
+    os.close(slave)
+    for ask in (low_latency, rs485_mode):
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            ask(slave)
+
+
+def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
+    words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
+    status, out, _ = run("doctor", port, *words)
+    assert status == 0
+    findings = {it["topic"]: it for it in json.loads(out)["findings"]}
+    assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
+
+
+@pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)
+def test_no_delay_is_negative_where_nothing_tells_of_bits(run: Run, port: str) -> None:
+    """The far end answers at once: sooner than a wire could have brought the request."""
+    status, out, _ = run("doctor", port, "--model", "invt-che", "--address", "1")
+    told = " ".join(out.split())
+    assert status == 0
+    found = re.search(
+        r"invt-che@1 begins to answer after (\S+) ms at least, (\S+) in the middle, (\S+) at", told
+    )
+    assert found
+    least, median, most = map(float, found.groups())
+    assert 0 <= least <= median <= most
+    assert "from when its request was handed over (a wire at 9600 8N1 alone takes 9.4 ms)" in told
+
+
+def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> None:
+    status, out, _ = run("doctor", port, "--baudrate", "19200", "--format", "8E1")
+    assert status == 0
+    assert "none at 19200 8E1: nothing came back" in out
+
+
+class FarEnd:
+    """A line of which every request is noted, and answered or not."""
+
+    def __init__(self, answer: Callable[[bytes], bytes]) -> None:
+        self.requests: list[bytes] = []
+        self._answer = answer
+        self._fd, slave = os.openpty()
+        tty.setraw(slave)
+        self.path = os.ttyname(slave)
+        self._slave = slave
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        received = b""
+        while (piece := os.read(self._fd, 4096)) != b"end":
+            received += piece
+            while len(received) >= 8:
+                request, received = received[:8], received[8:]
+                self.requests.append(request)
+                os.write(self._fd, self._answer(request))
+
+    def close(self) -> None:
+        os.write(self._slave, b"end")
+        self._thread.join()
+        os.close(self._fd)
+        os.close(self._slave)
+
+
+@pytest.fixture
+def far_end() -> Iterator[Callable[[Callable[[bytes], bytes]], FarEnd]]:
+    made: list[FarEnd] = []
+
+    def make(answer: Callable[[bytes], bytes]) -> FarEnd:
+        made.append(FarEnd(answer))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, far_end: Any) -> None:
+    """As a server does that answers for every address."""
+    end = far_end(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
+    told = " ".join(run("doctor", end.path)[1].split())
+    assert "answers with exception 04" in told
+    assert "came unasked" not in told
+
+
+def test_only_what_was_sent_is_counted(run: Run, far_end: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A silent drive is not asked again while its late answer may come; that was no request."""
+    end = far_end(lambda request: b"")
+    monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
+    status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
+    told = " ".join(out.split())
+    assert status == 1
+    sent = sum(request[0] == 9 for request in end.requests)
+    assert 1 <= sent < ROUNDS
+    assert f"invt-che@9 did not answer once in {sent} request{'s' * (sent != 1)} -> check its address" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "sentence"),
+    [
+        (("/dev/nowhere",), 1, "/dev/nowhere: there is no such port"),
+        (("/dev/null",), 1, "/dev/null: it is not a serial port"),
+        (("/dev/nowhere", "--model", "invt-che"), 2, "--model and --address belong together"),
+        (("/dev/nowhere", "--model", "invt", "--address", "1"), 2, "did you mean invt-che"),
+        (("/dev/nowhere", "--baudrate", "0"), 2, "baud rate 0 is outside 50 to 4000000"),
+        (("/dev/nowhere", "--format", "9N1"), 2, "format '9N1' is not data bits, parity and stop bits"),
+        (("/dev/nowhere", "--framing", "rtu"), 2, "name the drive with --model and --address"),
+    ],
+)
+def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
+    found, out, err = run("doctor", *words)
+    assert (found, out) == (status, "")
+    assert sentence in err
+    assert len(err.splitlines()) == 1

@@ -1,0 +1,528 @@
+"""The monitor: what it knows, how it looks at any size, and that its keys do nothing but stop."""
+
+from __future__ import annotations
+
+import re
+import string
+import termios
+import threading
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lines import PATIENCE
+from rich.console import Console
+from terminals import on_terminal
+from test_cli import Run, run
+from test_cli_poll import plant, plant_file
+
+import multidrop.cli.support.extra
+from multidrop.cli.monitor import PAGE, _Monitor
+from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
+from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
+from multidrop.cli.monitor.watched import WatchedPlant
+from multidrop.control.stop_all import Seen, Stopped
+from multidrop.core import Counters, Result
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
+from multidrop.polling.batch import Row
+from multidrop.recording import open_reader
+from multidrop.recording.rows import from_rows
+from multidrop.transport.statistics import LineStatistics, look
+
+__all__ = ["plant", "run"]  # fixtures
+
+SECOND = 1_000_000_000
+NOW = 1_795_253_400 * SECOND
+CHE = ("output_frequency", "output_current", "status", "fault")
+MISSES = Counter({Result.NO_REPLY: 3, Result.BAD_CHECKSUM: 9})
+
+
+def a_plant(tmp_path: Path, drives: int = 3) -> Plant:
+    path = tmp_path / "hall.toml"
+    text = '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
+    for at in range(1, drives + 1):
+        text += (
+            f'[[line.drive]]\nname = "drive-{at}"\nmodel = "invt-che"\naddress = {at}\npoll = {list(CHE)}\n'
+        )
+    path.write_text(text)
+    return load_plant(path)
+
+
+def row(drive: str, register: str, value: float | None, status: str = "ok", ago: float = 0.5) -> Row:
+    at = NOW - round(ago * SECOND)
+    return Row(at, at, None if value is None else 1000, drive, register, value, status)
+
+
+def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) -> dict[str, LineStatistics]:
+    """All of it is that of the first drive."""
+    busy = Counters(
+        sent=exchanges,
+        ideal_ns=round(utilisation * seconds * SECOND),
+        missed=MISSES,
+        late=2,
+        stray_bytes=17,
+        longest_ns=31_000_000,
+        delays=Counter({56: 99, 64: 1}),  # 8.4 to 9.4 ms, 16.8 to 18.9 ms
+    )
+    counters_by_drive = {f"drive-{at}": busy if at == 1 else Counters() for at in range(1, drives + 1)}
+    return {"hall-1": look(seconds, counters_by_drive, None)}
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> WatchedPlant:
+    """One drive that runs, one with a fault, one that never answered."""
+    it = WatchedPlant(a_plant(tmp_path))
+    rows = [
+        row("drive-1", "output_frequency", 42.5),
+        row("drive-1", "output_current", 2.5),
+        row("drive-1", "status", 1.0),
+        row("drive-1", "fault", 0.0),
+        row("drive-2", "output_frequency", 0.0, ago=9),
+        row("drive-2", "fault", 4.0, ago=9),
+        row("drive-2", "output_frequency", None, "bad checksum"),
+        *(row("drive-3", register, None, "no reply") for register in CHE),
+    ]
+    it.add(from_rows(rows))
+    it.tick(100.0, told(10, 1000, 0.9))
+    it.tick(101.0, told(11, 1050, 0.9))
+    return it
+
+
+def texts(lines: list[Any]) -> list[str]:
+    return [line.plain for line in lines]
+
+
+# ---- what it knows ----
+
+
+def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
+    assert [(it.state, it.fault, it.why_silent) for it in watched.drives] == [
+        ("forward", "", ""),
+        ("fault", "oc1_overcurrent_accelerating", ""),
+        ("silent", "", "no reply"),
+    ]
+    assert [it.age(NOW) for it in watched.drives] == [0.5, 9.0, None]
+    assert [it.so_far.misses.total() for it in watched.drives] == [12, 0, 0]
+
+
+def test_a_rested_drive_tells_why_it_is_rested(watched: WatchedPlant) -> None:
+    watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
+    assert watched.drives[2].why_silent == "no reply"
+
+
+def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
+    it = WatchedPlant(a_plant(tmp_path, 1))
+    it.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
+    assert it.drives[0].state == ""
+    it.add(from_rows([row("drive-1", "output_frequency", 3.0)]))
+    assert it.drives[0].state == "turns"
+
+
+def test_rates_are_those_of_the_last_seconds(watched: WatchedPlant) -> None:
+    lately = watched.lately["hall-1"]
+    assert lately.exchanges_per_second == pytest.approx(50)
+    assert lately.utilisation == pytest.approx(0.9)
+    assert lately.misses == {}
+    assert watched.so_far["hall-1"].misses == {"no reply": 3, "bad checksum": 9}
+    for second in range(2, 12):
+        watched.tick(100.0 + second, told(10 + second, 1050, 0.0))
+    assert watched.lately["hall-1"].exchanges == 0
+    assert watched.drives[0].lately.exchanges == 0
+
+
+def test_history_has_a_gap_where_a_value_was_missed(watched: WatchedPlant) -> None:
+    assert [list(it.history) for it in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
+    assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
+    assert sparkline([50, 50, 50], 2) == "██"
+    assert sparkline([0, 0], 5) == "▁▁"
+    assert sparkline([0, 7], 5, PLAIN_BLOCKS) == "_@"
+    assert sparkline([1, 2], 0) == ""
+
+
+# ---- how it looks ----
+
+
+def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
+    lines = texts(overview(watched, Position(), (80, 24), NOW, BLOCKS))
+    assert lines[0].startswith(" multidrop monitor  hall.toml")
+    assert lines[0].endswith("09:30:00 UTC ")
+    assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
+    assert lines[3].split() == [">drive-1", "forward", "42.50", "Hz", "2.5", "A", "0.5", "s", "12", "██"]
+    assert lines[4].startswith("!drive-2 fault")
+    assert "oc1_overc" in lines[4]
+    assert lines[5].split()[:5] == ["drive-3", "silent", "no", "reply", "never"]
+    assert lines[-1].startswith(" up/down choose")
+    assert "start" not in " ".join(lines).lower()
+
+
+@pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
+@pytest.mark.parametrize("drives", [1, 31, 247])
+def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+    it = WatchedPlant(a_plant(tmp_path, min(drives, 247)))
+    it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
+    it.tick(1.0, told(1, 1, 1.0, drives))
+    for chosen in (0, drives - 1):
+        failed = [f"drive-{number}: " + "why " * 40 for number in range(30)]
+        for at in (
+            Position(chosen),
+            Position(chosen, question="Stop?"),
+            Position(chosen, message="m" * 300),
+            Position(chosen, failures=failed),
+            Position(chosen, question="Leave?", failures=["x" * 5000]),
+        ):
+            for lines in (
+                overview(it, at, size, NOW, BLOCKS),
+                page(it.drives[chosen], {}, at, size, NOW),
+            ):
+                assert len(lines) == size[1]
+                assert max(len(line) for line in texts(lines)) <= size[0]
+        shown = texts(overview(it, Position(chosen), size, NOW, BLOCKS))
+        assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
+
+
+def test_the_page_has_every_register(watched: WatchedPlant) -> None:
+    it = watched.drives[1]
+    others = {"motor_speed": "0 rpm"}
+    lines = texts(page(it, others, Position(1, page=True), (80, 40), NOW))
+    assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
+    rows = {line.split()[0]: line for line in lines[3:-2] if line.strip()}
+    readable = {name for name, register in it.polled.drive.registers.items() if register.readable}
+    assert set(rows) == readable
+    assert rows["output_frequency"].split()[1:] == ["0.00", "Hz", "9.0", "s", "bad", "checksum"]
+    assert rows["status"].split()[1:3] == ["not", "yet"]
+    assert rows["motor_speed"].split()[1:] == ["0", "rpm", "not", "polled"]
+    assert rows["device"].split()[1] == "..."
+
+
+@pytest.mark.parametrize(
+    ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
+)
+def test_an_age_is_told_as_people_do(watched: WatchedPlant, seconds: int, age: str) -> None:
+    lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
+    assert " ".join(lines[3].split()[6:8]) == age
+
+
+def test_a_wide_overview_has_the_delays(watched: WatchedPlant) -> None:
+    lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
+    assert lines[2].split()[-2:] == ["DELAY", "HISTORY"]
+    assert " 8.9 ms " in lines[3]
+    assert " ms " not in lines[4]
+
+
+def test_the_page_says_how_the_drive_answers(watched: WatchedPlant) -> None:
+    lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
+    assert lines[1] == " forward      12 missed: bad checksum 9, no reply 3"
+    assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
+    silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), NOW))
+    assert silent[2] == " 0.0 exchanges/s"
+
+
+def test_the_page_scrolls_as_far_as_there_is_something(watched: WatchedPlant) -> None:
+    at = Position(0, page=True, scrolled=1000)
+    lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
+    assert lines[9].strip()
+    assert (
+        f"of {len([it for it in watched.drives[0].polled.drive.registers.values() if it.readable])}"
+        in lines[-2]
+    )
+
+
+# ---- its keys ----
+
+
+@pytest.mark.parametrize(
+    ("pressed", "keys"),
+    [
+        (b"q", ["q"]),
+        (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
+        (b"\x1bOBsy", [DOWN, "s", "y"]),
+        (b"\x1b[5~\x1b", ["page up", "escape"]),
+    ],
+)
+def test_keys_that_come_together_are_told_apart(pressed: bytes, keys: list[str]) -> None:
+    found = []
+    while pressed:
+        key, pressed = next_key(pressed)
+        found.append(key)
+    assert found == keys
+
+
+class Poller:
+    """Notes what is asked of its bus."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def bus(self, line: str) -> Poller:
+        return self
+
+    def stop_all(self) -> dict[str, Stopped]:
+        self.asked.append("stop all")
+        return {
+            "drive-1": Stopped("drive-1", Seen.STOPPED, 0.1),
+            "drive-2": Stopped("drive-2", Seen.FAILED, 0.2, "no reply"),
+        }
+
+    def perform(self, name: str, script: Any) -> None:
+        step = next(script)
+        self.asked.append(f"{name} {step.register.name} {step.value.name}")
+
+
+def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Poller]:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", "24")
+    poller = Poller()
+    plant = a_plant(tmp_path)
+    for polled in plant.lines[0].drives:
+        polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
+    anyone: Any = poller
+    monitor: Any = _Monitor(plant, anyone, [], Console())
+    monitor._in_background = monitor._carry_out  # at once
+    monitor._side.read = lambda chosen: {}
+    return monitor, poller
+
+
+def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    for keys, asked in (
+        (["s", "n"], []),
+        (["s", ENTER], []),
+        (["s", "Y"], []),
+        (["y"], []),
+        ([DOWN, "s", "y"], ["drive-2 control STOP"]),
+        (["S", "n"], []),
+        (["S", "y"], ["stop all"]),
+    ):
+        poller.asked.clear()
+        for key in keys:
+            monitor._obey(key)
+        assert poller.asked == asked
+
+
+def seen(monitor: Any) -> str:
+    """All that stands on the screen."""
+    return "\n".join(line.rstrip() for line in monitor._drawn().plain.split("\n"))
+
+
+def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    monitor._plant.tick(0.0, told(1, 1, 0.5))
+    for key in "Sy":
+        monitor._obey(key)
+    failure = "drive-2: failed after 0.2 s: no reply"
+    assert failure in seen(monitor)
+    assert "1 of 2 drives on hall-1 have stopped" in seen(monitor)
+    assert "a acknowledges what FAILED" in seen(monitor)
+    poller.stop_all = lambda: {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}  # type: ignore[method-assign]
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
+        monitor._obey(key)
+        assert failure in seen(monitor)
+    assert list(monitor.left_open()) == monitor._at.failures
+    monitor._obey("a")
+    assert failure not in seen(monitor)
+    assert "q quit" in seen(monitor)
+    assert list(monitor.left_open()) == []
+
+
+def test_all_lines_stand_in_what_a_stop_of_all_came_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    monitor._stood = {}
+    message = ""
+    for line in ("hall-1", "hall-2"):
+        message, _ = monitor._stop_all(line)
+    assert message == "1 of 2 drives on hall-1 have stopped; 1 of 2 drives on hall-2 have stopped"
+
+
+def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: WatchedPlant) -> None:
+    at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
+    shown: list[str] = []
+    for more in (24, 17, 10, 3, 0):
+        lines = texts(overview(watched, at, (80, 24), NOW, BLOCKS))
+        told = [line.strip(" !") for line in lines if line.startswith(" ! drive-")]
+        assert any(f"... and {more} more, after these" in line for line in lines) == bool(more)
+        shown += told
+        del at.failures[: at.failures_shown]
+    assert shown == [f"drive-{number}: no reply" for number in range(31)]
+
+
+@pytest.mark.parametrize("failure", [OSError("the ledger cannot be kept"), KeyError("odd"), RuntimeError()])
+def test_a_stop_that_fails_in_any_way_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    monitor._plant.tick(0.0, told(1, 1, 0.5))
+
+    def fail(*details: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(poller, "stop_all", fail)
+    monkeypatch.setattr(poller, "perform", fail)
+    for key in "Sysy":
+        monitor._obey(key)
+    words = str(failure) or "RuntimeError"
+    assert f"stopping all drives on hall-1 failed: {words}" in seen(monitor)
+    assert f"stopping drive-1 failed: {words}" in seen(monitor)
+
+
+def test_leaving_under_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    stands = threading.Event()
+    del monitor._in_background  # in a thread, as it is
+    monitor._stop = lambda chosen: (str(stands.wait(PATIENCE)), [])
+    for key in ("s", "y", "q", "n"):
+        monitor._obey(key)
+        assert not monitor._has_left
+    assert list(monitor.left_open()) == ["a stop was under way and is not waited for: look at the motors"]
+    for key in ("q", "y"):
+        monitor._obey(key)
+    assert monitor._has_left
+    stands.set()
+    for thread in monitor._stops:
+        thread.join()
+    assert list(monitor.left_open()) == []
+
+
+def test_page_keys_scroll_a_page_and_choose_in_the_overview(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monitor, _ = a_monitor(tmp_path, monkeypatch)
+    monitor._obey(PAGE_DOWN)
+    assert (monitor._at.chosen, monitor._at.scrolled) == (2, 0)
+    monitor._obey(ENTER)
+    for key, scrolled in ((PAGE_DOWN, PAGE), (PAGE_DOWN, 2 * PAGE), (PAGE_UP, PAGE), (UP, 0), (PAGE_UP, 0)):
+        monitor._obey(key)
+        assert monitor._at.scrolled == scrolled
+    assert monitor._at.chosen == 1
+
+
+def test_no_key_does_more_than_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor, poller = a_monitor(tmp_path, monkeypatch)
+    for key in [*string.printable, *KEYS.values()]:
+        for answer in "yY\r ":
+            monitor._obey(key)
+            monitor._obey(answer)
+    assert set(poller.asked) <= {"stop all", *(f"drive-{at} control STOP" for at in (1, 2, 3))}
+
+
+# ---- on a terminal ----
+
+
+def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"\r")
+        terminal.wait_for("TOY T1  address 1")
+        terminal.wait_for("acceleration_time")
+        terminal.press(b"\x1bs")
+        terminal.wait_for("Stop pump-1? y stops it")
+        terminal.press(b"n")
+        terminal.wait_for("nothing was sent")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=60) == 0
+        assert termios.tcgetattr(terminal.slave) == terminal.before
+
+
+def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
+    """Not below it: a screen that scrolls is never still, and shows parts of two pictures."""
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        pictures = homes = 0
+        while pictures < 4:
+            terminal.press(b"\x1b[B")  # forgets what was written: within a picture, maybe
+            terminal.wait_for("q quit")
+            terminal.wait_for("multidrop monitor")
+            pictures += len(re.findall(rb".{5} multidrop monitor", terminal.written, re.DOTALL))
+            homes += len(re.findall(rb"\x1b\[H(?:\x1b\[[0-9;]*m)* multidrop monitor", terminal.written))
+        assert pictures == homes
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=20) == 0
+
+
+def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"sy")
+        terminal.wait_for("pump-1 has stopped")
+        terminal.press(b"\x1b[Bsy")
+        terminal.wait_for("the stop is repeated for 30 s at least: pump-9")
+
+
+def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
+    with on_terminal("monitor", plant) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"\x1b[B\r")
+        terminal.wait_for("TOY T1  address 9")
+        terminal.wait_for("NoReply")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=60) == 0
+
+
+def test_what_it_shows_is_recorded(plant: Path, tmp_path: Path) -> None:
+    out = tmp_path / "seen.arrows"
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=60) == 0
+    rows = [row for batch in open_reader(out) for row in batch]
+    assert {row.drive for row in rows} == {"pump-1", "pump-9"}
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("seen.arrows")  # it is there already
+        assert terminal.process.wait(timeout=60) == 2
+
+
+def test_where_no_port_opens_nothing_is_recorded(tmp_path: Path) -> None:
+    plant, out = tmp_path / "hall.toml", tmp_path / "seen.arrows"
+    plant.write_text(
+        '[[line]]\nname = "hall"\nport = "/dev/not-there"\n'
+        '[[line.drive]]\nname = "pump"\nmodel = "invt-che"\naddress = 1\n'
+    )
+    with on_terminal("monitor", plant, "--out", out) as terminal:
+        terminal.wait_for("there is no such port")
+        assert terminal.process.wait(timeout=60) == 1
+    assert not out.exists()
+
+
+def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
+    environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
+    with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:
+        terminal.wait_for(">pump-1")
+        terminal.wait_for("pump-9 silent")  # and the other has answered
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=60) == 0
+        assert not re.search(rb"\x1b\[[0-9;]*3[0-9]m", terminal.written)
+        assert terminal.written.isascii()
+
+
+def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
+    with on_terminal("monitor", plant, TERM="dumb") as terminal:
+        terminal.wait_for(">pump-1")
+        terminal.wait_for("q quit")
+        assert b"\x1b" not in terminal.written
+        picture = terminal.text[terminal.text.index(" multidrop monitor") :].partition("q quit")[0]
+        assert len(picture.splitlines()) == 23
+        terminal.wait_for("pump-9 silent")
+        terminal.press(b"q")
+        assert terminal.process.wait(timeout=60) == 0
+
+
+def test_a_terminal_that_is_too_small_is_one_sentence(plant: Path) -> None:
+    with on_terminal("monitor", plant, size=(40, 10)) as terminal:
+        terminal.wait_for("too small: it has 40 x 10")
+        assert terminal.process.wait(timeout=60) == 2
+
+
+def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None:
+    status, _, err = run("monitor", plant_file(tmp_path))
+    assert status == 2
+    assert err == "multidrop: `multidrop monitor` needs a terminal; `multidrop poll` works without one\n"
+
+
+def test_without_the_extra_it_is_named(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multidrop.cli.support.extra.importlib.util, "find_spec", lambda name: None)
+    status, _, err = run("monitor", plant_file(tmp_path))
+    assert status == 2
+    assert "pip install 'multidrop[monitor]'" in err

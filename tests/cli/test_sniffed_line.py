@@ -1,0 +1,184 @@
+"""A mixed line that pymodbus masters, while `sniff` only listens: first undamaged, then damaged on the way.
+
+SNIFFED_EXCHANGES says how many exchanges; the whole proof takes 10,000.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from peers import require_module
+from taps import tapped
+from test_cli_sniff import sniffing
+from test_sim_lines import opened, receive
+
+from multidrop.core import FrameSpan, Framing, Kind, Message, Splitter, Stream, build_request, parse_reply
+from multidrop.drive import Drive
+from multidrop.drives import DelixiNative, InnovertIBD, InvtCHE
+from multidrop.sim import EncodedDrive, Simulator, Wire
+
+EXCHANGES = int(os.environ.get("SNIFFED_EXCHANGES", "300"))
+TURN = 10  # exchanges of one master before the next one's
+BAUDRATE = 1_000_000  # characters and silences take next to no time
+TO_HEAR = ["--baudrate", BAUDRATE]
+
+
+def drives() -> list[Drive]:
+    return [
+        type(family.__name__, (family,), {"baudrates": (BAUDRATE,), "needed_silence": lambda drive: 0.0})(
+            address, framing=framing
+        )
+        for address, (family, framing) in enumerate(
+            (
+                (InnovertIBD, Framing.RTU),
+                (InvtCHE, Framing.RTU),
+                (InnovertIBD, Framing.ASCII),
+                (DelixiNative, Framing.DELIXI),
+            ),
+            1,
+        )
+    ]
+
+
+# ---- masters that know nothing of us ----
+
+Said = tuple[int, int, list[int] | int]  # address, function, values or minus the exception code
+NUMBERS = itertools.count(1)  # each is written once: so an exchange can be told from all others
+
+
+def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Callable[..., Iterator[Said]]:
+    """A master that reads and writes with pymodbus."""
+
+    def master(port: str, chance: random.Random) -> Iterator[Said]:
+        client = require_module("pymodbus.client")
+        kind = require_module("pymodbus").FramerType(framer)
+        with client.ModbusSerialClient(port, framer=kind, baudrate=BAUDRATE, timeout=5) as it:
+            for _ in range(TURN):
+                if chance.random() < 0.6:
+                    start = chance.choice(starts)
+                    reply = it.read_holding_registers(start, count=chance.randint(1, 3), device_id=address)
+                    yield address, 3, -reply.exception_code if reply.isError() else reply.registers
+                else:
+                    number = next(NUMBERS) % 10_000
+                    assert not it.write_register(written, number, device_id=address).isError()
+                    yield address, 6, [number]
+
+    return master
+
+
+def delixi(port: str, chance: random.Random) -> Iterator[Said]:
+    """pymodbus does not speak it."""
+    with opened(port) as fd:
+        for _ in range(TURN):
+            register = chance.choice([DelixiNative.output_frequency, DelixiNative.output_current])
+            request = Message(4, 7, register.address, data=bytes(4))
+            os.write(fd, build_request(Framing.DELIXI, request))
+            _, reply = parse_reply(Framing.DELIXI, receive(fd, 21), request)
+            assert reply is not None
+            yield 4, 7, [int.from_bytes(reply.data)]
+
+
+MASTERS = (
+    pymodbus("rtu", 1, [0, 1], InnovertIBD.frequency.address),
+    pymodbus("rtu", 2, [0x3000, 0x3001], InvtCHE.setpoint.address),
+    pymodbus("ascii", 3, [0, 1], InnovertIBD.frequency.address),
+    delixi,
+)
+
+
+def mastered(hear: Callable[[bytes], bytes] = bytes) -> tuple[list[Said], list[dict[str, Any]]]:
+    """What the masters have said and been answered, and what `sniff` tells of it."""
+    chance = random.Random(1)
+    said: list[Said] = []
+    simulator = Simulator([Wire([EncodedDrive(drive) for drive in drives()])])
+    with (
+        simulator,
+        tapped(simulator.wires[0].path, BAUDRATE, hear) as (port, tap),
+        sniffing(tap, *TO_HEAR) as sniffer,
+    ):
+        while len(said) < EXCHANGES:
+            said += chance.choice(MASTERS)(port, chance)
+    return said, sniffer.told
+
+
+def told_as_said(told: dict[str, Any]) -> Said:
+    values = -told["exception"] if told["result"] == "refused" else list(told["values"].values())
+    return told["address"], told["function"], values
+
+
+def test_every_exchange_of_a_mixed_line_is_heard() -> None:
+    said, told = mastered()
+    assert [told_as_said(it) for it in told[:-1]] == said
+    assert told[-1]["summary"] == {
+        "exchanges": len(said),
+        "broadcasts": 0,
+        "unanswered": 0,
+        "strays": 0,
+        "unknown_bytes": 0,
+    }
+    assert {it["framing"] for it in told[:-1]} == {"rtu", "ascii", "delixi"}
+
+
+# ---- with damage ----
+
+
+@dataclass
+class Damage:
+    """One byte in a hundred is changed, lost or doubled on its way to the listener."""
+
+    said: bytearray = field(default_factory=bytearray)
+    damaged: list[int] = field(default_factory=list)  # places in what was said
+    chance: random.Random = field(default_factory=lambda: random.Random(2))
+
+    def __call__(self, said: bytes) -> bytes:
+        heard = bytearray()
+        for byte in said:
+            kind = self.chance.choice(["changed", "lost", "doubled"]) if self.chance.random() < 0.01 else ""
+            if kind:
+                self.damaged.append(len(self.said))
+            self.said.append(byte)
+            if kind != "lost":
+                heard.append(byte ^ self.chance.randrange(1, 256) if kind == "changed" else byte)
+            if kind == "doubled":
+                heard.append(byte)
+        return bytes(heard)
+
+    def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
+        """Of each exchange whether it is whole, and its frames."""
+        heard = Stream()
+        heard.put(bytes(self.said), 0)
+        heard.end(True)
+        spans = list(Splitter().spans(heard))
+        assert [span.kind for span in spans] == [Kind.REQUEST, Kind.REPLY] * (len(spans) // 2)
+        damaged, found, at = set(self.damaged), [], 0
+        for pair in zip(spans[::2], spans[1::2], strict=True):
+            length = sum(len(span.raw) for span in pair)
+            found.append((damaged.isdisjoint(range(at, at + length)), frames(pair)))
+            at += length
+        return found
+
+
+def frames(pair: tuple[FrameSpan, ...]) -> tuple[str, ...]:
+    return tuple(span.raw.hex(" ").upper() for span in pair)
+
+
+def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
+    damage = Damage()
+    said, told = mastered(damage)
+    exchanges = damage.exchanges()
+    assert len(exchanges) == len(said)
+    assert len(damage.damaged) > 0.005 * len(damage.said)
+    is_whole = [whole for whole, _ in exchanges]
+    expected = [exchanges[at][1] for at in range(1, len(exchanges) - 1) if all(is_whole[at - 1 : at + 2])]
+    assert len(expected) > 0.3 * len(said)
+    heard = [tuple(it["frames"]) for it in told[:-1] if it.get("result") in ("ok", "refused")]
+    rest = iter(heard)
+    assert [it for it in expected if it not in rest] == []  # all of them, in their order
+    assert set(heard) <= {it for _, it in exchanges}  # and nothing that was never said
+    unknown = sum(len(bytes.fromhex(it["unknown"])) for it in told[:-1] if "unknown" in it)
+    assert told[-1]["summary"]["unknown_bytes"] == unknown > 0

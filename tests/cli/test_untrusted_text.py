@@ -1,0 +1,180 @@
+"""Names from files and arguments: whatever stands in them commands no terminal and breaks no page."""
+
+from __future__ import annotations
+
+import ast
+import struct
+import subprocess
+from pathlib import Path
+
+import pytest
+from frames import PRINTED
+from terminals import MULTIDROP
+from test_capture import write
+from test_cli import Run, run
+from test_plot import record, row
+
+import multidrop.cli
+from multidrop.core import Framing, Message
+from multidrop.plant.loader import PlantError, load_plant
+from multidrop.printable import printable
+from multidrop.report import load, plot, plot_page, png, report_page
+
+__all__ = ["run"]  # a fixture
+
+# Clear the screen; set the title; write the clipboard; run from right to left; one-byte escape; two lines.
+TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")
+TRAP = "".join(TRAPS)
+
+
+def is_harmless(text: str) -> bool:
+    return all(line.isprintable() for line in text.split("\n"))
+
+
+def test_what_prints_stays_as_it_is() -> None:
+    assert printable("pump-1 насос 泵 é '\"\\") == "pump-1 насос 泵 é '\"\\"
+    assert printable("\x1b[2J") == r"\x1b[2J"
+    assert all(printable(trap).isprintable() for trap in TRAPS)
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_a_plant_file_has_no_names_and_ports_that_do_not_print(tmp_path: Path, trap: str) -> None:
+    text = "".join(f"\\u{ord(character):04x}" for character in trap)
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        f'[[line]]\nname = "{text}"\nport = "{text}"\n'
+        f'[[line.drive]]\nname = "{text}"\nmodel = "invt-che"\naddress = 1\n'
+    )
+    with pytest.raises(PlantError) as found:
+        load_plant(path)
+    assert len(found.value.mistakes) == 3
+    assert all("has characters that do not print" in sentence for sentence in found.value.mistakes)
+    assert is_harmless(str(found.value))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("doctor", TRAP),
+        ("read", TRAP, "invt-che", 1),
+        ("read", "/dev/nowhere", TRAP, 1),
+        ("read", "/dev/nowhere", "invt-che", 1, TRAP),
+        ("stop", TRAP, "invt-che", 1),
+        ("write", TRAP, "invt-che", 1, TRAP, TRAP),
+        ("set-frequency", TRAP, "invt-che", 1, 5, "--yes"),
+        ("scan", TRAP),
+        ("sniff", TRAP),
+        ("sniff", f"socket://{TRAP}:1"),
+        ("plan", TRAP),
+        ("poll", TRAP),
+        ("simulate", TRAP, "--ports", TRAP),
+        ("models", TRAP),
+        ("models", f"{TRAP}.py:Fan"),
+        ("plot", TRAP),
+        ("report", f"{TRAP}.arrows"),
+        ("convert", f"{TRAP}.arrows", "b.csv"),
+        ("decode", TRAP),
+        (TRAP,),
+        ("models", TRAP, TRAP),
+    ],
+)
+def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object, ...]) -> None:
+    status, out, err = run(*(str(word).replace("\0", "") for word in words))
+    assert status in (1, 2)
+    assert err.startswith("multidrop: ")
+    assert is_harmless(out + err)
+
+
+def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_path: Path) -> None:
+    rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(10)]
+    rows.append(row(3, TRAP, TRAP, None, TRAP))
+    drive = dict.fromkeys(("line", "model", "settings", "address", "framing"), TRAP)
+    names = {"unit": TRAP, "values": {TRAP: 1, "$x^{$": 2}, "bits": False}
+    registers = {f"{TRAP}1": names, f"{TRAP}2": {**names, "bits": True}}
+    about = {"plant": TRAP, "drives": {TRAP: {**drive, "registers": registers}}}
+    path = record(tmp_path / "it.arrows", rows, about)
+    for command, suffix in (("plot", ".html"), ("report", ".html")):
+        status, out, err = run(command, path, "--out", tmp_path / f"{command}{suffix}")
+        assert (status, err) == (0, "")
+        assert is_harmless(out + err)
+        page = (tmp_path / f"{command}{suffix}").read_text("utf-8")
+        assert is_harmless(page.replace("\u202f", " "))
+        assert r"\x1b[2J" in page or command == "plot"
+    status, out, err = run("plot", path, "--drive", "x")
+    assert status == 2
+    assert is_harmless(out + err)
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+@pytest.mark.parametrize("name", ["$x^{$", "_hidden", "$", "a$b$c", "\\frac", "%s{0}", TRAP])
+def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
+    rows = [
+        row(at, name, register, at) for at in range(3) for register in (name, "output_frequency", "fault")
+    ]
+    rows.append(row(3, name, name, None, name))
+    look = load(record(tmp_path / "it.arrows", rows, {"drives": {name: {"line": name}}}))
+    figure, _ = plot(look)
+    assert png(figure)
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 2
+    assert report_page(look)
+    assert plot_page(look, figure)
+
+
+def test_the_interfaces_and_comments_of_a_capture_are_told_without_their_commands(
+    run: Run, tmp_path: Path
+) -> None:
+    exchanges = [it for it in PRINTED if it.framing is Framing.RTU and isinstance(it.says, Message)]
+    path = write(tmp_path / "it.pcapng", [it for it in exchanges if it.request is not None][:3], line=TRAP)
+    comment = struct.pack("<HH4s", 1, 4, b"\x1b[2J")
+    section = struct.pack("<III", 0x0A0D0D0A, 36, 0x1A2B3C4D) + struct.pack("<HHq", 1, 0, -1) + comment
+    path.write_bytes(section + struct.pack("<I", 36) + path.read_bytes()[section_length(path) :])
+    for words in (("decode", path), ("decode", path, "--json"), ("sniff", "--replay", path)):
+        status, out, err = run(*words)
+        assert status == 0
+        assert "3 exchanges" in out or "--json" in words
+        assert is_harmless(out + err)
+    damaged = path.read_bytes()[:200].replace(struct.pack("<HHI", 252, 0, 0), struct.pack("<HHI", 1, 0, 0))
+    path.write_bytes(damaged)
+    status, out, err = run("decode", path)
+    assert status == 2
+    assert "is Ethernet" in err
+    assert is_harmless(out + err)
+
+
+def section_length(path: Path) -> int:
+    return int(struct.unpack_from("<I", path.read_bytes(), 4)[0])
+
+
+def test_commands_print_through_what_spells_out() -> None:
+    """A `print` of its own is only for what is no text of others: help, drawing, questions."""
+    ours = {"__init__.py", "support/saying.py", "support/confirm.py", "poll/live_table.py", "scan.py"}
+    root = Path(multidrop.cli.__file__).parent
+    found = {
+        str(path.relative_to(root))
+        for path in root.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    }
+    assert found == ours
+
+
+@pytest.mark.parametrize("command", ["plan", "poll"])
+def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str) -> None:
+    """In a process of its own, as a file is run once in each."""
+    (tmp_path / "fan.py").write_text(
+        "from pathlib import Path\nfrom multidrop import Drive, reading\n"
+        f"Path({str(tmp_path / 'ran')!r}).touch()\n\n"
+        "class Fan(Drive):\n    speed = reading(1, 'rpm')\n"
+    )
+    plant = tmp_path / "hall.toml"
+    plant.write_text(
+        '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
+        + "".join(f'[[line.drive]]\nname = "fan-{n}"\nmodel = "fan.py:Fan"\naddress = {n}\n' for n in (1, 2))
+    )
+    done = subprocess.run([*MULTIDROP, command, str(plant)], capture_output=True, text=True)
+    assert (tmp_path / "ran").exists()
+    told, *rest = done.stderr.splitlines()
+    assert told == f"multidrop: {tmp_path}/fan.py is run as Python: a model of one's own is a program"
+    assert not any("is run as Python" in line for line in rest)
+    assert done.returncode == (0 if command == "plan" else 1)

@@ -1,0 +1,596 @@
+"""A bus and its drives, on simulated lines: what is sent, what is returned, and what goes wrong."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from itertools import chain, repeat
+from typing import Any, cast
+
+import checksums
+import pytest
+from lines import Faulty, patient, proof, until
+from toy import Fault, Toy
+
+from multidrop.bus import READ_ATTEMPTS, Bus, exchange
+from multidrop.core import Framing, Message
+from multidrop.drive import Drive, Script
+from multidrop.drive.register import HOLDING, Kept, command, reading, setting
+from multidrop.drive.verbs import verb
+from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.drives.innovert_ibd import IBDControl
+from multidrop.drives.invt_che import parameter
+from multidrop.errors import BadReply, BusError, DriveRefused, LineError, NoReply, Refused, Unconfirmed
+from multidrop.poller import Poller
+from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport import exchange as exchanges
+
+
+class Rig(Drive):
+    """A test rig: one register of each kind."""
+
+    response_timeout = 0.1
+    most_registers = {HOLDING: 4}
+    options = {}
+
+    speed = reading(0x00, "rpm")
+    torque = reading(0x01, "%", step=0.1)
+    fault = reading(0x02, Fault)
+    gain = setting(0x10, step=0.01, span=(0, 10), kept=Kept.RAM)
+    limit = setting(0x11, "A", step=0.1, span=(0, 50), kept=Kept.EEPROM)
+    sealed = setting(0x12, never="it is the maker's", kept=Kept.RAM)
+    target = command(0x20, "rpm", span=(0, 3000), moves=False)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Take it for a rig: there is nothing else on these lines."""
+        yield from ()
+
+
+class MyCHE(InvtCHE):
+    """A CHE whose owner has looked a parameter up."""
+
+    acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
+
+
+def unpaced(*drives: SimulatedDrive) -> Simulator:
+    return Simulator([Wire(drives, unpaced=True)])
+
+
+def faulty(drive: SimulatedDrive, fate: Callable[[bytes], bytes]) -> Simulator:
+    return Simulator([Faulty([drive], fate, unpaced=True)])
+
+
+def path(sim: Simulator) -> str:
+    return sim.wires[0].path
+
+
+def sent(drive: SimulatedDrive) -> dict[int, int]:
+    """How many requests of each function the drive has heard."""
+    return dict(drive.counters.functions)
+
+
+def losing(*functions: int) -> Callable[[bytes], bytes]:
+    """The fate of replies to these functions: lost."""
+    return lambda reply: b"" if reply[1] in functions else reply
+
+
+# ---- reading ----
+
+
+@patient
+def test_one_value_in_its_unit() -> None:
+    rig = simulated(Rig(1))
+    rig["torque"] = 33.3
+    with unpaced(rig) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        assert bus.read(ours, ours.torque) == 33.3
+        assert bus.read(ours, ours.fault) is Fault.NONE
+        rig["fault"] = Fault.OVERCURRENT
+        assert bus.read(ours, ours.fault) is Fault.OVERCURRENT
+
+
+@patient
+def test_many_values_in_the_order_asked_for() -> None:
+    with unpaced(EncodedDrive(Rig(1))) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        asked = [ours.gain, ours.speed, ours.limit, ours.torque, ours.gain]
+        found = bus.read_many(ours, asked)
+        assert list(found) == ["gain", "speed", "limit", "torque"]
+        assert found == {register.name: proof(ours, register) for register in asked}
+
+
+REQUESTS = {  # all readings: from the documents' maps and limits
+    ErmanERG220: 2,  # 1 to 12, across the addresses between; 0400H to 0403H
+    InvtCHE: 4,  # 1001H; 3000H to 3016H, 16 at a time; 5000H and 5001H
+    InnovertIBD: 2,  # PrA.03 and PrA.04; PrA.22
+    DelixiModbus: 32,  # one at a time
+    DelixiNative: 33,
+    YD1000: 16,
+}
+
+
+@patient
+@pytest.mark.parametrize("family", REQUESTS)
+def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive]) -> None:
+    there = EncodedDrive(family(1))
+    with unpaced(there) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(family, 1)
+        found = bus.read_many(ours, ours.readings())
+        counters = bus.peer(ours).counters()
+    assert found == {register.name: proof(ours, register) for register in ours.readings()}
+    echo_probes = 1 if ours.telling else 0  # on a line of which it is not known whether its adapter echoes
+    assert counters.answered == REQUESTS[family] + echo_probes
+    assert there.counters.requests == counters.exchanges == counters.answered
+    assert there.counters.refusals == 0
+
+
+@patient
+def test_drives_of_all_families_at_their_own_baud_rate_and_format() -> None:
+    drives = [
+        ErmanERG220(1),
+        InvtCHE(2, baudrate=19200, format="8E1"),
+        InnovertIBD(3),
+        InnovertIBD(4, framing=Framing.ASCII, baudrate=38400, format="8O1"),
+        DelixiModbus(5),
+        DelixiModbus(6, framing=Framing.ASCII),
+        DelixiNative(7, baudrate=4800),
+        YD1000(8),
+    ]
+    with Simulator([Wire([EncodedDrive(drive) for drive in drives])]) as sim, Bus(path(sim)) as bus:
+        for ours in [bus.attach(drive) for drive in drives] * 2:
+            register = ours.readings()[-1]
+            assert bus.read(ours, register) == proof(ours, register)
+
+
+def test_the_bus_has_defaults_for_drives_without_their_own() -> None:
+    with unpaced(simulated(Toy(1))) as sim, Bus(path(sim), baudrate=19200, format="8N2") as bus:
+        assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
+        assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"
+        assert str(bus.attach(Toy(3)).settings) == "9600 8N1"
+
+
+# ---- writing ----
+
+
+@patient
+def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
+    """One bit is added, as to the standard's own."""
+    drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
+    with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
+        for at in (1, 2):
+            drive = bus.attach(ErmanERG220, at)
+            assert drive.needed_silence() == 600e-6
+            assert exchange(drive, Message(at, 4, 1, 1), bus.peer(drive)).c.silence_ns == 626042
+            bus.read(drive, drive.output_current)
+        assert bus.attach(ErmanERG220, 3, silence=1e-3).needed_silence() == 1e-3
+        assert bus.attach(ErmanERG220, 4, silence=None).needed_silence() == 1.75e-3
+        with pytest.raises(ValueError, match=r"^silence 300 us is shorter than 1\.5 characters at 38400 8N1"):
+            bus.attach(ErmanERG220, 5, silence=300e-6)
+
+
+@patient
+def test_a_write_returns_what_the_drive_then_holds() -> None:
+    rig = simulated(Rig(1))
+    with unpaced(rig) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        assert bus.write(ours, ours.gain, 1.234) == 1.23
+        assert bus.write(ours, ours.target, 1500) == 1500  # cannot be read: what was written
+    assert (rig["gain"], rig["target"]) == (1.23, 1500)
+    assert sent(rig)[0x06] == 2
+
+
+@patient
+def test_a_value_that_the_drive_clamps() -> None:
+    """IBD stores a value above the largest as the largest, and confirms it as it was sent."""
+    ibd = simulated(InnovertIBD(1))
+    with unpaced(ibd) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(InnovertIBD, 1)
+        assert bus.write(ours, ours.acceleration_time, 4000.0) == 3600.0
+
+
+@patient
+def test_eeprom_is_written_on_change_only() -> None:
+    rig = simulated(Rig(1))
+    rig["limit"] = 10.0
+    with unpaced(rig) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        assert bus.write(ours, ours.limit, 10.0) == 10.0
+        assert not rig.counters.writes
+        assert bus.write(ours, ours.limit, 12.5) == 12.5
+        assert bus.write(ours, ours.limit, 12.5) == 12.5
+    assert rig.counters.eeprom_writes == {"limit": 1}
+
+
+@patient
+def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
+    che = simulated(MyCHE(1))
+    with unpaced(che) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(MyCHE, 1)
+        for seconds in (5.0, 6.0, 7.0):
+            assert bus.write(ours, ours.acceleration_time, seconds) == seconds
+    assert [(it.address, it.raw) for it in che.counters.writes] == [(0x8008, 50), (0x8008, 60), (0x8008, 70)]
+    assert not che.counters.eeprom_writes
+
+
+MISTAKES: dict[str, tuple[Callable[[Bus, Rig], Any], type[Exception], str]] = {
+    "a reading is written": (
+        lambda bus, rig: bus.write(rig, rig.speed, 1),
+        Refused,
+        "speed of pump is not written: it is a reading",
+    ),
+    "a sealed setting is written": (
+        lambda bus, rig: bus.write(rig, rig.sealed, 1),
+        Refused,
+        "sealed of pump is not written: it is the maker's",
+    ),
+    "above the span": (
+        lambda bus, rig: bus.write(rig, rig.target, 3001),
+        ValueError,
+        "target = 3001 is outside 0 to 3000 rpm",
+    ),
+    "no finite number": (
+        lambda bus, rig: bus.write(rig, rig.gain, float("nan")),
+        ValueError,
+        "gain takes a finite number, not nan",
+    ),
+    "no number": (
+        lambda bus, rig: bus.write(rig, rig.gain, "1"),
+        TypeError,
+        "gain takes a number, not '1'",
+    ),
+    "a truth value": (
+        lambda bus, rig: bus.write(rig, rig.gain, True),
+        TypeError,
+        "gain takes a number, not True",
+    ),
+    "a command is read": (
+        lambda bus, rig: bus.read(rig, rig.target),
+        ValueError,
+        "target of pump cannot be read: it is a command",
+    ),
+    "one of many cannot be read": (
+        lambda bus, rig: bus.read_many(rig, [rig.speed, rig.target]),
+        ValueError,
+        "target of pump cannot be read: it is a command",
+    ),
+    "an address that is taken": (
+        lambda bus, rig: bus.attach(Toy, 1),
+        ValueError,
+        "address 1 is taken by pump",
+    ),
+    "the same drive again": (
+        lambda bus, rig: bus.attach(rig),
+        ValueError,
+        "address 1 is taken by pump",
+    ),
+    "an address that no drive has": (
+        lambda bus, rig: bus.attach(Toy, 32),
+        ValueError,
+        "address 32 is not one of TOY T1: 1 to 31",
+    ),
+    "no address": (
+        lambda bus, rig: bus.attach(Toy),
+        TypeError,
+        "attach(Toy, address=...): which address does it have?",
+    ),
+    "a drive of another bus": (
+        lambda bus, rig: bus.read(Toy(5), Toy.status),
+        ValueError,
+        "toy@5 is not attached to this bus: use bus.attach(...)",
+    ),
+    "another family's register is read": (
+        lambda bus, rig: bus.read(rig, InvtCHE.output_current),
+        ValueError,
+        "this output_current is no register of pump, which is a Rig",
+    ),
+    "another family's register is written": (
+        lambda bus, rig: bus.write(rig, YD1000.acceleration_time, 5.0),
+        ValueError,
+        "this acceleration_time is no register of pump, which is a Rig",
+    ),
+    "a name is read": (
+        lambda bus, rig: bus.read(rig, "target"),
+        TypeError,
+        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "a name is written": (
+        lambda bus, rig: bus.write(rig, "target", 5.0),
+        TypeError,
+        "'target' is no register of pump: use its attribute, or drive.register(NAME)",
+    ),
+    "a name of a drive is read": (
+        lambda bus, rig: bus.read("pump", rig.target),
+        TypeError,
+        "'pump' is no drive: it is what attach returns",
+    ),
+    "a name is attached": (
+        lambda bus, rig: bus.attach("innovert-ibd", 2),
+        TypeError,
+        "attach takes a family such as InnovertIBD, or a drive of one, not 'innovert-ibd'",
+    ),
+    "a drive that is made is attached at another address": (
+        lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
+        TypeError,
+        "pump is made already: what it is to be goes into Toy(…)",
+    ),
+    "a class is attached that is no family": (
+        lambda bus, rig: bus.attach(dict, 2),
+        TypeError,
+        "attach takes a family such as InnovertIBD, or a drive of one, not <class 'dict'>",
+    ),
+    "no port": (
+        lambda bus, rig: Bus(cast(Any, None)),
+        TypeError,
+        "a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not None",
+    ),
+    "a file instead of its plant": (
+        lambda bus, rig: Poller(cast(Any, "plant.toml")),
+        TypeError,
+        "Poller takes a Plant, such as load_plant('plant.toml') gives, not 'plant.toml'",
+    ),
+    "a broadcast that the document does not have": (
+        lambda bus, rig: bus.broadcast(rig.target, 0),
+        Refused,
+        "has no harmless broadcast of target",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_told_before_anything_is_sent(mistake: str) -> None:
+    call, kind, sentence = MISTAKES[mistake]
+    rig = simulated(Rig(1))
+    with unpaced(rig) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1, name="pump")
+        with pytest.raises(kind) as caught:
+            call(bus, ours)
+    assert sentence in str(caught.value)
+    assert rig.counters.requests == rig.counters.broadcasts == 0
+
+
+def test_a_verb_of_a_drive_that_is_on_no_bus() -> None:
+    with pytest.raises(RuntimeError, match=r"^toy@1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"):
+        Toy(1).start()
+
+
+# ---- what goes wrong on the line ----
+
+
+@pytest.fixture
+def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait so long for each reply, though the drive answers at once: the machine may be busy."""
+    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", 0.5)
+    monkeypatch.setattr(Rig, "response_timeout", 0.5)
+
+
+def test_a_confirmation_that_is_lost_and_cannot_be_looked_up() -> None:
+    rig = simulated(Rig(1))
+    with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        with pytest.raises(Unconfirmed) as caught:
+            bus.write(ours, ours.target, 1500)
+    assert str(caught.value) == "Rig@1: it is not known whether target = 1500 rpm took effect: no reply"
+    assert (caught.value.drive, caught.value.what) == ("Rig@1", "target = 1500 rpm")
+    assert sent(rig)[0x06] == 1
+    assert rig["target"] == 1500  # as it happens
+
+
+def test_a_confirmation_that_is_lost_and_nothing_can_be_read_back() -> None:
+    rig = simulated(Rig(1))
+    with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        with pytest.raises((Unconfirmed, NoReply)):
+            bus.write(ours, ours.gain, 2.0)
+    assert sent(rig).get(0x06, 0) <= 1
+
+
+def test_a_drive_that_says_nothing_is_asked_a_few_times() -> None:
+    rig = simulated(Rig(1))
+    with faulty(rig, losing(0x03)) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1, name="pump")
+        with pytest.raises(NoReply) as caught:
+            bus.read(ours, ours.speed)
+        until(lambda: rig.counters.requests >= READ_ATTEMPTS)
+    assert str(caught.value).startswith("pump does not answer: check its address, ")
+    assert caught.value.drive == "pump"
+    assert isinstance(caught.value, TimeoutError)
+    assert rig.counters.requests == READ_ATTEMPTS
+
+
+@pytest.mark.usefixtures("half_a_second")
+def test_a_damaged_reply_is_shown() -> None:
+    rig = simulated(Rig(1))
+    with faulty(rig, lambda reply: reply[:-1] + b"\0") as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1, name="pump")
+        with pytest.raises(BadReply) as caught:
+            bus.read(ours, ours.speed)
+    good = checksums.rtu("01 03 02 00 00")
+    assert caught.value.reason == "bad checksum"
+    assert caught.value.frame == good[:-1] + b"\0"
+    assert str(caught.value) == f"pump: bad checksum (received {caught.value.frame.hex(' ').upper()})"
+    assert rig.counters.requests == READ_ATTEMPTS
+
+
+@pytest.mark.usefixtures("half_a_second")
+def test_a_read_is_repeated_after_noise() -> None:
+    fates = chain([lambda reply: b"", lambda reply: reply[:-1]], repeat(lambda reply: reply))
+    rig = simulated(Rig(1))
+    rig["speed"] = 1480
+    with faulty(rig, lambda reply: next(fates)(reply)) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        assert bus.read(ours, ours.speed) == 1480
+
+
+WRONG = {  # pymodbus, libmodbus and minimalmodbus each take some of these for the reply
+    "another address": checksums.rtu("02 03 02 00 07"),
+    "another function": checksums.rtu("01 04 02 00 07"),
+    "too many registers": checksums.rtu("01 03 04 00 07 00 07"),
+    "too few registers": checksums.rtu("01 03 00"),
+    "bad checksum": b"\x01\x03\x02\x00\x07\x00\x00",
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_reply_is_never_data(wrong: str) -> None:
+    with faulty(simulated(Rig(1)), lambda reply: WRONG[wrong]) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        with pytest.raises((BadReply, NoReply)):  # where this machine is late
+            bus.read(ours, ours.speed)
+
+
+WRONG_ECHOES = {
+    "another register": "01 06 00 21 05 DC",
+    "another value": "01 06 00 20 05 DD",
+    "another address": "02 06 00 20 05 DC",
+    "another function": "01 05 00 20 05 DC",
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_ECHOES)
+def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
+    echo = checksums.rtu(WRONG_ECHOES[wrong])
+
+    def fate(reply: bytes) -> bytes:
+        return echo if reply[1] == 0x06 else reply
+
+    rig = simulated(Rig(1))
+    with faulty(rig, fate) as sim, Bus(path(sim)) as bus:
+        ours = bus.attach(Rig, 1)
+        with pytest.raises(Unconfirmed):
+            bus.write(ours, ours.target, 1500)
+    assert sent(rig)[0x06] == 1
+
+
+REFUSALS = [  # exception codes mean what the family's document says
+    (Rig(1), Rig.speed, "01 83 02", 0x02, "illegal address"),
+    (ErmanERG220(1), ErmanERG220.output_current, "01 84 03", 0x03, "bad addresses on read"),
+    (InvtCHE(1), InvtCHE.output_current, "01 83 12", 0x12, "write not allowed: out of range, "),
+    (
+        InnovertIBD(1),
+        InnovertIBD.output_current,
+        "01 83 02",
+        0x02,
+        "a code that the document does not explain",
+    ),
+]
+
+
+@patient
+@pytest.mark.parametrize(("drive", "register", "reply", "code", "meaning"), REFUSALS)
+def test_a_refusal_has_its_family_s_meaning(
+    drive: Drive, register: Any, reply: str, code: int, meaning: str
+) -> None:
+    there = simulated(drive)
+    with faulty(there, lambda _: checksums.rtu(reply)) as sim, Bus(path(sim)) as bus:
+        bus.attach(drive)
+        with pytest.raises(DriveRefused) as caught:
+            bus.read(drive, register)
+    assert caught.value.code == code
+    assert caught.value.meaning.startswith(meaning)
+    assert str(caught.value).startswith(f"{drive.name} refuses: code {code:02X}H, {meaning}")
+    assert there.counters.requests == 1  # an answer, which asking again would not change
+
+
+@pytest.mark.parametrize(
+    ("drive", "least_ms", "most_ms"),
+    [
+        (InvtCHE(1), 20, 400),
+        (YD1000(1), 110, 500),  # answers after 24 characters of 11 bits
+        (YD1000(1, baudrate=2400), 440, 500),
+        (YD1000(1, baudrate=1200), 500, 500),
+    ],
+    ids=lambda it: f"{it.name} {it.settings}" if isinstance(it, Drive) else None,
+)
+def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, most_ms: int) -> None:
+    with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
+        known = bus.peer(bus.attach(drive)).c
+    assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)
+
+
+# ---- broadcasts ----
+
+
+@patient
+def test_a_stop_to_all_of_one_family() -> None:
+    drives = [simulated(InnovertIBD(address)) for address in (1, 2)]
+    with unpaced(*drives) as sim, Bus(path(sim)) as bus:
+        for it in drives:
+            bus.attach(it.drive)
+        bus.broadcast(InnovertIBD.control, IBDControl.STOP)
+    assert [it.counters.broadcasts for it in drives] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("drives", "value"),
+    [
+        ([InnovertIBD(1), InnovertIBD(2)], IBDControl.RUN),
+        ([InnovertIBD(1), InvtCHE(2)], IBDControl.STOP),
+        ([InnovertIBD(1), InnovertIBD(2, baudrate=19200)], IBDControl.STOP),
+        ([InnovertIBD(1), InnovertIBD(2, framing=Framing.ASCII)], IBDControl.STOP),
+    ],
+    ids=["a start", "another family", "another baud rate", "another framing"],
+)
+def test_a_broadcast_that_could_do_harm_is_refused(drives: list[Drive], value: IBDControl) -> None:
+    there = [simulated(drive) for drive in drives]
+    with unpaced(*there) as sim, Bus(path(sim)) as bus:
+        for it in there:
+            bus.attach(it.drive)
+        with pytest.raises(Refused):
+            bus.broadcast(InnovertIBD.control, value)
+    assert [it.counters.broadcasts for it in there] == [0, 0]
+
+
+# ---- one bus for all ----
+
+
+@patient
+def test_two_threads_on_one_bus() -> None:
+    drives = [EncodedDrive(Toy(address)) for address in (1, 2, 3)]
+    wrong: list[Any] = []
+    with unpaced(*drives) as sim, Bus(path(sim)) as bus:
+        ours = [bus.attach(Toy, address) for address in (1, 2, 3)]
+
+        def read(drive: Toy) -> None:
+            truth = {register.name: proof(drive, register) for register in drive.readings()}
+            for _ in range(15):
+                try:
+                    found = bus.read_many(drive, drive.readings())
+                except BusError as failure:
+                    wrong.append(failure)
+                else:
+                    wrong.extend([found] if found != truth else [])
+
+        threads = [threading.Thread(target=read, args=(drive,)) for drive in ours]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert wrong == []
+
+
+def read_for_ever(bus: Bus, rig: Rig) -> None:
+    while True:
+        bus.read(rig, rig.speed)
+
+
+def read_until_closed(bus: Bus, rig: Rig) -> None:
+    with pytest.raises(LineError):
+        read_for_ever(bus, rig)
+
+
+@patient
+def test_a_bus_that_is_closed_while_others_use_it() -> None:
+    """Whoever comes too late gets an error, and nothing worse happens."""
+    with unpaced(simulated(Rig(1))) as sim:
+        for _ in range(20):
+            bus = Bus(path(sim))
+            ours = bus.attach(Rig, 1)
+
+            threads = [threading.Thread(target=read_until_closed, args=(bus, ours)) for _ in range(3)]
+            for thread in threads:
+                thread.start()
+            bus.read(ours, ours.speed)
+            bus.close()
+            for thread in threads:
+                thread.join()

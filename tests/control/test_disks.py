@@ -1,0 +1,201 @@
+"""Ledger and audit log on disks that are full, come back or take nothing, and under a clock set back."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import AbstractContextManager, closing
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from disks import full_at, read_only_directory
+from halls import one
+
+from multidrop.cli import main
+from multidrop.control.audit_log import AuditLog, read_audit
+from multidrop.control.eeprom_ledger import Ledger, LedgerCell
+from multidrop.drives import DelixiModbus, ErmanERG220, InvtCHE
+from multidrop.errors import Refused
+
+CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
+HOUR = 3600.0
+NOON = 1_795_000_000.0
+
+
+def raises_unkept() -> AbstractContextManager[object]:
+    return pytest.raises(OSError, match=r"the ledger of EEPROM writes .* cannot be kept")
+
+
+def writes(ledger: Ledger) -> int:
+    return sum(wear.writes for wear in ledger.wear(NOON))
+
+
+# ---- the audit log ----
+
+
+@pytest.mark.parametrize("room", range(0, 90, 10))
+def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> None:
+    path = tmp_path / "audit.jsonl"
+    log, other = AuditLog(path), AuditLog(path)  # of another process
+    log.add(0, {"write": "first"})
+    with full_at(path.stat().st_size + room):
+        for _ in range(2):
+            with pytest.raises(OSError, match=r"room for a part|File too large"):
+                log.add(1, {"write": "lost" * 20})
+    other.add(2, {"write": "second"})
+    log.add(3, {"write": "third"})
+    for it in (log, other):
+        it.close()
+    assert [it["write"] for it in read_audit(path)] == ["first", "second", "third"]
+    whole = path.read_bytes().splitlines()
+    assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
+
+
+def _is_record(line: bytes) -> bool:
+    try:
+        json.loads(line)
+    except ValueError:
+        return False
+    return True
+
+
+def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+    drive.set_frequency(20)
+    drive.start()
+    with full_at(path.stat().st_size + 50):
+        drive.stop()
+    assert not sim.motor.energised
+    assert "the audit log cannot be written: " in caplog.text
+    drive.set_frequency(30)
+    hall.bus.close()
+    assert [it["write"] for it in read_audit(path)] == [
+        "setpoint = 40.00 %",
+        "control = FORWARD",
+        "setpoint = 60.00 %",
+    ]
+
+
+def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with read_only_directory() as directory, pytest.raises(PermissionError, match=r"audit\.jsonl"):
+        one(monkeypatch, InvtCHE(1), audit=directory / "audit.jsonl")
+
+
+# ---- the ledger ----
+
+
+@pytest.mark.parametrize("room", [0, 512, 4096, 8192, 12288])
+def test_a_ledger_on_a_full_disk_keeps_the_write_back_and_goes_on_afterwards(
+    tmp_path: Path, room: int
+) -> None:
+    ledger = Ledger(tmp_path / "wear.sqlite")
+    for at in range(3):
+        assert ledger.enter(CELL, NOON + at, 0.0) == ""
+    others = 0
+    with full_at(room), raises_unkept():
+        while others < 1000:  # until it must grow, where it has room for some
+            others += not ledger.enter(LedgerCell("p" * 200, 2, "m", f"r{others}"), NOON, 0.0)
+    assert others < 1000
+    assert ledger.enter(CELL, NOON + 3, 0.0) == ""
+    assert writes(ledger) == 4 + others
+
+
+@pytest.mark.parametrize("room", [0, 512, 4096, 8192])
+def test_a_ledger_that_was_begun_on_a_full_disk(tmp_path: Path, room: int) -> None:
+    ledger = Ledger(tmp_path / "wear.sqlite")
+    with full_at(room), pytest.raises(OSError, match="cannot be kept"):
+        ledger.enter(CELL, NOON, 0.0)
+    assert ledger.enter(CELL, NOON, 0.0) == ""
+    assert writes(ledger) == 1
+
+
+def test_a_ledger_in_a_read_only_directory_keeps_the_write_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    with read_only_directory() as directory:
+        for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
+            hall, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
+            with pytest.raises(OSError, match=r"the ledger of EEPROM writes .*wear\.sqlite cannot be kept"):
+                drive.set_frequency(10)
+            assert hall.written == []
+            drive.stop()  # needs none
+            assert len(hall.written) == 1
+
+
+def test_a_clock_that_is_set_back_an_hour_frees_one_write_and_no_more(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path / "wear.sqlite")
+    assert ledger.enter(CELL, NOON, 60.0) == ""
+    set_back = NOON - HOUR
+    assert ledger.enter(CELL, set_back, 60.0) == ""
+    for second in range(60):  # by the clock as it is now
+        assert "was written" in ledger.enter(CELL, set_back + second, 60.0)
+    assert ledger.enter(CELL, set_back + 60, 60.0) == ""
+    assert writes(ledger) == 3
+
+
+def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path / "wear.sqlite", budget=10)
+    for at in range(10):
+        assert ledger.enter(CELL, NOON + at, 0.0) == ""
+    for set_back in (HOUR, 86400.0, NOON):  # at last to 1970, as a board without a battery begins
+        assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
+
+
+# ---- both, under a drive ----
+
+
+def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """10 Hz to an EEPROM for an hour of such a clock: once a minute at most, and once for the jump."""
+    log = tmp_path / "audit.jsonl"
+    hall, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
+    utc = [1_700_000_000 * 10**9]
+    monkeypatch.setattr("multidrop.control.writer.utc_minus_monotonic_ns", lambda: utc[0])
+    tried = []
+    for second in range(240):
+        if second == 120:
+            utc[0] -= 3600 * 10**9
+        try:
+            drive.set_frequency(10 + second / 10)
+        except Refused:
+            continue
+        finally:
+            hall.sleep(1)
+        tried.append(second)
+    gaps = sorted(after - before for before, after in pairwise(tried))
+    assert len(tried) >= 5
+    assert all(gap >= 58 for gap in gaps[1:])  # all but the one in which the clock was set back
+    assert sim.counters.eeprom_writes["frequency"] == len(tried)
+    hall.bus.close()
+    times = [str(it["time"]) for it in read_audit(log)]
+    assert len(times) == len(tried)
+    assert times != sorted(times)  # the log says what the clock said, in the order of what was done
+
+
+def test_a_budget_of_a_drive_s_own_ledger_outlives_the_bus(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for life in range(3):
+        _, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
+        drive.set_frequency(10 + life)
+    assert writes(Ledger(tmp_path / "wear.sqlite")) == 3
+
+
+@pytest.mark.parametrize(
+    "time", ["'yesterday'", "x'00'", "null", "9e999", "-1e308", "1e308", "1" + "0" * 400]
+)
+def test_a_ledger_with_a_time_that_is_none_keeps_the_write_back(tmp_path: Path, time: str) -> None:
+    ledger, cell = Ledger(tmp_path / "wear.sqlite"), LedgerCell("/dev/ttyUSB0", 1, "toy", "acceleration_time")
+    assert ledger.enter(cell, 100.0, 60.0) == ""
+    with closing(sqlite3.connect(ledger.path)) as file:
+        file.execute(f"update writes set time = {time}")
+        file.commit()
+    why = "cannot be kept: it has a write of acceleration_time at a time that is none"
+    with pytest.raises(OSError, match=why):
+        ledger.enter(cell, 1000.0, 60.0)
+    assert main(["wear", "--ledger", str(ledger.path)]) == 1
+    with closing(sqlite3.connect(ledger.path)) as file:
+        assert file.execute("select count(*) from writes").fetchone() == (1,)

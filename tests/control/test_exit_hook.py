@@ -1,0 +1,269 @@
+"""Leaving by a signal: all buses are stopped at once, and no second signal keeps a motor running."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+from lines import PATIENCE, until
+from motors import Heard
+
+from multidrop.control.exit_hook import CUT_SHORT, ExitHook
+from multidrop.drives import InvtCHE
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+
+BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+
+
+class Act:
+    """A last act that takes as long as the test wants."""
+
+    def __init__(self) -> None:
+        self.is_begun = False
+        self.works = threading.Event()
+        self.go_on = threading.Event()
+
+    def begin(self) -> None:
+        self.is_begun = True
+
+    def work(self) -> None:
+        self.works.set()
+        assert self.go_on.wait(PATIENCE)
+
+
+@pytest.fixture
+def caught() -> Iterator[list[int]]:
+    """The signals that had the effect that they had before."""
+    found: list[int] = []
+    before = [
+        (it, signal.signal(it, lambda number, frame: found.append(number)))
+        for it in (signal.SIGINT, signal.SIGTERM)
+    ]
+    yield found
+    for number, handler in before:
+        signal.signal(number, handler)
+
+
+@BOTH
+def test_a_second_signal_is_held_until_all_is_done(caught: list[int], number: int) -> None:
+    hook, acts = ExitHook(), [Act(), Act()]
+    for act in acts:
+        hook.add(act.begin, act.work)
+    signal.raise_signal(number)
+    assert all(act.is_begun for act in acts)  # at once
+    for act in acts:
+        assert act.works.wait(PATIENCE)  # side by side: none of them is over
+    signal.raise_signal(number)
+    acts[0].go_on.set()
+    assert caught == []
+    acts[1].go_on.set()
+    until(lambda: caught)
+    assert caught == [number]
+    assert signal.getsignal(number) != hook._on_signal
+
+
+@BOTH
+def test_a_signal_while_one_bus_is_left_begins_the_others(caught: list[int], number: int) -> None:
+    hook, acts = ExitHook(), [Act(), Act()]
+    made = [hook.add(act.begin, act.work) for act in acts]
+    timer = threading.Thread(target=lambda: (acts[0].works.wait(PATIENCE), signal.raise_signal(number)))
+    timer.start()
+    release = threading.Thread(target=lambda: (acts[1].works.wait(PATIENCE), acts[0].go_on.set()))
+    release.start()
+    hook.finish(made[0])  # the signal comes meanwhile
+    assert caught == []
+    acts[1].go_on.set()
+    until(lambda: caught)
+    assert caught == [number]
+    timer.join()
+    release.join()
+
+
+def test_the_third_signal_within_a_second_cuts_it_short_and_says_so(
+    caught: list[int], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr("multidrop.control.exit_hook.time.monotonic", lambda: now)
+    hook, act = ExitHook(), Act()
+    made = hook.add(act.begin, act.work)
+    for _ in range(5):  # slowly, as many as one likes
+        signal.raise_signal(signal.SIGINT)
+        now += 0.7
+    assert caught == []
+    now += 5
+    for count in (0, 0, 1):
+        signal.raise_signal(signal.SIGINT)
+        now += 0.1
+        assert len(caught) == count
+    assert capfd.readouterr().err.encode() == CUT_SHORT
+    hook.finish(made)  # nobody waits for it
+    act.go_on.set()
+    until(lambda: not threading_names() & {"multidrop exit"})
+    assert len(caught) == 1
+
+
+def threading_names() -> set[str]:
+    return {thread.name for thread in threading.enumerate()}
+
+
+def test_an_act_that_fails_holds_nobody_up(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    hook = ExitHook()
+    act = hook.add(lambda: None, fail)
+    hook.finish(act)
+    assert "the drives could not be stopped" in caplog.text
+
+
+def test_it_may_be_finished_on_any_thread(caught: list[int]) -> None:
+    hook, act = ExitHook(), Act()
+    made = hook.add(act.begin, act.work)
+    act.go_on.set()
+    thread = threading.Thread(target=hook.finish, args=[made])
+    thread.start()
+    thread.join(PATIENCE)
+    assert made.is_over
+    signal.raise_signal(signal.SIGTERM)
+    assert caught == [signal.SIGTERM]
+
+
+# ---- in processes ----
+
+CLIENT = """
+import sys, time
+from contextlib import ExitStack
+from multidrop import Bus, InvtCHE
+with ExitStack() as stack:
+    buses = [stack.enter_context(Bus(port)) for port in sys.argv[2:]]
+    for bus in buses:
+        for address in (1, 2, 3, 4):
+            pump = bus.attach(InvtCHE(address, maximum_frequency=50))
+            pump.set_frequency(20)
+            pump.start()
+        bus.stop_on_exit()
+    print("running", flush=True)
+    if sys.argv[1] == "wait":
+        time.sleep(600)
+"""
+
+
+@contextmanager
+def lines(count: int) -> Iterator[tuple[list[list[Heard]], list[str]]]:
+    """What the four drives of each line hear, and the ports."""
+    heard: list[list[Heard]] = []
+    for _ in range(count):
+        sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3, 4)]
+        for sim in sims:
+            assert isinstance(sim, PoweredDrive)
+            sim.motor.acceleration_time, sim.motor.deceleration_time = 0.2, 3.0
+        heard.append([Heard(sim) for sim in sims if isinstance(sim, PoweredDrive)])
+    with Simulator([Wire([it.sim for it in one], unpaced=True) for one in heard]) as simulator:
+        yield heard, [wire.path for wire in simulator.wires]
+
+
+@contextmanager
+def client(how: str, ports: list[str]) -> Iterator[subprocess.Popen[str]]:
+    words = [sys.executable, "-c", CLIENT, how, *ports]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+        yield process
+
+
+def stops(heard: list[Heard]) -> int:
+    broadcast = max(sum(it.address == 0 for it in one.requests) for one in heard)
+    return broadcast + sum(it.data[-1] == 5 for one in heard for it in one.writes if it.start == 0x1000)
+
+
+def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
+    with lines(1) as (heard, ports), client("wait", ports) as process:
+        for it in heard[0]:
+            it.loses = lambda request: True
+        process.send_signal(signal.SIGINT)
+        until(lambda: stops(heard[0]))
+        for _ in range(20):  # two that come at once are one
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(0.1)
+                break
+            except subprocess.TimeoutExpired:
+                pass
+        _, told = process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
+        assert CUT_SHORT.decode() in told
+
+
+@BOTH
+def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
+    """It comes when the first drive has its stop, and the others have none perhaps."""
+    with lines(1) as (heard, ports), client("wait", ports) as process:
+        process.send_signal(number)
+        until(lambda: stops(heard[0]))
+        process.send_signal(number)
+        process.communicate()
+        assert process.returncode == -number
+        assert not any(it.sim.motor.energised for it in heard[0])
+
+
+def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
+    with lines(1) as (heard, ports), client("leave", ports) as process:
+        until(lambda: stops(heard[0]))
+        process.send_signal(signal.SIGTERM)
+        process.communicate()
+        assert process.returncode == -signal.SIGTERM
+        assert not any(it.sim.motor.energised for it in heard[0])
+
+
+def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
+    with lines(2) as (heard, ports), client("wait", ports) as process:
+        turning_at_last_stop: list[bool] = []
+        for one, others in (heard, heard[::-1]):
+            for it in one:
+                it.loses = seen(it, others, turning_at_last_stop)
+        process.send_signal(signal.SIGTERM)
+        process.communicate()
+        assert process.returncode == -signal.SIGTERM
+        assert all(stops(one) for one in heard)
+        assert turning_at_last_stop
+        assert all(turning_at_last_stop)
+        assert not any(it.sim.motor.energised for one in heard for it in one)
+
+
+def seen(drive: Heard, others: list[Heard], found: list[bool]) -> Callable[[Any], bool]:
+    """Note at its first stop that the others still turn along their ramps."""
+
+    def loses(request: Any) -> bool:
+        if request.start == 0x1000 and request.data[-1:] == b"\5" and drive.sim.motor.frequency > 0:
+            found.append(all(it.sim.motor.frequency > 0 for it in others))
+        return False
+
+    return loses
+
+
+def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    from lines import line, plant, polled
+
+    from multidrop.poller import Poller
+
+    with lines(2) as (heard, ports):
+        drives = [InvtCHE(1, maximum_frequency=50, name=f"pump-{number}") for number in (1, 2)]
+        declared = [
+            line(port, polled(drive, [drive.output_frequency]), name=f"line-{number}")
+            for number, (port, drive) in enumerate(zip(ports, drives, strict=True))
+        ]
+        with ExitStack() as stack:
+            poller = stack.enter_context(Poller(plant(*declared)))
+            for drive in drives:
+                drive.set_frequency(20)
+                drive.start()
+            poller.stop_on_exit()
+        assert not any(it.sim.motor.energised for one in heard for it in one)

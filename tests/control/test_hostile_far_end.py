@@ -1,0 +1,150 @@
+"""Replies lost, damaged, doubled, merged, cut, and among foreign frames and junk: nothing is mistaken.
+
+As test_hostile_line.py, which has more kinds of faults, but with nothing of the library at the far end: what
+the drives hold, the checksums and the judge of what we send are our own. A seed makes the same faults in
+the same order; the port and the time are real. For longer:
+`HOSTILE_SEEDS=50 pytest tests/control/test_hostile_far_end.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+import checksums
+import pytest
+from far_drives import KINDS, FarDrive
+from far_end import FarEnd, FarLine
+from lines import line, plant, polled, rows_of, until
+from test_mixed_line import REASONS
+from test_stop_wins import quick
+
+from multidrop.drive import Drive
+from multidrop.errors import BusError
+from multidrop.plant.model import PolledDrive
+from multidrop.poller import Poller
+
+SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))
+FRAMES = 150  # that the far end hears
+STRANGER = 99  # no drive of ours has this address
+MOTOR = "yd1000"
+REGISTERS = 5  # of each drive
+
+
+class Hostile:
+    """What becomes of replies: one in three is mistreated, in one way."""
+
+    def __init__(self, seed: int) -> None:
+        self.struck: Counter[str] = Counter()
+        self._chance = random.Random(seed)
+        self._kept = b""
+        self._ways = {
+            "lost": lambda said: b"",
+            "damaged": self._damaged,
+            "doubled": lambda said: said + said,
+            "merged": self._merged,
+            "cut": lambda said: said[: self._chance.randrange(len(said))],
+            "foreign before": lambda said: self._foreign() + said,
+            "foreign instead": lambda said: self._foreign(),
+            "junk": lambda said: self._chance.randbytes(self._chance.randint(1, 40)) + said,
+        }
+
+    def mangle(self, said: bytes) -> bytes:
+        kept, self._kept = self._kept, b""
+        if said and self._chance.random() < 0.33:
+            way = self._chance.choice(list(self._ways))
+            self.struck[way] += 1
+            said = self._ways[way](said)
+        return kept + said
+
+    def _damaged(self, said: bytes) -> bytes:
+        at, bit = self._chance.randrange(len(said)), self._chance.randrange(8)
+        return said[:at] + bytes([said[at] ^ 1 << bit]) + said[at + 1 :]
+
+    def _merged(self, said: bytes) -> bytes:
+        """It comes with the next one."""
+        self._kept = said
+        return b""
+
+    def _foreign(self) -> bytes:
+        """Another master's exchange with a drive that is not ours, whole and with a good checksum."""
+        count, value = self._chance.randint(1, 4), self._chance.randrange(0x10000)
+        words = f"{value:04X}" * count
+        return self._chance.choice(
+            (
+                checksums.rtu(f"{STRANGER:02X}03{2 * count:02X}{words}"),
+                checksums.rtu(f"{STRANGER:02X}030010{count:04X}"),
+                checksums.rtu(f"{STRANGER:02X}061000{value:04X}"),
+                checksums.ascii(f"{STRANGER:02X}03{2 * count:02X}{words}"),
+                checksums.delixi(f"{STRANGER:02X}0701F40000{value:04X}"),
+            )
+        )
+
+
+def far_drive(kind: str, drive: PolledDrive) -> FarDrive:
+    """It holds another number in each register that is polled, and no two drives share one."""
+    found = FarDrive(KINDS[kind], drive.drive.address)
+    for at, poll in enumerate(drive.polls):
+        found.hold(poll.register.address, value(drive.drive.address, at))
+    return found
+
+
+def value(address: int, at: int) -> int:
+    return 1000 * address + 100 * at + 7
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
+    drives: dict[str, Drive] = {
+        kind: quick(kind)(address, name=kind, **KINDS[kind].makes) for address, kind in enumerate(KINDS, 1)
+    }
+    asked = {
+        kind: polled(it, [reg for reg in it.readings() if reg.values is None][:REGISTERS])
+        for kind, it in drives.items()
+    }
+    asked[MOTOR] = polled(drives[MOTOR], [])  # its values are its motor's
+    far_line = FarLine([far_drive(kind, it) for kind, it in asked.items()])
+    hostile = Hostile(seed)
+    far_line.mangle = hostile.mangle
+    starts: list[str] = []
+    over = threading.Event()
+
+    def command() -> None:
+        """Start the motor and stop it, again and again."""
+        motor = drives[MOTOR]
+        while not over.is_set():
+            with suppress(BusError):
+                motor.set_frequency(20)
+            starts.append("called")
+            for act in (motor.start, motor.stop):
+                with suppress(BusError):
+                    act()
+
+    with FarEnd([far_line], Path(os.environ["XDG_STATE_HOME"])) as far:
+        poller = Poller(plant(line(far.ports[0], *asked.values())))
+        with poller:
+            commander = threading.Thread(target=command)
+            commander.start()
+            until(lambda: len(far_line.log) >= FRAMES, patience=120)
+            over.set()
+            commander.join()
+    truth = {
+        (kind, poll.register.name): value(it.drive.address, at) * poll.register.scale
+        for kind, it in asked.items()
+        for at, poll in enumerate(it.polls)
+    }
+    rows = rows_of(poller)
+    samples = [row for row in rows if row.value is not None]
+    assert len({*truth.values()}) > len(drives)
+    assert [row for row in samples if row.value != float(truth[row.drive, row.register])] == []
+    assert {row.drive for row in samples} == set(drives) - {MOTOR}
+    misses = {row.status for row in rows if row.value is None}
+    assert {it for it in misses if not it.startswith("exception ")} <= REASONS
+    assert [str(it) for it in far_line.log if it.what == "damaged"] == []
+    moves = [str(it) for it in far_line.log if it.what == "moves"]
+    assert len(moves) <= len(starts), "a motor was started that nobody started, or twice"
+    assert hostile.struck.total() > FRAMES / 10

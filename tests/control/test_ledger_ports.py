@@ -1,0 +1,217 @@
+"""The ledger knows a drive by what its port is, counts what wears, and is not spent by simulated drives."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from halls import Hall
+from lines import PATIENCE
+from toy import Status, Toy
+
+from multidrop.bus import Bus
+from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
+from multidrop.drive import Drive
+from multidrop.drive.register import COIL, Kept, setting
+from multidrop.errors import Refused
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport import port_identity, simulated_ports
+from multidrop.transport.line import Line
+from multidrop.transport.simulated_ports import is_simulated
+
+
+def toys(port: str = "pty") -> Simulator:
+    toy = simulated(Toy(1))
+    toy["status"] = Status(0)
+    return Simulator([Wire([toy], unpaced=True, port=port)])
+
+
+def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
+    with Bus(port, ledger=ledger) as bus:
+        toy = bus.attach(Toy, 1)
+        bus.write(toy, toy.acceleration_time, seconds)
+
+
+# ---- what a port is ----
+
+
+def test_one_write_a_minute_however_the_port_is_spelt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ledger = Ledger(tmp_path / "wear")
+    (tmp_path / "ports").mkdir()
+    with toys(str(tmp_path / "ports" / "hall-1")) as sim:
+        device = os.path.realpath(sim.wires[0].path)
+        (tmp_path / "again").symlink_to(tmp_path / "ports")
+        write("ports/hall-1", 12.0, ledger)
+        spellings = (
+            device,
+            f"{tmp_path}/ports/hall-1",
+            "again/hall-1",
+            "./ports/../again/hall-1",
+            f"spy://{device}",
+        )
+        for at, port in enumerate(spellings):
+            with pytest.raises(Refused, match="is written once in 60 s at most"):
+                write(port, 13.0 + at, ledger)
+        (wear,) = ledger.wear(0)
+        assert (wear.cell.port, wear.writes) == (device, 1)
+
+
+def test_one_write_a_minute_by_whatever_name_of_a_host(tmp_path: Path) -> None:
+    ledger = Ledger(tmp_path / "wear")
+    with toys("socket://127.0.0.1:0") as sim:
+        path = sim.wires[0].path
+        write(path, 12.0, ledger)
+        with pytest.raises(Refused, match="is written once in 60 s at most"):
+            write(path.replace("127.0.0.1", "localhost"), 13.0, ledger)
+        assert [it.cell.port for it in ledger.wear(0)] == [path.removeprefix("socket://")]
+
+
+def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_identity, "BY_ID", tmp_path / "by-id")
+    (tmp_path / "by-id").mkdir()
+    for name in ("ttyUSB0", "ttyUSB1"):
+        (tmp_path / name).touch()
+    link = tmp_path / "by-id" / "usb-FTDI_A1-port0"
+    link.symlink_to("../ttyUSB0")
+    assert port_identity.of_device(f"{tmp_path}/ttyUSB0") == str(link)
+    assert port_identity.of_device(f"{tmp_path}/ttyUSB1") == f"{tmp_path}/ttyUSB1"
+    ledger = Ledger(tmp_path / "wear")
+    cell = LedgerCell(str(link), 1, "m", "r", f"{tmp_path}/ttyUSB0")
+    assert ledger.enter(cell, 1000.0, 60.0) == ""
+    link.unlink()
+    link.symlink_to("../ttyUSB1")  # it was plugged in again
+    moved = LedgerCell(port_identity.of_device(f"{tmp_path}/ttyUSB1"), 1, "m", "r", f"{tmp_path}/ttyUSB1")
+    assert "was written 5 s ago" in ledger.enter(moved, 1005.0, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "identity"),
+    [
+        ("socket://10.0.0.7:4001", "10.0.0.7:4001"),
+        ("rfc2217://10.0.0.7:4001?ign_set_control", "10.0.0.7:4001"),
+        ("socket://Server:4001", "server:4001"),
+        ("socket://[fe80::1]:4001", "[fe80::1]:4001"),
+        ("10.0.0.7:4001", "10.0.0.7:4001"),
+        ("socket://nowhere", "socket://nowhere"),
+        ("socket://a:99999", "socket://a:99999"),
+        ("loop://", "loop://"),
+        ("/dev/../dev/null", "/dev/null"),
+    ],
+)
+def test_what_a_name_means(name: str, identity: str) -> None:
+    assert port_identity.of_name(name) == identity
+    assert port_identity.of_name(identity) == identity
+
+
+def test_a_port_without_a_device_is_known_by_its_name() -> None:
+    line = Line("loop://")
+    assert line.identity == "loop://"
+    line.close()
+
+
+@pytest.mark.parametrize(
+    "old", ["link", "device", "socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001", "socket://hall:1"]
+)
+def test_what_an_older_ledger_counted_still_counts(tmp_path: Path, old: str) -> None:
+    (tmp_path / "device").touch()
+    (tmp_path / "link").symlink_to("device")
+    entered = old if "://" in old else f"{tmp_path}/{old}"
+    ledger = Ledger(tmp_path / "wear", budget=3)
+    for at in range(2):
+        assert ledger.enter(LedgerCell(entered, 1, "m", "r"), 1000.0 + at, 0.0) == ""
+    now = {"socket://hall:1": "10.0.0.9:1"}.get(old, port_identity.of_name(entered))
+    cell = LedgerCell(now, 1, "m", "r", entered)
+    assert ledger.enter(cell, 1002.0, 0.0) == ""
+    assert "written 3 times in a year" in ledger.enter(cell, 1003.0, 0.0)
+    if old != "socket://hall:1":
+        assert [(it.cell.port, it.writes) for it in ledger.wear(1003.0)] == [(now, 3)]
+
+
+# ---- what wears ----
+
+
+def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Fan(Drive):
+        """A user's own."""
+
+        relay = setting(1, table=COIL)
+        speed = setting(2, kept=Kept.RAM)
+        known = setting(3)
+        latch = setting(4, table=COIL, kept=Kept.EEPROM)
+
+    ledger = Ledger(tmp_path / "wear")
+    sim = SimulatedDrive(Fan(1))
+    hall = Hall(monkeypatch, sim, ledger=ledger)
+    fan = hall.attach(Fan(1, ram=["known"]))
+    for register in (fan.relay, fan.speed, fan.known):
+        hall.bus.write(fan, register, 1)
+    assert ledger.wear(0) == []
+    hall.bus.write(fan, fan.latch, 1)
+    assert [it.cell.register for it in ledger.wear(0)] == ["latch"]
+    assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # what its owner knows, its class does not
+
+
+# ---- simulated drives ----
+
+with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
+
+
+@with_names
+@pytest.mark.parametrize("port", ["pty", "link", "socket://127.0.0.1:0", "socket://0.0.0.0:0"])
+def test_a_simulated_drive_does_not_spend_the_user_s_ledger(tmp_path: Path, port: str) -> None:
+    with toys(str(tmp_path / "link") if port == "link" else port) as sim:
+        path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
+        write(path, 12.0)
+        with pytest.raises(Refused, match="is written once in 60 s at most"):  # as with a real one
+            write(path, 13.0)
+    assert Ledger().wear(0) == []
+    assert not list(default_path().parent.rglob("*.sqlite"))
+
+
+@with_names
+def test_a_ledger_that_is_named_counts_simulated_drives_too(tmp_path: Path) -> None:
+    with toys() as sim:
+        write(sim.wires[0].path, 12.0, Ledger(tmp_path / "wear"))
+    assert len(Ledger(tmp_path / "wear").wear(0)) == 1
+
+
+@with_names
+def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Path) -> None:
+    program = (
+        "import time\nfrom multidrop.sim.port import PtyPort\nfrom multidrop.drive.timing import Settings\n"
+        "port = PtyPort(Settings(9600, '8N1'), None)\nprint(port.path, flush=True)\ntime.sleep(3600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        device = process.stdout.readline().strip()
+        try:
+            assert is_simulated(device)
+        finally:
+            process.kill()
+            process.wait(PATIENCE)
+    assert not is_simulated(device)
+
+
+def test_a_real_port_is_not_taken_for_a_simulated_one() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        line = Line(f"socket://127.0.0.1:{listener.getsockname()[1]}")
+        assert not is_simulated(line.identity)
+        line.close()
+    master, slave = os.openpty()
+    assert not is_simulated(os.ttyname(slave))
+    os.close(slave)
+    os.close(master)
+
+
+def test_a_system_without_such_names_counts_everything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated_ports, "_HAS_NAMES", False)
+    with toys() as sim:
+        write(sim.wires[0].path, 12.0)
+    assert len(Ledger().wear(0)) == 1

@@ -1,0 +1,72 @@
+"""An adapter that begins to echo just when the drive dies: no write is told to be done."""
+
+from __future__ import annotations
+
+import pytest
+from halls import Hall, is_write, one
+
+from multidrop.control.outcome import Effect
+from multidrop.core import build_request
+from multidrop.drive import Drive
+from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import Unconfirmed
+
+DRIVES = (
+    ErmanERG220(1),
+    InvtCHE(1, maximum_frequency=50),
+    InnovertIBD(1),
+    DelixiModbus(1),
+    DelixiNative(1),
+    YD1000(1),
+)
+
+
+def dies_and_echoes(hall: Hall, drive: Drive) -> None:
+    """From now on all that is heard of a write is what was sent, and of a read nothing."""
+    hall.deafens = lambda request: True
+    hall.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
+
+
+@pytest.mark.parametrize("declared", DRIVES, ids=lambda drive: drive.model)
+def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
+    monkeypatch: pytest.MonkeyPatch, declared: Drive
+) -> None:
+    hall, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
+    stop = next(it for it in drive.registers.values() if it.harmless)
+    value = stop.decode(stop.harmless[-1])
+    assert hall.bus.try_write(drive, stop, value).effect is Effect.DONE
+    dies_and_echoes(hall, drive)
+    with pytest.raises(Unconfirmed, match="echo"):
+        hall.bus.write(drive, stop, value)
+
+
+@pytest.mark.parametrize("family", [InnovertIBD, DelixiNative])
+def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
+    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
+) -> None:
+    """It cannot be read back."""
+    hall, drive, _ = one(monkeypatch, family(1))
+    drive.set_frequency(20)
+    dies_and_echoes(hall, drive)
+    for write in (lambda: hall.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
+        with pytest.raises(Unconfirmed, match="echo"):
+            write()
+
+
+def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
+    hall.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+    dies_and_echoes(hall, drive)
+    with pytest.raises(Unconfirmed, match="echo"):
+        hall.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+
+
+def test_what_is_told_of_an_adapter_that_is_known_to_echo_is_believed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """There the core tells the drive's copy from the adapter's."""
+    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
+    hall.has_echo = True
+    drive.set_frequency(20)
+    hall.loses = lambda request: not is_write(request)
+    assert hall.bus.try_write(drive, drive.frequency, 25.0).effect is Effect.DONE

@@ -1,0 +1,219 @@
+"""Whatever is called in whatever order: no forbidden frame leaves, and none that starts a motor unasked.
+
+What is allowed is typed here from the documents, not taken from the library's declarations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from halls import Hall, is_write
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_safety_bus import MAKE, STARTS
+
+from multidrop.control.ramp import ramp, start_staggered
+from multidrop.core import Message
+from multidrop.drive import Direction
+from multidrop.drive.register import Register
+from multidrop.errors import BusError
+from multidrop.sim import simulated
+
+
+def word(request: Message) -> int:
+    return int.from_bytes(request.data)
+
+
+def erman(it: Message) -> bool:
+    """Coils 3 to 8 and 10 to 12 are reserved, and so are most registers; 0001H is never written."""
+    if it.function == 5:
+        return it.start in (0, 1, 2, 9)
+    return it.function == 6 and it.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
+
+
+def che(it: Message) -> bool:
+    return it.function == 6 and (
+        (it.start == 0x1000 and 1 <= word(it) <= 8) or (it.start == 0x2000 and word(it) <= 10_000)
+    )
+
+
+def ibd(it: Message) -> bool:
+    """No direction without a word of its owner's, never the toggle; a reset without run."""
+    if it.start == 0x2000:
+        return it.function == 6 and word(it) in (0, 1, 2, 3, 0x10)
+    return it.function == 6 and (it.start in (107, 108) or (it.start == 0x2001 and word(it) <= 40_000))
+
+
+def delixi(it: Message) -> bool:
+    """Bits 2, 3 and 6 to 15 are reserved, bits 4 and 5 together are the toggle; run has its direction."""
+    if it.start == 0x2000:
+        return it.function == 6 and word(it) in (0, 1, 0x12, 0x22, 0x13, 0x23)
+    return it.function == 6 and it.start == 2
+
+
+def native(it: Message) -> bool:
+    if it.function == 2:
+        return it.start in (1, 2, 3, 4) and word(it) == 0
+    return (it.function == 4 and it.start in (1, 7)) or (it.function == 6 and it.start == 2)
+
+
+def yd(it: Message) -> bool:
+    """Bits 5 and 4 are reserved; bit 15 stays; a reset goes alone; some parameters are the panel's."""
+    if it.start == 0x1000:
+        control = word(it)
+        resets = control & 0x2000 and control & 0x0500
+        return it.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
+    never = (1, 2, 3, 4, 6, 7, 8, 0x15, 0x16, 0x103, 0x104, *range(0x110, 0x116), 0x0800, 0x0801, 0x0802)
+    readings = it.start == 0x1100 or 0x1200 <= it.start <= 0x1214
+    return (
+        it.function == 6
+        and it.start not in never
+        and not readings
+        and not set("ABCDEF") & set(f"{it.start:X}")
+    )
+
+
+ALLOWED: dict[str, Callable[[Message], bool]] = {
+    "erman-er-g-220": erman,
+    "invt-che": che,
+    "innovert-ibd": ibd,
+    "delixi-modbus": delixi,
+    "delixi-native": native,
+    "yd1000": yd,
+}
+BROADCASTS = {  # function, address, value: a stop, or a setpoint of 0
+    (6, 0x1000, 5),
+    (6, 0x1000, 0xC000),
+    (6, 0x1000, 0x8000),
+    (6, 0x1001, 0),
+    (6, 0x2000, 0),  # CHE
+    (6, 0x2000, 1),  # IBD, Delixi
+    (6, 0x2001, 0),
+    (2, 1, 0),
+}
+TURNING_VERBS = ("start", "jog", "start_staggered")
+VERBS = ("start", "stop", "coast", "emergency_stop", "jog", "reset_fault", "state", "identify")
+
+directions = st.sampled_from([None, *Direction])
+numbers = st.one_of(
+    st.floats(-1e5, 1e5), st.just(float("nan")), st.integers(-1, 0x1_0000), st.sampled_from([0, 1, 0.0, 30.0])
+)
+
+
+@st.composite
+def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[Hall, Any], object]]:
+    """One public call, with any arguments, and its name."""
+    family = type(MAKE[model](1))
+    name = draw(
+        st.sampled_from(
+            [
+                *VERBS,
+                *VERBS,
+                *["write"] * 10,
+                "set_frequency",
+                "write",
+                "broadcast",
+                "stop_all",
+                "ramp",
+                "start_staggered",
+            ]
+        )
+    )
+    if name == "set_frequency":
+        hz = draw(numbers)
+        return name, lambda hall, drive: drive.set_frequency(hz)
+    if name in ("write", "broadcast"):
+        registers = list(family.registers.values())
+        moving = [it for it in registers if it.harmless is not None]
+        register = draw(st.one_of(st.sampled_from(moving), st.sampled_from(registers)))
+        value = draw(values(register))
+        if name == "write":
+            return name, lambda hall, drive: hall.bus.write(drive, register, value)
+        return name, lambda hall, drive: hall.bus.broadcast(register, value)
+    if name == "stop_all":
+        return name, lambda hall, drive: hall.bus.stop_all()
+    if name == "ramp":
+        hz = draw(st.floats(0, 60))
+        return name, lambda hall, drive: ramp(drive, hz, rate=5.0, every=1.0)
+    if name == "start_staggered":
+        return name, lambda hall, drive: start_staggered([drive], 1.0)
+    if name in ("start", "jog"):
+        direction = draw(directions)
+        return name, lambda hall, drive: getattr(drive, name)(direction)
+    return name, lambda hall, drive: getattr(drive, name)()
+
+
+def values(register: Register[Any]) -> st.SearchStrategy[Any]:
+    if register.values is None:
+        return numbers
+    kind: Any = register.values
+    known = st.sampled_from(list(kind))
+    if hasattr(kind, "__or__") and kind.__mro__[1].__name__ == "IntFlag":
+        return st.one_of(known, st.integers(0, 0xFFFF).map(kind), st.integers(0, 0xFFFF))
+    return st.one_of(known, st.integers(0, 0xFFFF))
+
+
+@pytest.mark.parametrize("model", MAKE)
+@settings(
+    max_examples=100,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(data=st.data())
+def test_no_sequence_of_calls_sends_what_is_forbidden(
+    monkeypatch: pytest.MonkeyPatch, model: str, data: st.DataObject
+) -> None:
+    sim: Any = simulated(MAKE[model](1))
+    with TemporaryDirectory() as directory:
+        hall = Hall(monkeypatch, sim, ledger=Path(directory) / "wear")
+        play(hall, sim, model, data)
+
+
+def play(hall: Hall, sim: Any, model: str, data: st.DataObject) -> None:
+    """A setpoint, and then any calls with any replies lost."""
+    drive = hall.attach(sim.drive)
+    drive.set_frequency(20)
+    hall.frames.clear()
+    loses = data.draw(st.sampled_from(["nothing", "writes", "some"]))
+    some = data.draw(st.sets(st.integers(0, 60), max_size=12))
+    hall.loses = {
+        "nothing": lambda request: False,
+        "writes": is_write,
+        "some": lambda request: len(hall.frames) in some,
+    }[loses]
+    for name, call in data.draw(st.lists(calls(model), min_size=1, max_size=6)):
+        begun = len(hall.frames)
+        ran = sim.motor.energised
+        with suppress(BusError, ValueError, TypeError):
+            call(hall, drive)
+        sent = [request for request, _ in hall.frames[begun:] if is_write(request)]
+        for request in sent:
+            if request.address == 0:
+                assert (request.function, request.start, word(request)) in BROADCASTS
+            else:
+                assert ALLOWED[model](request), f"{name} sent {request}"
+        turning = [request for request in sent if STARTS[model](request)]
+        assert len(turning) <= (name in TURNING_VERBS), f"{name} sent {turning}"
+        assert len([request for request in sent if resets(model, request)]) <= (name == "reset_fault")
+        sim.pass_time(hall.seconds)
+        if name not in TURNING_VERBS and not ran:
+            assert not sim.motor.energised, f"{name} started the motor"
+
+
+def resets(model: str, it: Message) -> bool:
+    """A reset is a pulse: once in a call."""
+    if it.address == 0:
+        return False
+    return {
+        "erman-er-g-220": it.function == 5 and it.start == 9 and word(it) != 0,
+        "invt-che": it.start == 0x1000 and word(it) == 7,
+        "innovert-ibd": it.start == 0x2000 and bool(word(it) & 0x10),
+        "delixi-modbus": False,
+        "delixi-native": it.function == 2 and it.start == 4,
+        "yd1000": it.start == 0x1000 and bool(word(it) & 0x2000),
+    }[model]

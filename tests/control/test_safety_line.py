@@ -1,0 +1,156 @@
+"""Faults on the way to a motor, through the real engine and a pty: what left, and what the caller was told.
+
+The same cases as on a clock of the test's own (test_safety_bus.py); here the drive counts what it heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from lines import until
+from motors import MAKE, Heard
+
+from multidrop.bus import Bus
+from multidrop.drive import Condition, Drive, read
+from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.transport import exchange as exchanges
+
+every_family = pytest.mark.parametrize("model", MAKE)
+GOODRIVE = 0x010A
+PATIENCE = 0.3  # s, with a machine that has much else to do
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
+
+
+@contextmanager
+def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, PoweredDrive, Heard]]:
+    """The drive as its bus knows it; what is there in truth, `other` or the same; and what that hears."""
+    drive.response_timeout = PATIENCE
+    sim = simulated(other or drive)
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    heard = Heard(sim)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+        yield bus.attach(drive), sim, heard
+
+
+@every_family
+def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
+    with line(MAKE[model](1)) as (drive, sim, heard):
+        drive.set_frequency(20)
+        heard.loses = lambda request: request in heard.starts
+        with pytest.raises(Unconfirmed, match="no reply"):
+            drive.start()
+        assert len(heard.starts) == 1
+        assert sim.motor.energised  # it did happen, and the caller was told that it may have
+
+
+@every_family
+@pytest.mark.parametrize("lost", [2, 3, 7])
+def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
+    """It is sent until it is confirmed."""
+    with line(MAKE[model](1)) as (drive, sim, heard):
+        drive.set_frequency(20)
+        drive.start()
+        begun = len(heard.writes)
+        heard.loses = lambda request: request in heard.writes and len(heard.writes) <= begun + lost
+        drive.stop()
+        stops = heard.writes[begun:]
+        assert len(stops) > lost
+        assert all(stop == stops[0] for stop in stops[: lost + 1])
+        assert len(heard.starts) == 1
+        assert not sim.motor.energised
+
+
+OTHERS: dict[str, tuple[Drive, Drive]] = {  # declared, and there: of one framing and baud rate
+    "che for ibd": (InvtCHE(1, maximum_frequency=50), InnovertIBD(1)),
+    "che for yd1000": (InvtCHE(1, maximum_frequency=50), YD1000(1)),
+    "ibd for che": (InnovertIBD(1, confirmed=0), InvtCHE(1)),
+    "yd1000 for che": (YD1000(1), InvtCHE(1)),
+    "delixi for yd1000": (DelixiModbus(1, framing="rtu"), YD1000(1)),
+    "delixi for che": (DelixiModbus(1, framing="rtu"), InvtCHE(1)),
+}
+
+
+@pytest.mark.parametrize("pair", OTHERS)
+def test_a_drive_of_another_family_is_not_written_to(pair: str) -> None:
+    declared, there = OTHERS[pair]
+    with line(declared, there) as (drive, sim, heard):
+        with pytest.raises((Refused, NoReply)):
+            drive.start()
+        assert heard.requests
+        assert heard.writes == []
+        assert not sim.motor.energised
+
+
+def test_a_goodrive_is_not_taken_for_a_che() -> None:
+    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, heard):
+        sim["device"] = GOODRIVE
+        with pytest.raises(Refused, match="010AH"):
+            drive.start()
+        assert heard.writes == []
+
+
+def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    with line(ErmanERG220(1)) as (drive, sim, heard):
+        accept = sim.accept
+        monkeypatch.setattr(
+            sim, "accept", lambda cell, raw: min(raw, 300) if cell.name == "frequency" else accept(cell, raw)
+        )
+        with pytest.raises(NotDone, match=r"45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
+            drive.set_frequency(45)
+        assert len(heard.writes) == 1
+
+
+def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, heard):
+        drive.set_frequency(20)
+        run = sim.motor.run
+        monkeypatch.setattr(sim.motor, "run", lambda direction: sim.trip(4))
+        with pytest.raises(NotDone, match="tripped: OC1"):
+            drive.start()
+        with pytest.raises(Refused, match=r"OC1.*reset_fault"):
+            drive.start()
+        monkeypatch.setattr(sim.motor, "run", run)
+        drive.reset_fault()
+        assert len(heard.starts) == 1
+        assert drive.state().condition is Condition.STOPPED
+        assert not sim.motor.energised
+
+
+def test_a_power_cycle_in_mid_ramp() -> None:
+    """The drive has forgotten its setpoint: it stays off, and the next start says so."""
+    with line(YD1000(1)) as (drive, sim, heard):
+        drive.set_frequency(40)
+        drive.start()
+        sim.motor.acceleration_time = 60.0
+        until(lambda: drive.perform(read(drive.output_frequency)) > 0)
+        assert 0 < sim.motor.frequency < 40
+        sim._restart()  # all but the EEPROM is gone, and it is deaf for a while
+        sent = len(heard.writes)
+        with pytest.raises(NoReply):
+            drive.state()
+        until(lambda: _condition(drive) is Condition.STOPPED)
+        with pytest.raises(Refused, match="set_frequency"):
+            drive.start()
+        assert len(heard.writes) == sent
+        assert not sim.motor.energised
+        drive.set_frequency(40)
+        drive.start()
+        assert len(heard.starts) == 2
+        assert sim.motor.energised
+
+
+def _condition(drive: Any) -> Condition | None:
+    try:
+        return drive.state().condition
+    except NoReply:
+        return None

@@ -1,0 +1,222 @@
+"""Leaving and dying, two processes at one ledger, and an adapter's echo: on real ports and processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from multidrop.bus import Bus
+from multidrop.control.audit_log import AuditLog, read_audit
+from multidrop.control.eeprom_ledger import BUDGET, YEAR, Ledger, LedgerCell
+from multidrop.drives import InvtCHE
+from multidrop.errors import NoReply, Unconfirmed
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+
+CLIENT = """
+import sys, time
+from multidrop import Bus, InvtCHE
+with Bus(sys.argv[1]) as bus:
+    pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+    pump.set_frequency(20)
+    pump.start()
+    if sys.argv[2] == "stop":
+        bus.stop_on_exit()
+    print("running", flush=True)
+    {then}
+"""
+ENDINGS = {  # what the client does after its start, the signal that it is sent, and its status then
+    "SIGTERM": ("time.sleep(60)", signal.SIGTERM, -signal.SIGTERM),
+    "SIGINT": ("time.sleep(60)", signal.SIGINT, 1),
+    "leaving": ("pass", None, 0),
+    "error": ("raise RuntimeError", None, 1),
+    "exit": ("sys.exit(3)", None, 3),
+}
+
+
+@contextmanager
+def pump() -> Iterator[tuple[PoweredDrive, str]]:
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.deceleration_time = 0.2
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        yield sim, simulator.wires[0].path
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("opted", ["stop", "leave"])
+def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> None:
+    then, number, status = ENDINGS[ending]
+    with pump() as (sim, port):
+        words = [sys.executable, "-c", CLIENT.format(then=then), port, opted]
+        with subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
+        ) as client:
+            assert client.stdout is not None
+            line = client.stdout.readline()
+            assert line == "running\n"
+            if number is not None:
+                client.send_signal(number)
+            client.communicate()
+        assert client.returncode in (status, -int(number or 0))
+        written = [it.raw for it in sim.counters.writes if it.name == "control"]
+        assert written == ([1, 5] if opted == "stop" else [1])
+        assert sim.motor.energised == (opted == "leave")
+
+
+def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pump() as (sim, port):
+        with Bus(port) as bus:
+            bus.attach(sim.drive)
+            bus.stop_on_exit()
+            bus.stop_on_exit()
+            assert signal.getsignal(signal.SIGTERM) != before[1]
+        assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+        assert [it.raw for it in sim.counters.writes] == [5]
+
+
+# ---- the ledger ----
+
+CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
+
+ENTRANT = """
+import sys
+from multidrop.control.eeprom_ledger import LedgerCell, Ledger
+ledger = Ledger(sys.argv[1], budget=100)
+cell = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
+print(sum(not ledger.enter(cell, 1e9 + at, 0.0) for at in range(80)))
+"""
+
+
+def test_two_processes_share_one_budget(tmp_path: Path) -> None:
+    path = tmp_path / "wear.sqlite"
+    words = [sys.executable, "-c", ENTRANT, str(path)]
+    both = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    assert sum(int(it.communicate()[0]) for it in both) == 100
+    (wear,) = Ledger(path).wear(1e9 + 100)
+    assert (wear.cell, wear.writes) == (CELL, 100)
+
+
+def test_a_ledger_remembers(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "wear.sqlite"
+    assert Ledger(path).wear(0) == []
+    assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""
+    assert "was written 59 s ago" in Ledger(path).enter(CELL, 1059.0, 60.0)
+    assert Ledger(path).enter(CELL, 1060.0, 60.0) == ""
+    assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""  # the clock was set back: counted all the same
+    other = LedgerCell("/dev/ttyUSB0", 2, "delixi-modbus", "frequency")
+    assert Ledger(path).enter(other, 1061.0, 60.0) == ""
+    assert [(it.cell.address, it.writes, it.this_year) for it in Ledger(path).wear(1061.0)] == [
+        (1, 3, 3),
+        (2, 1, 1),
+    ]
+    assert [it.this_year for it in Ledger(path).wear(1061.0 + YEAR)] == [0, 0]
+
+
+def test_the_budget_spends_10_000_cycles_in_ten_years() -> None:
+    assert BUDGET * 10 == 10_000
+
+
+def test_a_ledger_that_is_none_is_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "wear.sqlite"
+    path.write_text("this is no database, and long enough to be looked at as one" * 20)
+    with pytest.raises(OSError, match=r"the ledger of EEPROM writes .* cannot be kept"):
+        Ledger(path).enter(CELL, 0.0, 60.0)
+
+
+# ---- the audit log ----
+
+WRITER = """
+import sys
+from multidrop.control.audit_log import AuditLog
+log = AuditLog(sys.argv[1])
+for number in range(200):
+    log.add(number, {"writer": sys.argv[2], "number": number, "text": "x" * 200})
+"""
+
+
+def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in "ab"]
+    assert [it.wait() for it in writers] == [0, 0]
+    records = list(read_audit(path))
+    for name in "ab":
+        assert [it["number"] for it in records if it["writer"] == name] == list(range(200))
+
+
+@pytest.mark.parametrize("torn_at", range(0, 120, 7))
+def test_wherever_a_line_was_torn_the_others_stay(tmp_path: Path, torn_at: int) -> None:
+    path = tmp_path / "audit.jsonl"
+    log = AuditLog(path)
+    log.add(0, {"write": "first"})
+    log.add(1, {"write": "second"})
+    log.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: min(torn_at, len(whole))])
+    log = AuditLog(path)
+    log.add(2, {"write": "third"})
+    log.close()
+    found = [it["write"] for it in read_audit(path)]
+    assert found[-1] == "third"
+    assert found == [it for it in ("first", "second") if it in found] + ["third"]
+
+
+# ---- an adapter that echoes ----
+
+
+@contextmanager
+def echoing(hears: Any = None) -> Iterator[str]:
+    """A port on which everything that is sent comes back, and a drive answers if there is one."""
+    ours, theirs = os.openpty()
+    path = os.ttyname(theirs)
+    done = threading.Event()
+
+    def echo() -> None:
+        while not done.is_set():
+            try:
+                received = os.read(ours, 1024)
+            except OSError:
+                return
+            os.write(ours, received + (hears(received) if hears else b""))
+
+    thread = threading.Thread(target=echo, daemon=True)
+    thread.start()
+    try:
+        yield path
+    finally:
+        done.set()
+        os.write(theirs, b"x")
+        thread.join()
+        os.close(theirs)
+        os.close(ours)
+
+
+def test_an_echo_without_a_drive_confirms_nothing() -> None:
+    with echoing() as port, Bus(port) as bus:
+        pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+        with pytest.raises(NoReply):
+            pump.start()
+        with pytest.raises((NoReply, Unconfirmed)):
+            pump.stop(seconds=0.5)
+
+
+def test_the_echo_is_not_the_drive_s_answer_to_a_write() -> None:
+    """The drive answers reads and has died by the time of the write: only the echo comes."""
+    device = bytes.fromhex("01 03 02 01 01 78 14")
+
+    def hears(request: bytes) -> bytes:
+        return device if request == bytes.fromhex("01 03 30 16 00 01 6A CE") else b""
+
+    with echoing(hears) as port, Bus(port) as bus:
+        pump = bus.attach(InvtCHE(1))
+        with pytest.raises(Unconfirmed, match="no reply"):
+            bus.write(pump, pump.setpoint, 50.0)

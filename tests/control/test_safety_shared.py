@@ -1,0 +1,251 @@
+"""A second client on the same line, whose frames collide with ours: what left, and what we were told.
+
+No drive can tell its requests from ours, and we cannot tell the reply to its read of our drive from that
+to our own: what is read on a line with two clients is not to be trusted. What is commanded is: nothing
+that starts a motor or is a pulse is sent twice, none starts unasked, and what we are told of it is true.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from time import sleep
+from typing import Any
+
+import pytest
+from checksums import rtu
+from lines import until
+from motors import MAKE, STARTS, Heard
+from shared import SharedPair, shared
+
+from multidrop.bus import Bus
+from multidrop.core import Framing, Message, parse_request
+from multidrop.drive import Condition
+from multidrop.drives import InvtCHE
+from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.transport import exchange as exchanges
+
+RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
+ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at once
+
+
+@contextmanager
+def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]:
+    """Our drive 1, the pair, and what the drives 1 and 2 hear."""
+    ours = MAKE[model](1)
+    heard = []
+    for drive in (ours, MAKE[model](2)):
+        sim = simulated(drive)
+        assert isinstance(sim, PoweredDrive)
+        sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+        heard.append(Heard(sim))
+    wire = Wire([it.sim for it in heard], unpaced=True)
+    with (
+        Simulator([wire]),
+        shared(wire.path, ours.settings.baudrate, seed) as pair,
+        Bus(pair.ours) as bus,
+    ):
+        yield bus.attach(ours), pair, heard
+
+
+def requests(pair: SharedPair) -> list[Message]:
+    """What left our port: whole requests, one after another."""
+    found, sent = [], pair.sent
+    while sent:
+        used, message = parse_request(Framing.RTU, sent)
+        assert message is not None
+        found.append(message)
+        sent = sent[used:]
+    return found
+
+
+def attempt(act: Callable[[], object]) -> BusError | None:
+    """How it failed."""
+    try:
+        act()
+    except BusError as failure:
+        return failure
+    return None
+
+
+def set_frequency(drive: Any, hz: float) -> None:
+    """As often as it takes on a machine that has much else to do."""
+    until(lambda: attempt(lambda: drive.set_frequency(hz)) is None)
+
+
+# ---- at random ----
+
+
+class Stranger:
+    """The other client: it reads both drives and writes the second's setpoint, and never starts anything."""
+
+    def __init__(self, port: str, model: str, seed: int) -> None:
+        self.exchanges = 0
+        self._chance = random.Random(seed)
+        self._bus = Bus(port)
+        self._first, self._second = (self._bus.attach(MAKE[model](address)) for address in (1, 2))
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Stranger:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._done.set()
+        self._thread.join()
+        self._bus.close()
+
+    def _run(self) -> None:
+        while not self._done.is_set():
+            for act in (self._look, self._second.state, self._set):
+                with suppress(BusError):
+                    act()
+                self.exchanges += 1
+                sleep(self._chance.uniform(0.0, 0.04))
+
+    def _look(self) -> None:
+        self._bus.read(self._first, self._first.readings()[0])
+
+    def _set(self) -> None:
+        self._second.set_frequency(self._chance.randint(1, 40))
+
+
+@pytest.mark.parametrize("model", RTU_FAMILIES)
+def test_starts_and_stops_while_another_client_talks(model: str) -> None:
+    with hall(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
+        set_frequency(drive, 20)
+        stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
+        for done in range(MOST_ROUNDS):
+            if done >= ROUNDS and pair.collisions:
+                break
+            sent, carried_out = len(starts(pair, model)), len(first.starts)
+            failure = attempt(drive.start)
+            sent, carried_out = len(starts(pair, model)) - sent, len(first.starts) - carried_out
+            assert carried_out <= sent <= 1
+            if failure is None:
+                assert carried_out == 1
+            elif not isinstance(failure, (Unconfirmed, NotDone)):
+                assert carried_out == 0, f"{failure!r}, and it started"
+            until(lambda: attempt(drive.stop) is None)
+            until(lambda: not first.sim.motor.energised)
+        assert second.starts == []
+        assert stranger.exchanges
+        assert pair.collisions
+
+
+def starts(pair: SharedPair, model: str) -> list[Message]:
+    return [it for it in requests(pair) if it.function in (5, 6, 15, 16) and STARTS[model](it)]
+
+
+# ---- at the worst moment: ours is lost, and this is heard within our time-out ----
+
+PATIENCE = 0.1  # s, with a machine that has much else to do
+
+
+@pytest.fixture
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchanges, "LEAST_TIMEOUT", PATIENCE)
+
+
+patient = pytest.mark.usefixtures("_patient")
+START, STOP, RESET, JOG = (f"01 06 10 00 00 {command:02X}" for command in (1, 5, 7, 3))
+SAYS: dict[str, bytes] = {
+    "nothing": b"",
+    "noise": bytes.fromhex("00 F8 FF 01 06 10 00 00"),
+    "the begin of ours": rtu(START)[:5],
+    "ours with one bit turned": rtu(START)[:5] + b"\3" + rtu(START)[6:],
+    "a read of the same drive, which it answers": rtu("01 03 10 01 00 01"),
+    "a read of ours, answered by both": rtu("01 03 10 01 00 01") + rtu("02 03 10 01 00 01"),
+    "a write to the same drive, which it confirms": rtu("01 06 20 00 03 E8"),
+    "a write to the other drive": rtu("02 06 20 00 03 E8"),
+    "a stop of the other drive": rtu("02 06 10 00 00 05"),
+    "a stop of all": rtu("00 06 10 00 00 05"),
+    "an exception of the other drive": rtu("02 86 12"),
+    "an exception to another function": rtu("01 83 02"),
+}
+FAILURES = {"ours with one bit turned": DriveRefused}  # a CHE answers it with exception 11H
+PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
+
+
+def running(drive: Any, heard: Heard) -> None:
+    """By the hand of whoever stands there."""
+    set_frequency(drive, 20)
+    heard.sim.motor.run(1)
+
+
+MOMENTS = [("start", says) for says in SAYS] + [
+    (verb, says)
+    for verb in ("jog", "reset_fault")
+    for says in ("nothing", "a read of the same drive, which it answers", "a write to the other drive")
+]
+
+
+@patient
+@pytest.mark.parametrize(("verb", "says"), MOMENTS)
+def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
+    with hall("invt-che", seed=3) as (drive, pair, heard):
+        set_frequency(drive, 20)
+        if verb == "reset_fault":
+            heard[0].sim.trip(4)
+        pair.says = SAYS[says]
+        pair.holds = lambda said: said == rtu(PULSES[verb])
+        with pytest.raises(FAILURES.get(says, Unconfirmed)):
+            getattr(drive, verb)()
+        assert pair.sent.count(rtu(PULSES[verb])) == 1
+        assert not any(it.starts or it.sim.motor.energised for it in heard)
+        assert heard[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
+
+
+@patient
+@pytest.mark.parametrize("says", SAYS)
+def test_what_another_client_says_confirms_no_stop(says: str) -> None:
+    with hall("invt-che", seed=3) as (drive, pair, heard):
+        running(drive, heard[0])
+        pair.says = SAYS[says]
+        pair.holds = lambda said: said == rtu(STOP)
+        with pytest.raises((Unconfirmed, FAILURES.get(says, Unconfirmed))):
+            drive.stop(seconds=1)
+        assert pair.sent.count(rtu(STOP)) >= 2
+        assert rtu(START) not in pair.sent
+        assert heard[0].sim.motor.energised == (says != "a stop of all")
+
+
+@patient
+def test_the_same_stop_of_another_client_is_one_too() -> None:
+    """It looks like the drive's confirmation of ours, and the motor stops all the same."""
+    with hall("invt-che", seed=3) as (drive, pair, heard):
+        running(drive, heard[0])
+        pair.says = rtu(STOP)
+        pair.holds = lambda said: said == rtu(STOP)
+        drive.stop()
+        assert not heard[0].sim.motor.energised
+
+
+@patient
+@pytest.mark.parametrize("verb", ["stop", "coast"])
+def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
+    """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
+    look = rtu("01 03 10 01 00 01")
+    with hall("invt-che", seed=3) as (drive, pair, heard):
+        running(drive, heard[0])
+        pair.says = look
+        pair.holds = lambda said: said == look
+        assert drive.state().condition is Condition.RUNNING
+        pair.holds = lambda said: False
+        getattr(drive, verb)()
+        assert len([it for it in heard[0].writes if it.start == 0x1000]) <= 3
+        assert not heard[0].sim.motor.energised
+
+
+@patient
+def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
+    with hall("invt-che", seed=3) as (drive, pair, heard), Bus(pair.theirs) as other:
+        set_frequency(drive, 20)
+        set_frequency(other.attach(InvtCHE(1, maximum_frequency=50)), 50)
+        with pytest.raises(Refused, match=r"holds 100\.00 % and not 40\.00 %"):
+            drive.start()
+        assert not heard[0].starts

@@ -1,0 +1,398 @@
+"""A stop always wins: after one was called, by anybody, nothing moves a motor that was not called after it.
+
+Real ports and threads, and a far end of our own that notes every frame. Order is judged on the wire alone:
+a line delivers in order, so what comes after a stop's first frame has left after the stop was called.
+Threads that start motors are held in the middle of their looks until the stop is called. More of it:
+`STOP_EXAMPLES=100 pytest tests/control/test_stop_wins.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from far_drives import KINDS, FarDrive
+from far_end import FarEnd, FarLine
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from lines import line as declared_line
+from lines import plant, polled
+from own_fan import Fan
+
+from multidrop.bus import Bus
+from multidrop.control.ramp import start_staggered
+from multidrop.drive import Drive
+from multidrop.drives import MODELS
+from multidrop.errors import BusError
+from multidrop.poller import Poller
+
+EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
+EXPIRY = 60.0  # s: a busy machine is slow, and nothing is wrong with it
+DRIVES = 2
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
+
+
+def quick(kind: str) -> type[Drive]:
+    """The family without the silences that it asks for, which the far end does not need."""
+    family = FAMILIES[kind]
+    without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
+    return type(family.__name__, (family,), without)
+
+
+class Signalled(Exception):
+    """A signal's effect, where it would have ended the process."""
+
+
+def _signalled(number: int, frame: object) -> None:
+    raise Signalled(number)
+
+
+class Stops(RuleBasedStateMachine):
+    """One line of two drives of one family, and all that may happen to it.
+
+    An episode is what happens from one stop to the next.
+    """
+
+    kind = ""
+
+    @initialize(polling=st.booleans(), on_exit=st.booleans())
+    def begin(self, polling: bool, on_exit: bool) -> None:
+        self._stack = ExitStack()
+        directory = Path(self._stack.enter_context(TemporaryDirectory()))
+        self._ledger = directory / "ledger"
+        self.polling, self.on_exit = polling, on_exit
+        self.far_drives = [FarDrive(KINDS[self.kind], address) for address in range(1, DRIVES + 1)]
+        self.line = FarLine(self.far_drives)
+        self.far = self._stack.enter_context(FarEnd([self.line], directory))
+        for number in SIGNALS:
+            self._stack.callback(signal.signal, number, signal.signal(number, _signalled))
+        self.threads: list[threading.Thread] = []
+        self._open()
+
+    # ---- the client ----
+
+    def _open(self) -> None:
+        """A client anew, that has written its setpoints, and a mark on the wire."""
+        self.line.troubles.clear()
+        family, options = quick(self.kind), KINDS[self.kind].makes
+        self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.far_drives]
+        if self.polling:
+            asked = [polled(it, it.readings()[:2]) for it in self.drives]
+            self.poller: Poller | None = Poller(
+                plant(declared_line(self.far.ports[0], *asked)), ledger=self._ledger
+            )
+            self.poller.__enter__()
+            self.bus = self.poller.bus("line")
+        else:
+            self.poller = None
+            self.bus = Bus(self.far.ports[0], ledger=self._ledger, expiry=EXPIRY)
+            for drive in self.drives:
+                self.bus.attach(drive)
+        if self.on_exit:
+            self.bus.stop_on_exit()
+        if self.kind != "fan":
+            for drive in self.drives:
+                drive.set_frequency(20)
+        self._mark()
+
+    def _mark(self, drive: Drive | None = None) -> None:
+        """An episode begins: a read is on the wire behind all that was sent before."""
+        drive = drive or self.drives[0]
+        self.line.troubles.clear()
+        begun = len(self.line.log)
+        with suppress(BusError):
+            self.bus.read(drive, drive.register(KINDS[self.kind].mark))
+        assert len(self.line.log) > begun
+        self.begun = len(self.line.log)
+        self.staggered = False
+        self.connection = self.line.connection
+
+    def _close(self) -> None:
+        (self.poller or self.bus).close()
+
+    # ---- what happens ----
+
+    @rule(troubles=st.lists(st.sampled_from(["mute", "deaf", "late", 1, 2, 3, 4, 6, 0x11, ""]), max_size=6))
+    def have_trouble(self, troubles: list[str | int]) -> None:
+        """With the next requests."""
+        self.line.troubles[:] = troubles
+
+    @precondition(lambda self: len(self.threads) < 3 and not self.staggered)
+    @rule(
+        number=st.integers(0, DRIVES - 1),
+        name=st.sampled_from(["start", "start", "jog", "staggered"]),
+        after=st.integers(0, 12),
+    )
+    def start_and_hold(self, number: int, name: str, after: int) -> None:
+        """A thread starts a motor; from some request on nothing is answered until a stop is called.
+
+        A staggered start that fails is a stop too, after which nothing is started in this episode.
+        """
+        self.staggered = name == "staggered"
+        self.line.hold(after)
+        thread = self._thread(
+            (lambda: start_staggered(self.drives, 0.05))
+            if self.staggered
+            else getattr(self.drives[number], name)
+        )
+        while thread.is_alive() and not self.line.held.wait(0.01):
+            pass
+
+    @rule(number=st.integers(0, DRIVES - 1))
+    def started_by_hand(self, number: int) -> None:
+        self.far_drives[number].turn()
+
+    @rule(
+        how=st.sampled_from(["verb", "verb", "stop_all", "leave", "signal", "signal"]),
+        verbs=st.lists(st.tuples(st.integers(0, DRIVES - 1), st.integers(0, 2)), min_size=1, max_size=2),
+        signals=st.lists(st.sampled_from(SIGNALS), min_size=1, max_size=2),
+    )
+    def stop(self, how: str, verbs: list[tuple[int, int]], signals: list[signal.Signals]) -> None:
+        """Somebody stops; what was held is let go when that is called."""
+        if how in ("leave", "signal") and not self.on_exit:
+            how = "stop_all"
+        stopped = {number for number, _ in verbs} if how == "verb" else set(range(DRIVES))
+        failures: list[BaseException] = []
+        calls: list[Callable[[], object]] = []
+        if how == "verb":
+            halts = KINDS[self.kind].halts
+            calls = [getattr(self.drives[number], halts[which % len(halts)]) for number, which in verbs]
+        elif how == "stop_all":
+            calls = [self.bus.stop_all]
+        stopping = [self._thread(call, failures) for call in calls]
+        releasing = threading.Thread(target=self._release)
+        releasing.start()
+        if how == "leave":
+            self._close()
+        elif how == "signal":
+            self._signal(signals)
+        for thread in (releasing, *stopping, *self.threads):
+            thread.join()
+        self.threads.clear()
+        self.judge(stopped, failures)
+        if how in ("leave", "signal"):
+            self._close()
+            self._judge_order(range(DRIVES))
+            for number in SIGNALS:
+                signal.signal(number, _signalled)
+            self._open()
+        else:
+            self._mark()
+
+    def _release(self) -> None:
+        """A moment after the stop was called: what is held is only held back for a better chance to fail."""
+        time.sleep(0.005)
+        self.far.release(self.line)
+
+    def _signal(self, signals: list[signal.Signals]) -> None:
+        """The second one comes when the first one's stops are on the wire."""
+
+        def again() -> None:
+            while not self._heard("stops") and not over.is_set():
+                over.wait(0.001)
+            for number in signals[1:]:
+                os.kill(os.getpid(), number)
+
+        over = threading.Event()
+        second = threading.Thread(target=again)
+        try:
+            second.start()
+            signal.raise_signal(signals[0])
+            while True:  # it is held until the stops are over
+                time.sleep(0.01)
+        except Signalled:
+            over.set()
+        while not self._is_deaf_to_signals():
+            pass
+        second.join()
+
+    def _is_deaf_to_signals(self) -> bool:
+        """The second one may come after the first one's effect."""
+        try:
+            for number in SIGNALS:
+                signal.signal(number, signal.SIG_IGN)
+        except Signalled:
+            return False
+        return True
+
+    @precondition(lambda self: self.threads)
+    @rule(detaches=st.booleans())
+    def part(self, detaches: bool) -> None:
+        """Close the bus, or take the first drive off: what began to move it writes nothing after that."""
+        releasing = threading.Thread(target=self._release)
+        releasing.start()
+        if detaches and self.poller:
+            self.poller.remove("line", self.drives[0].name)
+        elif detaches:
+            self.bus.detach(self.drives[0])
+        else:
+            self._close()
+            releasing.join()  # no client can tell an answer to the one before it
+            self._open()
+        self._mark(self.drives[1])
+        for thread in (releasing, *self.threads):
+            thread.join()
+        self.threads.clear()
+        begun = self.begun
+        self._mark(self.drives[1])
+        late = [at for at in self._heard("moves", 1 if detaches else None, begun) if at < self.begun]
+        assert [str(self.line.log[at]) for at in late] == [], self._story()
+        if detaches:
+            self._close()
+            self._open()
+
+    @precondition(lambda self: self.threads and not self.staggered)
+    @rule()
+    def lose_the_port(self) -> None:
+        """Pull the adapter out and plug it in again: nothing that was under way comes then."""
+        self.far.lose(self.line)
+        failures: list[BaseException] = []
+        stopping = self._thread(self.drives[0].stop, failures)
+        for thread in self.threads:
+            thread.join()
+        self.threads.clear()
+        self.far.bring_back(self.line)
+        stopping.join()
+        self._close()
+        back = [it for it in self.line.log if it.connection == self.line.connection]
+        assert [str(it) for it in back if it.what == "moves"] == []
+        assert failures or not self.far_drives[0].runs
+        for drive in self.far_drives:  # there may have been no way to stop them
+            drive.switch_on()
+        self._open()
+
+    @precondition(lambda self: not self.threads and not self.polling)
+    @rule(number=st.integers(0, DRIVES - 1))
+    def start(self, number: int) -> None:
+        """After a stop a motor can be started again."""
+        if self.far_drives[number].runs:
+            return
+        self.line.troubles.clear()
+        self.drives[number].start()
+        assert self.far_drives[number].runs
+
+    # ---- judging ----
+
+    def _thread(
+        self, call: Callable[[], object], failures: list[BaseException] | None = None
+    ) -> threading.Thread:
+        def run() -> None:
+            try:
+                call()
+            except (BusError, ValueError, OSError) as failure:
+                if failures is not None:
+                    failures.append(failure)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        if failures is None:
+            self.threads.append(thread)
+        return thread
+
+    def _heard(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
+        """Where in the log there are such frames of this episode, or from `begun` on."""
+        begun = self.begun if begun is None else begun
+        return [
+            at
+            for at, it in enumerate(list(self.line.log))
+            if at >= begun
+            and it.what == what
+            and it.asked is not None
+            and (address is None or it.asked.address in (0, address))
+        ]
+
+    def _judge_order(self, numbers: Any) -> None:
+        for number in numbers:
+            stops, moves = (self._heard(what, number + 1) for what in ("stops", "moves"))
+            if stops:
+                late = [str(self.line.log[at]) for at in moves if at > stops[0]]
+                assert not late, f"after {self.line.log[stops[0]]} came {late}\n{self._story()}"
+
+    def judge(self, numbers: set[int], failures: list[BaseException]) -> None:
+        self._judge_order(numbers)
+        for number in numbers:
+            assert self._heard("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
+            if not failures:
+                assert not self.far_drives[number].runs, f"{number + 1} was left running\n{self._story()}"
+
+    def _story(self) -> str:
+        return "\n".join(str(it) for it in self.line.log[self.begun :])
+
+    @invariant()
+    def no_frame_of_ours_is_damaged(self) -> None:
+        assert [str(it) for it in getattr(self, "line", FarLine([])).log if it.what == "damaged"] == []
+
+    def teardown(self) -> None:
+        if not hasattr(self, "_stack"):
+            return
+        failure = sys.exc_info()[1]
+        if isinstance(failure, Exception):  # it may not come again, and then nobody else tells of it
+            print(f"{type(failure).__name__}: {failure}\n{self._story()}\n")
+        self.line.troubles.clear()
+        self.far.release(self.line)
+        with suppress(AttributeError, Signalled):
+            self._close()
+        for thread in self.threads:
+            thread.join()
+        self._stack.close()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_moves_after_a_stop(kind: str) -> None:
+    machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
+    run_state_machine_as_test(
+        machine,
+        settings=settings(
+            max_examples=EXAMPLES,
+            stateful_step_count=12,
+            derandomize=not os.environ.get("STOP_EXAMPLES"),
+            phases=[Phase.generate],
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stop_in_the_middle_of_a_start(kind: str) -> None:
+    """At each of its first exchanges: the machine's own steps, but none left to chance."""
+    machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
+    machine.begin(polling=False, on_exit=False)
+    try:
+        for after in range(6):
+            machine.start_and_hold(number=0, name="start", after=after)
+            machine.stop(how="verb", verbs=[(0, 0)], signals=[])
+    finally:
+        machine.teardown()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
+    """Else the tests above ask nothing of this kind."""
+    machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
+    machine.begin(polling=False, on_exit=False)
+    try:
+        machine.drives[0].start()
+        assert machine.far_drives[0].runs
+    finally:
+        machine.teardown()

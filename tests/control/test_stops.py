@@ -1,0 +1,839 @@
+"""A stop always wins: against what was called before it, against looks that fail, ledgers and deaf lines."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from time import sleep
+from typing import Any
+
+import pytest
+from halls import Hall, is_write, one
+from motors import MAKE, STARTS
+
+from multidrop.bus import Bus
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.control.outcome import Effect
+from multidrop.control.ramp import ramp, start_staggered
+from multidrop.control.stop_all import LEAST_S, Seen
+from multidrop.core import Completion, Exchange, Framing, Message, build_reply
+from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
+from multidrop.drive.register import Kept, reading, setting
+from multidrop.drive.verbs import verb
+from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import (
+    BusError,
+    Expired,
+    LineError,
+    NoReply,
+    Overtaken,
+    PortLost,
+    Refused,
+    Unconfirmed,
+)
+from multidrop.sim import simulated
+
+every_family = pytest.mark.parametrize("model", MAKE)
+
+STOPS: dict[str, Callable[[Message], bool]] = {  # in the documents' words
+    "erman-er-g-220": lambda it: it.function == 5 and it.start == 1 and it.data != b"\0\0",
+    "invt-che": lambda it: it.start == 0x1000 and it.data[-1] == 5,
+    "innovert-ibd": lambda it: it.start == 0x2000 and it.data[-1] == 1,
+    "delixi-modbus": lambda it: it.start == 0x2000 and it.data[-1] == 1,
+    "delixi-native": lambda it: it.function == 2 and it.start == 1,
+    "yd1000": lambda it: it.start == 0x1000 and it.data[0] == 0xC0,
+}
+
+
+class Own(Drive):
+    """A drive of a user's own, stopped by a setting that wears."""
+
+    model = "own"
+    title = "OWN 1"
+    speed = reading(0x10, "rpm")
+    run = setting(0x20, kept=Kept.EEPROM)
+    ratio = setting(0x21, kept=Kept.RAM)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor."""
+        yield from read(self.speed)
+        yield from write(self.run, 1)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from write(self.run, 0)
+
+    @verb
+    def state(self) -> Script[State]:
+        """What the drive says of itself."""
+        speed = yield from read(self.speed)
+        return State(Condition.RUNNING if speed else Condition.STOPPED)
+
+
+def writes(hall: Hall, begun: int = 0) -> list[Message]:
+    return [request for request, _ in hall.frames[begun:] if is_write(request)]
+
+
+def first(hall: Hall, begun: int, met: Callable[[Message], bool]) -> int | None:
+    """How many frames went before the first write of this kind."""
+    wanted = (at for at, (it, _) in enumerate(hall.frames[begun:]) if is_write(it) and met(it))
+    return next(wanted, None)
+
+
+class Meanwhile:
+    """Has another thread do something when so many more frames were sent, and waits for that thread."""
+
+    def __init__(self, hall: Hall, frames: int, act: Callable[[], object]) -> None:
+        self.failure: BaseException | None = None
+        self.has_come = False
+        self._left = frames
+        self._act = act
+        self._carry_out = hall.carry_out
+        vars(hall)["carry_out"] = self.carry_out
+
+    def carry_out(self, exchange: Exchange, **times: int) -> Completion:
+        completion = self._carry_out(exchange, **times)
+        self._left -= 1
+        if self._left == 0:
+            self.has_come = True
+            thread = threading.Thread(target=self._run)
+            thread.start()
+            thread.join(30)
+            assert not thread.is_alive()
+        return completion
+
+    def _run(self) -> None:
+        try:
+            self._act()
+        except BaseException as failure:
+            self.failure = failure
+
+
+# ---- against what was called before ----
+
+
+def started_while(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    model: str,
+    frames: int,
+    act: Callable[[Hall, Any], object],
+) -> tuple[Hall, Any, Meanwhile, int, BaseException | None]:
+    """A start, in which another thread acts after so many frames; and how the start ended."""
+    hall, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
+    drive.set_frequency(20)
+    begun = len(hall.frames)
+    meanwhile = Meanwhile(hall, frames, lambda: act(hall, drive))
+    failure = None
+    try:
+        drive.start()
+    except BusError as error:
+        failure = error
+    return hall, drive, meanwhile, begun, failure
+
+
+ACTS: dict[str, Callable[[Hall, Any], object]] = {
+    "stop": lambda hall, drive: drive.stop(),
+    "stop_all": lambda hall, drive: hall.bus.stop_all(),
+    "a plain stop": lambda hall, drive: hall.bus.write(drive, *plain_stop(drive)),
+    "leave": lambda hall, drive: hall.bus.leave(),
+    "close": lambda hall, drive: hall.bus.close(),
+    "detach": lambda hall, drive: hall.bus.detach(drive),
+}
+
+
+def plain_stop(drive: Drive) -> tuple[Any, Any]:
+    register = drive.registers.get("control") or drive.register("stop_coil")
+    assert register.harmless
+    return register, register.decode(register.harmless[-1])
+
+
+@pytest.mark.parametrize("act", ACTS)
+@every_family
+def test_nothing_moves_after_a_stop_wherever_it_came_in_a_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, act: str
+) -> None:
+    """At every frame of it; what was sent before is followed by the stop, and never told as not sent."""
+    for frames in range(1, 100):
+        hall, drive, meanwhile, begun, failure = started_while(
+            monkeypatch, tmp_path, model, frames, ACTS[act]
+        )
+        if not meanwhile.has_come:
+            break
+        assert meanwhile.failure is None
+        start = first(hall, begun, STARTS[model])
+        assert start is None or start < frames
+        assert isinstance(failure, Overtaken if start is None else Unconfirmed), (frames, failure)
+        if act in ("stop", "stop_all"):
+            stop = first(hall, begun, STOPS[model])
+            assert stop is not None
+            assert start is None or start < stop
+            assert drive.state().condition in (Condition.STOPPED, Condition.UNKNOWN)
+    assert frames > 3
+
+
+@pytest.mark.parametrize("verb_name", ["coast", "emergency_stop"])
+@every_family
+def test_the_other_stops_win_too(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, verb_name: str
+) -> None:
+    if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
+        return
+
+    def act(hall: Hall, drive: Any) -> None:
+        getattr(drive, verb_name)()
+
+    hall, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
+    assert isinstance(failure, Overtaken)
+    assert "a stop was called; nothing more was sent" in str(failure)
+    assert first(hall, begun, STARTS[model]) is None
+
+
+def test_other_drives_are_not_held_up_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    hall = Hall(monkeypatch, *sims)
+    one_of_them, other = (hall.attach(it.drive) for it in sims)
+    other.set_frequency(20)
+    Meanwhile(hall, 2, one_of_them.stop)
+    other.start()
+    assert sims[1].motor.energised
+
+
+def test_what_is_called_after_a_stop_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    drive.stop()
+    drive.start()
+    assert sim.motor.energised
+
+
+def test_what_is_called_while_a_stop_is_under_way_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    drive.start()
+    begun = len(hall.frames)
+    meanwhile = Meanwhile(hall, 2, drive.start)
+    drive.stop()
+    assert isinstance(meanwhile.failure, Overtaken)
+    assert first(hall, begun, STARTS["invt-che"]) is None
+    assert not sim.motor.energised
+
+
+def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, YD1000(1))
+    drive.set_frequency(10)
+    begun = len(hall.frames)
+    meanwhile = Meanwhile(hall, 8, drive.stop)
+    with pytest.raises(Overtaken):
+        ramp(drive, 60.0)
+    assert meanwhile.has_come
+    stop = first(hall, begun, STOPS["yd1000"])
+    assert stop is not None
+    after = [it for it in writes(hall, begun + stop) if it.start == 0x1001]
+    assert after == []
+
+
+def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where it came between two starts: the second one is not called after it by anybody."""
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
+    hall = Hall(monkeypatch, *sims)
+    drives = [hall.attach(it.drive) for it in sims]
+    for drive in drives:
+        drive.set_frequency(20)
+    perform = drives[1].perform
+
+    def stop_meanwhile(script: Script[Any]) -> Any:
+        hall.bus.stop_all()
+        return perform(script)
+
+    monkeypatch.setattr(drives[1], "perform", stop_meanwhile)
+    with pytest.raises(Overtaken):
+        start_staggered(drives, 1.0)
+    assert not any(it.motor.energised for it in sims)
+
+
+def test_after_closing_nothing_that_moves_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    hall.bus.close()
+    begun = len(hall.frames)
+    for call in (
+        drive.start,
+        drive.jog,
+        lambda: drive.set_frequency(30),
+        lambda: hall.bus.write(drive, drive.setpoint, 10.0),
+        lambda: hall.bus.raw(drive, 6, 0x1000, b"\0\1"),
+    ):
+        with pytest.raises(Overtaken, match="the bus was left"):
+            call()
+    assert writes(hall, begun) == []
+
+
+# ---- looks ----
+
+REFUSALS = [
+    ("invt-che", 0x11),
+    ("invt-che", 0x06),
+    ("delixi-native", 0xFF),
+    ("yd1000", 0x04),
+    ("innovert-ibd", 0x06),
+    ("erman-er-g-220", 0x02),
+]
+
+
+@pytest.mark.parametrize(("model", "code"), REFUSALS)
+def test_an_exception_to_the_look_keeps_no_stop_back(
+    monkeypatch: pytest.MonkeyPatch, model: str, code: int
+) -> None:
+    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    sim.motor.energised = True
+
+    def refuse(request: Message) -> bytes | None:
+        if is_write(request) or writes(hall):
+            return None
+        return build_reply(
+            drive.framing, Message(1, request.function, request.start, exception=code, data=bytes(4))
+        )
+
+    hall.answers = refuse
+    begun = hall.seconds
+    drive.stop()
+    stop = first(hall, 0, STOPS[model])
+    assert stop is not None
+    assert hall.seconds - begun < 60
+    assert STOPS[model](writes(hall)[0])  # nothing else was written
+
+
+@every_family
+def test_the_first_look_of_a_stop_and_the_stop_itself_wait_for_no_late_answer(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    insisted: list[bool] = []
+    carry_out = hall.carry_out
+
+    def watched(exchange: Any, **times: int) -> Any:
+        if not writes(hall):
+            insisted.append(bool(exchange.c.insists))
+        return carry_out(exchange, **times)
+
+    monkeypatch.setattr(hall, "carry_out", watched)
+    drive.stop()
+    assert len(insisted) >= 2
+    assert all(insisted)
+
+
+@every_family
+def test_a_look_that_is_lost_is_not_repeated_before_the_stop(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    hall.loses = lambda request: not writes(hall)
+    drive.stop()
+    assert first(hall, 0, STOPS[model]) == 1
+
+
+def test_one_odd_answer_is_no_proof_of_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
+    hall.answers = lambda request: odd if len(hall.frames) == 1 else None
+    drive.stop()
+    assert first(hall, 0, STOPS["invt-che"]) is not None
+
+
+def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it says may be the answer to what it was asked before."""
+    hall, drive, sim = one(monkeypatch, InvtCHE(1))
+    sim["device"] = 0x010A
+    counters = hall.bus.peer(drive).c.counters
+    counters.ended[10] = 1
+    drive.stop()
+    assert hall.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
+
+
+def test_a_stop_that_is_withheld_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, sim = one(monkeypatch, InvtCHE(1))
+    sim["device"] = 0x010A
+    with pytest.raises(Refused, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"):
+        drive.stop()
+    assert hall.written == []
+    sim["device"] = 0x0101
+    drive.stop()  # it is looked at again
+    assert hall.written != []
+
+
+OTHERS: Sequence[tuple[Drive, Drive]] = (  # declared, and there: of one framing and baud rate
+    (InvtCHE(1, maximum_frequency=50), YD1000(1)),
+    (InnovertIBD(1, confirmed=0), InvtCHE(1)),
+    (YD1000(1), InvtCHE(1)),
+    (DelixiModbus(1, framing="rtu", format="8E1"), YD1000(1, format="8E1")),
+)
+
+
+@pytest.mark.parametrize("pair", OTHERS, ids=lambda pair: f"{pair[0].model} for {pair[1].model}")
+def test_the_stop_of_the_family_that_it_looks_like_is_offered(
+    monkeypatch: pytest.MonkeyPatch, pair: tuple[Drive, Drive]
+) -> None:
+    declared, there = pair
+    sim = simulated(there)
+    hall = Hall(monkeypatch, sim)
+    drive = hall.attach(declared)
+    with pytest.raises(Refused, match=f"multidrop stop PORT {there.model} 1"):
+        drive.stop()
+    assert hall.written == []
+    hall.bus.detach(drive)
+    hall.attach(type(there)(1, format=there.settings.format)).stop()
+    assert hall.written != []
+
+
+# ---- until it stands ----
+
+
+@every_family
+def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(20)
+    drive.start()
+    hears_at = hall.seconds + 20
+    hall.deafens = lambda request: hall.seconds < hears_at
+    drive.stop()
+    assert not sim.motor.energised
+
+
+def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(50)
+    drive.start()
+    hall.sleep(20)
+    begun = hall.seconds
+    with pytest.raises(
+        Unconfirmed, match=r"after 2 s, all that it was given, it is not seen to have stopped"
+    ):
+        drive.stop(seconds=2)
+    assert 2 <= hall.seconds - begun < 2.2
+    hall.deafens = lambda request: True
+    begun = hall.seconds
+    with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed: .*no reply"):
+        drive.stop()
+    assert LEAST_S <= hall.seconds - begun < LEAST_S + 2
+    begun = hall.seconds
+    with pytest.raises(Unconfirmed):
+        drive.stop(seconds=100)
+    assert 100 <= hall.seconds - begun < 102
+    sent = len(writes(hall))
+    with pytest.raises(Unconfirmed):
+        drive.stop(seconds=0)  # once, and no more
+    assert len(writes(hall)) == sent + 1
+    for wrong in (-1, float("nan"), True):
+        with pytest.raises(ValueError, match="no time that a stop may take"):
+            drive.stop(seconds=wrong)
+
+
+def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
+    hall = Hall(monkeypatch, *sims)
+    for sim in sims:
+        drive = hall.attach(sim.drive)
+        drive.set_frequency(20)
+        drive.start()
+    hall.sleep(10)
+    hall.deafens = lambda request: request.address == 2
+    begun = hall.seconds
+    found = hall.bus.stop_all(seconds=12)
+    assert 12 <= hall.seconds - begun < 13
+    assert {name: it.seen for name, it in found.items()} == {
+        "invt-che@1": Seen.STOPPED,
+        "erman-er-g-220@2": Seen.SENT,
+    }
+
+
+def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor for the first one, of a drive that is known."""
+    others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
+    hall = Hall(monkeypatch, *(simulated(drive) for drive in others))
+    hall.attach(InvtCHE(1, maximum_frequency=50))
+    for drive in others[1:]:
+        hall.attach(drive)
+    hall.bus.check_identity(others[2])
+    begun = len(hall.frames)
+    found = hall.bus.stop_all()
+    addresses = [request.address for request, _ in hall.frames[begun:]]
+    assert [request.address for request in writes(hall, begun)][:2] == [3, 2]
+    assert addresses[0] == 3
+    before = first(hall, begun, lambda it: it.address == 2)
+    assert before is not None
+    assert addresses[:before].count(1) == 1
+    assert found["invt-che@1"].seen is Seen.FAILED
+    assert all(it.address != 1 for it in writes(hall, begun))
+
+
+def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hall, drive, sim = one(monkeypatch, YD1000(1))
+    drive.set_frequency(20)
+    drive.start()
+    begun = len(hall.frames)
+    hears_at = hall.seconds + 10
+    hall.deafens = lambda request: hall.seconds < hears_at
+    drive.emergency_stop()
+    pulses = [it for it in writes(hall, begun) if it.start == 0x1000 and it.data[0] & 0x10]
+    assert len(pulses) == 1
+    assert not sim.motor.energised
+
+
+@pytest.mark.parametrize("tended", [True, False])
+def test_a_port_that_was_lost_is_waited_for_and_opened_where_nobody_else_does(
+    monkeypatch: pytest.MonkeyPatch, tended: bool
+) -> None:
+    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    drive.start()
+    back_at = hall.seconds + 5
+    opened: list[float] = []
+
+    def regain() -> None:
+        opened.append(hall.seconds)
+        if hall.seconds < back_at:
+            raise PortLost("hall", "there is no such port")
+        hall.is_lost = False
+
+    def lost(request: Message) -> bytes | None:
+        if tended and hall.seconds >= back_at:
+            hall.is_lost = False
+        if hall.is_lost:
+            raise PortLost("hall", "the port was lost (hung up)")
+        return None
+
+    hall.is_lost, hall.answers, vars(hall)["regain"] = True, lost, regain
+    hall.bus.tended(tended)
+    with pytest.raises(LineError):
+        hall.bus.read(drive, drive.status)
+    assert opened == []  # only a stop does
+    with pytest.raises(LineError):
+        drive.stop(seconds=1)
+    drive.stop()
+    assert not sim.motor.energised
+    assert bool(opened) is not tended
+    assert all(later - earlier >= 0.5 for earlier, later in pairwise(opened))
+
+
+def test_a_stop_on_a_port_that_was_closed_is_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+
+    def closed(request: Message) -> bytes | None:
+        raise LineError("hall", "it is closed")
+
+    hall.answers = closed
+    begun = hall.seconds
+    with pytest.raises(LineError, match="it is closed"):
+        drive.stop()
+    assert hall.seconds - begun < 0.1
+
+
+# ---- a user's own drive ----
+
+
+def test_an_unwritable_ledger_keeps_no_stop_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    hall = Hall(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
+    drives = [hall.attach(Own(address)) for address in (1, 2)]
+    drives[0].stop()
+    assert len(writes(hall)) == 1
+    found = hall.bus.stop_all()
+    assert [it.seen for it in found.values()] == [Seen.STOPPED] * 2
+    assert "a stop was not counted" in caplog.text
+
+
+def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ledger = Ledger(tmp_path / "wear", budget=1)
+    hall = Hall(monkeypatch, simulated(Own(1)), ledger=ledger)
+    drive = hall.attach(Own(1, confirmed=1))
+    drive.start()
+    for _ in range(3):
+        drive.stop()
+    assert [it.data for it in writes(hall)] == [b"\0\1", b"\0\0", b"\0\0", b"\0\0"]
+    (wear,) = ledger.wear(1_700_000_000 + hall.seconds)
+    assert wear.writes == 4
+
+
+def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(Own):
+        """Its author made a mistake."""
+
+        @verb
+        def stop(self) -> Script[None]:
+            """Stop the motor."""
+            raise KeyError("speed")
+            yield
+
+    class Breaks(Own):
+        """After its stop was sent."""
+
+        @verb
+        def stop(self) -> Script[None]:
+            """Stop the motor."""
+            yield from write(self.run, 0)
+            raise ZeroDivisionError("division by zero")
+
+    hall = Hall(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
+    for drive in (Broken(1, name="broken"), Breaks(2, name="breaks"), Own(3, name="own")):
+        hall.attach(drive)
+    found = hall.bus.stop_all()
+    assert {name: it.seen for name, it in found.items()} == {
+        "broken": Seen.FAILED,
+        "breaks": Seen.SENT,
+        "own": Seen.STOPPED,
+    }
+    assert "KeyError: 'speed'" in found["broken"].why
+    assert "division by zero" in found["breaks"].why
+
+
+def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = Hall(monkeypatch, simulated(Own(1)))
+    drive = hall.attach(Own(1))
+    hall.deafens = lambda request: hall.seconds < 1010
+    drive.stop()
+    assert len(writes(hall)) > 3
+
+
+# ---- expiry ----
+
+
+@every_family
+def test_a_start_that_was_held_up_in_its_looks_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
+) -> None:
+    """As by Ctrl-Z, at each of them."""
+    for frames in range(1, 100):
+        hall, _, meanwhile, begun, failure = started_while(
+            monkeypatch, tmp_path, model, frames, lambda hall, drive: hall.sleep(5)
+        )
+        start = first(hall, begun, STARTS[model])
+        if not meanwhile.has_come or (start is not None and start < frames):
+            break
+        assert start is None
+        assert isinstance(failure, Expired)
+    assert frames > 2
+
+
+def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Sleepy(Own):
+        """It is waited for."""
+
+        @verb
+        def start(self, direction: Direction | None = None) -> Script[None]:
+            """Start the motor."""
+            for _ in range(20):
+                yield from wait(1.0)
+                yield from read(self.speed)
+            yield from write(self.ratio, 1)
+
+    hall = Hall(monkeypatch, simulated(Sleepy(1)))
+    hall.attach(Sleepy(1, confirmed=1)).start()
+    assert len(writes(hall)) == 1
+
+
+@pytest.mark.parametrize("expiry", [0, -1, float("nan"), float("inf"), True, "1"])
+def test_an_expiry_that_is_none_is_refused(expiry: Any) -> None:
+    with pytest.raises(ValueError, match=r"expiry = .* is not a number of seconds above 0"):
+        Bus("/dev/none", expiry=expiry)
+
+
+# ---- what is said of what was sent ----
+
+
+def test_a_port_that_is_lost_after_a_confirmed_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+
+    def lost(request: Message) -> bytes | None:
+        if first(hall, 0, STARTS["invt-che"]) is not None and not is_write(request):
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    hall.answers = lost
+    with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*lost"):
+        drive.start()
+
+
+def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    hall.bus.check_identity(drive)
+
+    def lost(request: Message) -> bytes | None:
+        if writes(hall) and not is_write(request):
+            raise LineError("hall", "the port was lost (hung up)")
+        return None
+
+    hall.answers = lost
+    outcome = hall.bus.try_write(drive, drive.setpoint, 10.0)
+    assert outcome.effect is Effect.UNCONFIRMED
+    with pytest.raises(Unconfirmed, match="confirmed, but not read back"):
+        assert outcome.value
+
+
+def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    hall.bus.check_identity(drive)
+    Meanwhile(hall, 1, lambda: hall.bus.detach(drive))
+    with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
+        hall.bus.write(drive, drive.setpoint, 10.0)
+
+
+# ---- interruptions ----
+
+
+@every_family
+@pytest.mark.parametrize("all_of_them", [False, True])
+def test_a_stop_that_is_interrupted_is_sent_once_more(
+    monkeypatch: pytest.MonkeyPatch, model: str, all_of_them: bool
+) -> None:
+    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    drive.set_frequency(20)
+    drive.start()
+    begun = len(hall.frames)
+    pressed: list[Message] = []
+
+    def press(request: Message) -> bytes | None:
+        if len(hall.frames) > begun and not pressed:
+            pressed.append(request)
+            raise KeyboardInterrupt
+        return None
+
+    hall.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        hall.bus.stop_all() if all_of_them else drive.stop()
+    stops = [it for it in writes(hall, begun) if STOPS[model](it)]
+    assert len(stops) == 2
+    assert interruption.value.__notes__ == [
+        f"{drive.name}: the stop was sent {1 if model != 'erman-er-g-220' else 2} times; "
+        "the motor is not seen to stand"
+    ]
+
+
+def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    hall.bus.check_identity(drive)
+
+    def press(request: Message) -> bytes | None:
+        raise KeyboardInterrupt
+
+    hall.answers = press
+    with pytest.raises(KeyboardInterrupt):
+        drive.stop()
+    assert len(writes(hall)) == 2
+
+
+@pytest.mark.parametrize(
+    ("moment", "note"),
+    [
+        ("look", "nothing of the start was sent"),
+        ("start", "control = FORWARD may have been sent, and nothing is known of its effect"),
+        ("after", "control = FORWARD was sent and confirmed; what came of it was not seen"),
+    ],
+)
+def test_a_start_that_is_interrupted_says_what_was_sent(
+    monkeypatch: pytest.MonkeyPatch, moment: str, note: str
+) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+
+    def press(request: Message) -> bytes | None:
+        is_start = is_write(request) and STARTS["invt-che"](request)
+        was_sent = first(hall, 0, STARTS["invt-che"]) is not None
+        if {"look": True, "start": is_start, "after": was_sent and not is_start}[moment]:
+            raise KeyboardInterrupt
+        return None
+
+    hall.answers = press
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        drive.start()
+    assert interruption.value.__notes__ == [f"{drive.name}: {note}"]
+
+
+# ---- one drive, one bus ----
+
+
+def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    other = Hall(monkeypatch)
+    with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
+        other.attach(drive)
+    assert other.bus.drives == []
+    drive.state()  # its verbs still go over the first
+    hall.bus.detach(drive)
+    other.attach(drive)
+    other.bus.close()
+    hall.attach(drive)  # the other one is closed
+
+
+def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = Hall(monkeypatch)
+    together = threading.Barrier(8)
+    add, inside, most = hall.bus._exchanges.add, set[str](), 0
+
+    def slow(drive: Drive) -> None:
+        nonlocal most
+        inside.add(drive.name)
+        most = max(most, len(inside))
+        sleep(0.001)  # the others may go on meanwhile
+        inside.discard(drive.name)
+        add(drive)
+
+    monkeypatch.setattr(hall.bus._exchanges, "add", slow)
+    outcomes: list[str] = []
+
+    def attach(address: int) -> None:
+        together.wait(30)
+        try:
+            hall.attach(InvtCHE(address))
+            outcomes.append("attached")
+        except ValueError:
+            outcomes.append("taken")
+
+    for _ in range(20):
+        outcomes.clear()
+        threads = [threading.Thread(target=attach, args=[1 + number % 4]) for number in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30)
+        assert sorted(outcomes) == ["attached"] * 4 + ["taken"] * 4
+        assert sorted(drive.address for drive in hall.bus.drives) == [1, 2, 3, 4]
+        for drive in hall.bus.drives:
+            hall.bus.detach(drive)
+    assert most == 1
+
+
+def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    hall.deafens = lambda request: True
+    with pytest.raises(Unconfirmed):
+        drive.stop(seconds=1)
+    with pytest.raises(NoReply):
+        drive.start()
+    assert first(hall, 0, STARTS["invt-che"]) is None
+
+
+def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Each stop was sent before the first record is written."""
+    hall = Hall(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    for address in (1, 2):
+        hall.attach(InvtCHE(address))
+    stopped: list[int] = []
+    audit = hall.bus._writer.audit
+    assert audit is not None
+    monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(hall))))
+    hall.bus.stop_all()
+    assert stopped == [2, 2]

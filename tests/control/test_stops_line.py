@@ -1,0 +1,253 @@
+"""A stop against late answers, other threads and a port that is closed: through the real engine and a pty."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lines import PATIENCE, LateWire, plant, polled, until
+from lines import line as declared_line
+from motors import MAKE, Heard
+
+from multidrop.bus import Bus
+from multidrop.control import performer
+from multidrop.core import Message
+from multidrop.drive import Condition
+from multidrop.errors import BusError, LineError, NoReply, Overtaken, Unconfirmed
+from multidrop.poller import Poller
+from multidrop.polling.polled_line import PolledLine
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.transport import exchange as exchanges
+
+every_family = pytest.mark.parametrize("model", MAKE)
+
+
+class Delayed(LateWire):
+    """Every reply comes so late, and in order."""
+
+    delay = 0.0
+
+    def distort(self, reply: bytes) -> bytes:
+        return self.hold_up(reply, self.delay) if self.delay else reply
+
+
+@contextmanager
+def line(model: str) -> Iterator[tuple[Bus, Any, Heard, Delayed]]:
+    drive = MAKE[model](1)
+    sim = simulated(drive)
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    heard, wire = Heard(sim), Delayed([sim], unpaced=True)
+    with Simulator([wire]) as simulator, Bus(simulator.wires[0].path) as bus:
+        yield bus, bus.attach(drive), heard, wire
+
+
+@every_family
+def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
+    """Each answer comes after the next question: the look before the stop has another's."""
+    with line(model) as (bus, drive, heard, wire):
+        heard.sim.motor.run(1)
+        wire.delay = 0.6
+        with suppress(BusError):
+            bus.read(drive, next(it for it in drive.registers.values() if it.readable))
+        with suppress(Unconfirmed):  # whether the motor stands may never be seen
+            drive.stop(seconds=1)
+        assert heard.writes
+        until(lambda: not heard.sim.motor.energised)
+
+
+def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            act()
+        except BaseException as failure:
+            failures.append(failure)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, failures
+
+
+@pytest.mark.parametrize("ending", ["close", "detach"])
+@pytest.mark.parametrize("what", ["start", "write", "raw"])
+def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
+    monkeypatch: pytest.MonkeyPatch, ending: str, what: str
+) -> None:
+    """Never as if nothing had been sent."""
+    monkeypatch.setattr(exchanges, "READ_ATTEMPTS", 1)
+    with line("invt-che") as (bus, drive, heard, _):
+        drive.set_frequency(20)
+        acts: dict[str, Callable[[], object]] = {
+            "start": drive.start,
+            "write": lambda: bus.write(drive, drive.setpoint, 50.0),
+            "raw": lambda: bus.raw(drive, 6, 0x1000, b"\0\1"),
+        }
+        begun, came = len(heard.writes), threading.Event()
+
+        def loses(request: Message) -> bool:
+            if len(heard.writes) > begun:
+                came.set()
+            return came.is_set()
+
+        heard.loses = loses
+        if ending == "close":
+            known = bus.peer(drive).c
+            known.most_timeout_ns = known.least_timeout_ns = 60_000_000_000
+        thread, failures = in_thread(acts[what])
+        assert came.wait(PATIENCE)
+        bus.close() if ending == "close" else bus.detach(drive)
+        thread.join(PATIENCE)
+        assert not thread.is_alive()
+        assert [type(it) for it in failures] == [Unconfirmed]
+        assert len(heard.writes) == begun + 1
+
+
+@every_family
+def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(model: str) -> None:
+    """The start's look is not answered until the stop has been."""
+    with line(model) as (_, drive, heard, _):
+        drive.set_frequency(20)
+        looked, stopped = threading.Event(), threading.Event()
+
+        def loses(request: Message) -> bool:
+            if not stopped.is_set() and request not in heard.writes:
+                looked.set()
+            return False
+
+        heard.loses = loses
+        starting, failures = in_thread(drive.start)
+        assert looked.wait(PATIENCE)
+        drive.stop()
+        stopped.set()
+        starting.join(PATIENCE)
+        assert [type(it) for it in failures] in ([Overtaken], [Unconfirmed])
+        until(lambda: not heard.sim.motor.energised)
+
+
+def test_closing_waits_for_a_stop_that_is_under_way() -> None:
+    with line("invt-che") as (bus, drive, heard, _):
+        drive.set_frequency(20)
+        drive.start()
+        deaf = threading.Event()
+        sent = threading.Event()
+
+        def loses(request: Message) -> bool:
+            if request in heard.writes:
+                sent.set()
+            return not deaf.is_set()
+
+        heard.loses = loses
+        stopping, failures = in_thread(drive.stop)
+        assert sent.wait(PATIENCE)
+        closing, _ = in_thread(bus.close)
+        closing.join(0.1)
+        assert closing.is_alive()
+        deaf.set()
+        for thread in (stopping, closing):
+            thread.join(PATIENCE)
+        assert failures == []
+
+
+class Pulled:
+    """A line whose port is pulled out while the motor turns, and is back at once under the same name."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = str(link)
+        self.drive = MAKE["invt-che"](1)
+        sim = simulated(self.drive)
+        assert isinstance(sim, PoweredDrive)
+        sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+        self.heard = Heard(sim)
+
+    def plugged_in(self) -> Simulator:
+        return Simulator([Wire([self.heard.sim], port=self.link, unpaced=True)])
+
+    def starts(self, bus: Bus) -> None:
+        drive: Any = self.drive
+        drive.set_frequency(20)
+        drive.start()
+
+    def until_lost(self, bus: Bus) -> None:
+        until(lambda: bus.line.queue is None or bus.line.queue.lost)
+        assert self.heard.sim.motor.energised
+        self.heard.requests.clear()
+
+
+@pytest.mark.parametrize("ending", ["close", "stop", "stop_all", "write"])
+def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
+    pulled = Pulled(tmp_path / "port")
+    drive: Any = pulled.drive
+    with ExitStack() as stack:
+        with pulled.plugged_in():
+            bus = stack.enter_context(Bus(pulled.link))
+            bus.attach(drive)
+            pulled.starts(bus)
+        pulled.until_lost(bus)
+        with pytest.raises(LineError):
+            drive.state()
+        with pytest.raises(LineError):  # nobody opens it
+            bus.line.regain()
+        with pulled.plugged_in():
+            with pytest.raises(LineError):
+                drive.state()
+            if ending == "close":
+                bus.stop_on_exit()
+            elif ending == "write":
+                bus.write(drive, drive.control, drive.control.values(5))
+                until(lambda: drive.state().condition is Condition.STOPPED)
+            else:
+                getattr(drive if ending == "stop" else bus, ending)()
+            bus.close()
+            assert pulled.heard.writes
+            assert pulled.heard.starts == []
+            until(lambda: not pulled.heard.sim.motor.energised)
+    with pytest.raises(LineError, match="it is closed"):
+        drive.stop()
+
+
+@pytest.mark.parametrize("opener", ["the poller", "the stop"])
+def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opener: str
+) -> None:
+    """Whoever opens it again."""
+    if opener == "the stop":
+        monkeypatch.setattr(PolledLine, "_reopen", lambda tended: None)
+    pulled = Pulled(tmp_path / "port")
+    drive: Any = pulled.drive
+    with ExitStack() as stack:
+        with pulled.plugged_in():
+            declared = declared_line(pulled.link, polled(drive, [drive.status]))
+            poller = stack.enter_context(Poller(plant(declared)))
+            poller.stop_on_exit()
+            bus = poller.bus("line")
+            pulled.starts(bus)
+        pulled.until_lost(bus)
+        with pulled.plugged_in():
+            poller.close()
+            assert pulled.heard.writes
+            assert pulled.heard.starts == []
+            until(lambda: not pulled.heard.sim.motor.energised)
+            waits: list[float] = []
+            monkeypatch.setattr(performer, "sleep", waits.append)
+            with pytest.raises(LineError, match="it is closed"):
+                drive.stop()
+            assert sum(waits) == 0  # it never comes back
+
+
+def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
+    with line("invt-che") as (_, drive, heard, _):
+        drive.set_frequency(20)
+        heard.loses = lambda request: True
+        stopping, _ = in_thread(lambda: drive.stop(seconds=1))
+        until(lambda: any(it.data == b"\0\5" for it in heard.writes))
+        for call in (drive.start, lambda: drive.set_frequency(30)):
+            with pytest.raises((Overtaken, NoReply)):
+                call()
+        stopping.join(PATIENCE)
+        assert heard.starts == []

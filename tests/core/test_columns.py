@@ -1,0 +1,263 @@
+"""Completions become columns: numbers on every wire, scales, misses, and their room."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from frames import words
+from line_driver import MS, LineDriver
+
+from multidrop.core import (
+    EXCEPTION_STATUS,
+    Columns,
+    Exchange,
+    Field,
+    Framing,
+    Message,
+    Names,
+    NumberFormat,
+    Peer,
+    Result,
+    RowLayout,
+    RowQueue,
+    build_reply,
+    raw_value,
+    spell,
+    status_text,
+)
+
+UTC = 1_700_000_000_000_000_000  # what monotonic time lies behind
+
+
+NUMBERS = [
+    (NumberFormat.U16, "FF FE", 65534),
+    (NumberFormat.I16, "FF FE", -2),
+    (NumberFormat.U32, "FF FF FF FE", 4294967294),
+    (NumberFormat.I32, "FF FF FF FE", -2),
+    (NumberFormat.U32_SWAPPED, "00 01 00 02", 0x20001),
+    (NumberFormat.I32_SWAPPED, "FF FE FF FF", -2),
+    (NumberFormat.U32_EITHER, "00 00 02 00", 512),
+    (NumberFormat.U32_EITHER, "02 00 00 00", 512),
+    (NumberFormat.F32, "42 47 00 00", 49.75),
+    (NumberFormat.F32_SWAPPED, "00 00 42 47", 49.75),
+    (NumberFormat.BIT, "01", 1),
+]
+
+
+@pytest.mark.parametrize(("wire", "data", "value"), NUMBERS)
+def test_number(wire: NumberFormat, data: str, value: float) -> None:
+    assert raw_value(bytes.fromhex(data), 0, wire) == value
+
+
+def test_every_wire_is_tested() -> None:
+    assert {wire for wire, _, _ in NUMBERS} == set(NumberFormat)
+
+
+def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:
+    """Application protocol V1.1b3, 6.1: the reply CD 6B 05 to a read of coils 20 to 38."""
+    coils = [raw_value(bytes.fromhex("CD 6B 05"), at, NumberFormat.BIT) for at in range(19)]
+    assert coils == [1, 0, 1, 1, 0, 0, 1, 1, 1, 1, 0, 1, 0, 1, 1, 0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("wire", list(NumberFormat))
+def test_beyond_the_data_there_is_no_number(wire: NumberFormat) -> None:
+    for at in (8, 9, 2**15, 2**31, 2**63, 2**64 - 1):
+        assert math.isnan(raw_value(b"\xff", at, wire))
+    assert math.isnan(raw_value(b"", 0, wire))
+
+
+def completed(request: Message, received: bytes) -> Any:
+    """What becomes of an exchange that begins at 1000 ms and whose reply begins 30 ms later."""
+    line = LineDriver()
+    line.begin(
+        Exchange(
+            Framing.RTU,
+            request,
+            Peer(least_timeout=0.1, most_timeout=0.1),
+            baudrate=9600,
+            format="8N1",
+            character=1e-6,
+            silence=0,
+        )
+    )
+    line.wait_until_write()
+    line.now += 30 * MS
+    line.receive(received)
+    line.wait_until_done()
+    return line.found
+
+
+def reply(*values: int) -> Any:
+    request = Message(1, 0x03, 0, len(values))
+    return completed(request, build_reply(Framing.RTU, Message(1, 0x03, data=words(*values))))
+
+
+def test_rows_of_a_block() -> None:
+    block = RowLayout(
+        5,
+        [
+            Field(0, NumberFormat.U16, register=50, multiplier=1, divisor=10),
+            Field(2, NumberFormat.I16, register=51, multiplier=1, divisor=100),
+            Field(1, NumberFormat.U32, register=52, multiplier=60, divisor=1),
+        ],
+    )
+    columns = Columns(8)
+    assert columns.add(block, reply(3, 0xFFFF, 0xFF9C), UTC)
+    assert len(columns) == 3
+    sent = 1000 * MS
+    assert list(columns.array("time")) == [UTC + sent] * 3
+    assert list(columns.array("sent")) == [sent] * 3
+    assert list(columns.array("uncertainty")) == [30 * MS - 10 * 1000] * 3
+    assert list(columns.array("drive")) == [5, 5, 5]
+    assert list(columns.array("reg")) == [50, 51, 52]
+    assert list(columns.array("status")) == [0, 0, 0]
+    assert list(columns.array("value")) == [0.3, -1.0, 0xFFFFFF9C * 60]
+    assert columns.array("valid")[0] & 0b111 == 0b111
+
+
+@pytest.mark.parametrize(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
+def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
+    """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
+    columns = Columns(1)
+    assert columns.add(RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)
+    assert columns.array("value")[0] == raw / divisor
+
+
+ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
+
+
+@pytest.mark.parametrize(
+    ("received", "status", "text"),
+    [
+        (b"", -Result.NO_REPLY, "no reply"),
+        (b"\x01\x03", -Result.CUT_SHORT, "reply cut short"),
+        (b"\x01\x03\x02\x00\x00\x00\x00", -Result.BAD_CHECKSUM, "bad checksum"),
+        (
+            build_reply(Framing.RTU, Message(1, 0x03, exception=0x12)),
+            EXCEPTION_STATUS + 0x12,
+            "exception 12",
+        ),
+    ],
+)
+def test_missing_value_has_a_row_that_says_why(received: bytes, status: int, text: str) -> None:
+    columns = Columns(1)
+    assert columns.add(ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
+    assert list(columns.array("status")) == [status]
+    assert status_text(columns.array("status")[0]) == text
+    assert (columns.array("valid")[0] & 1, columns.array("value")[0]) == (0, 0.0)
+    assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
+
+
+def test_value_that_was_due_but_never_asked_for() -> None:
+    columns = Columns(2)
+    assert columns.add_miss(ONE, Result.NOT_ASKED, 77 * MS, UTC)
+    assert (columns.array("status")[0], columns.array("sent")[0]) == (-Result.NOT_ASKED, 77 * MS)
+    assert columns.array("valid")[0] & 1 == 0
+
+
+def test_request_that_never_left_has_the_time_at_which_it_was_taken_up() -> None:
+    line = LineDriver()
+    line.now = 5000 * MS
+    line.begin(
+        Exchange(
+            Framing.RTU,
+            Message(1, 3, 0, 1),
+            Peer(least_timeout=1, most_timeout=1),
+            baudrate=9600,
+            format="8N1",
+            character=1e-3,
+            silence=1,
+        )
+    )
+    line.lose(5)
+    columns = Columns(1)
+    assert columns.add(ONE, line.found, UTC)
+    assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, -Result.LINE_LOST)
+
+
+def test_field_beyond_the_reply_is_a_miss() -> None:
+    columns = Columns(2)
+    block = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
+    assert columns.add(block, reply(9), 0)
+    assert list(columns.array("status")) == [0, -Result.BAD_LENGTH]
+    assert list(columns.array("value")) == [9, 0]
+
+
+def test_bitmap_of_values_and_misses() -> None:
+    columns = Columns(20)
+    good, bad = reply(1), completed(Message(1, 0x03, 0, 1), b"")
+    pattern = [1, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 0, 0, 1]
+    for bit in pattern:
+        assert columns.add(ONE, good if bit else bad, 0)
+    valid = columns.array("valid")
+    assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
+
+
+def test_block_without_room_is_left_out_whole() -> None:
+    columns = Columns(3)
+    two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
+    answer = reply(1, 2)
+    assert columns.add(two, answer, 0)
+    assert not columns.add(two, answer, 0)
+    assert len(columns) == 2
+    assert columns.add(ONE, answer, 0)
+    assert not columns.add(ONE, answer, 0)
+    assert list(columns.array("value")) == [1, 2, 1]
+
+
+def test_codes_are_spelt_out() -> None:
+    names = Names(["pump-1", "вентилятор", ""])
+    offsets, text = spell(memoryview(array("H", [1, 0, 2, 1])), names)
+    ends = list(offsets)
+    found = [bytes(text[begin:end]).decode() for begin, end in pairwise(ends)]
+    assert found == ["вентилятор", "pump-1", "", "вентилятор"]
+
+
+def test_names_that_are_added_are_spelt_out_too() -> None:
+    names = Names()
+    numbers = [names.number(name) for name in ("pump", "fan", "pump")]
+    spell(memoryview(array("H", numbers)), names)
+    numbers.append(names.number("насос"))
+    _, text = spell(memoryview(array("H", numbers)), names)
+    assert (numbers, bytes(text).decode()) == ([0, 1, 0, 2], "".join(["pump", "fan", "pump", "насос"]))
+
+
+def test_nothing_is_spelt_out() -> None:
+    offsets, text = spell(memoryview(array("H")), Names("a"))
+    assert (list(offsets), bytes(text)) == ([0], b"")
+
+
+BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for register in range(3)])
+
+
+def test_a_block_without_fields_leaves_nothing() -> None:
+    row_queue = RowQueue()
+    row_queue.add_miss(RowLayout(0, []), Result.NOT_ASKED, 5)
+    assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
+
+
+def test_a_block_that_no_chunk_can_hold_is_counted() -> None:
+    row_queue = RowQueue(chunk_rows=2)
+    row_queue.add_miss(BLOCK, Result.NOT_ASKED, 5)
+    assert row_queue.dropped == 3
+
+
+def test_chunks_that_were_taken_can_all_be_given_back() -> None:
+    """More of them than are kept for later."""
+    row_queue = RowQueue(chunk_rows=3, most_chunks=100)
+    for turn in (1, 2):
+        for due in range(100):
+            row_queue.add_miss(BLOCK, Result.NOT_ASKED, due * turn)
+        taken = [row_queue.take() for _ in range(100)]
+        assert [[*it.array("sent")] for it in taken if it] == [[due * turn] * 3 for due in range(100)]
+        del taken
+    assert (row_queue.take(), row_queue.dropped) == (None, 0)
+
+
+def test_a_code_without_a_name_is_not_spelt_out() -> None:
+    with pytest.raises(ValueError, match=r"^a code without a name, or more than 2 GiB of names"):
+        spell(memoryview(array("H", [0, 1])), Names(["pump"]))

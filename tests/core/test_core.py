@@ -1,0 +1,801 @@
+"""The core as Python sees it: exchanges carried out on descriptors, and what is told when they fail."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import os
+import resource
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from frames import words
+from lines import until
+from multidrop._core import ffi
+
+from multidrop.core import (
+    EXCEPTION_STATUS,
+    REFUSALS,
+    Columns,
+    Completion,
+    Echo,
+    Exchange,
+    Field,
+    Framing,
+    Latch,
+    Message,
+    NumberFormat,
+    Peer,
+    Permit,
+    Port,
+    Result,
+    RowLayout,
+    RowQueue,
+    build_reply,
+    now_ns,
+    parse_request,
+    status_text,
+)
+
+PARITY = next(bit for bit, name in REFUSALS.items() if name == "parity")
+ANY_SETTINGS, NO_SETTINGS = 0, -1
+
+
+ONE_VALUE = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
+
+
+def read(
+    start: int,
+    *,
+    timeout: float = 5.0,
+    format: str = "8N1",
+    peer: Peer | None = None,
+    period: float = 0.0,
+    insists: bool = False,
+    echo_probe: Exchange | None = None,
+) -> Exchange:
+    """A read of one register; without a reply it takes `timeout`, which no passing test waits for."""
+    return Exchange(
+        Framing.RTU,
+        Message(1, 0x03, start, 1),
+        peer or Peer(least_timeout=timeout, most_timeout=timeout),
+        baudrate=115_200,
+        format=format,
+        character=1e-6,
+        silence=1e-4,
+        turnaround=1e-4,
+        period=period,
+        insists=insists,
+        block=ONE_VALUE,
+        echo_probe=echo_probe,
+    )
+
+
+def wait_until(look: Callable[[], bool]) -> None:
+    while not look():
+        time.sleep(0.001)
+
+
+class Rows:
+    """What comes of a port's exchanges, in the order in which they were carried out."""
+
+    def __init__(self, port: Port) -> None:
+        self.row_queue = RowQueue()
+        self._columns: list[Columns] = []
+        port.report_to(self.row_queue, 0)
+
+    def of(self, name: str, rows: int) -> list[int]:
+        """A column, when there are so many rows."""
+        wait_until(lambda: self._taken() >= rows)
+        return [it for columns in self._columns for it in columns.array(name)]
+
+    def _taken(self) -> int:
+        while columns := self.row_queue.take():
+            self._columns.append(columns)
+        return sum(map(len, self._columns))
+
+
+def echo_start(request: Message) -> bytes:
+    """A drive whose registers hold their own addresses."""
+    data = words(request.start)
+    return build_reply(Framing.RTU, Message(request.address, request.function, data=data))
+
+
+class Far:
+    """The far end of a line: answers every request until the line is closed."""
+
+    def __init__(self, fd: int, answer: Callable[[Message], bytes]) -> None:
+        self.fd = fd
+        self._answer = answer
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        received = b""
+        while True:
+            try:
+                more = os.read(self.fd, 1024)
+            except OSError:
+                return
+            if not more:
+                return
+            received += more
+            used, request = parse_request(Framing.RTU, received)
+            while request is not None:
+                if answer := self._answer(request):
+                    with suppress(OSError):  # the line is closed already
+                        os.write(self.fd, answer)
+                received = received[used:]
+                used, request = parse_request(Framing.RTU, received)
+
+    def join(self) -> None:
+        self._thread.join()
+        os.close(self.fd)
+
+
+@pytest.fixture
+def drive() -> Iterator[Callable[[Callable[[Message], bytes]], int]]:
+    """Makes a line with a drive at its far end; the near end's descriptor."""
+    lines: list[tuple[socket.socket, Far]] = []
+
+    def make(answer: Callable[[Message], bytes]) -> int:
+        near, far = socket.socketpair()
+        near.setblocking(False)
+        lines.append((near, Far(far.detach(), answer)))
+        return near.fileno()
+
+    yield make
+    for near, far in lines:
+        near.close()
+        far.join()
+
+
+Drive = Callable[[Callable[[Message], bytes]], int]
+
+
+def test_queued_exchanges_are_carried_out_in_turn(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS, room=128)) as port:
+        rows = Rows(port)
+        queued = [read(start) for start in range(100)]
+        assert port.submit(queued, [0] * 100) == 100
+        assert rows.of("value", 100) == list(range(100))
+    assert rows.of("status", 100) == [0] * 100
+    sent = rows.of("sent", 100)
+    assert sent == sorted(sent)
+    assert queued[0].peer.counters().values == 1
+
+
+def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS, room=4)) as port:
+        later = [now_ns() + 60_000_000_000] * 6
+        queued = [read(start) for start in range(6)]
+        assert port.submit(queued, later) == 4
+        assert port.submit(queued, later) == 0
+        assert port.pending == 4
+
+
+def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
+        rows = Rows(port)
+        queued = [read(0), read(1)]
+        port.submit(queued, due)
+        sent = rows.of("sent", 2)
+    assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
+
+
+def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) -> None:
+    """Of each exchange the last one that is due is sent, how late it may be."""
+    second = 1_000_000_000
+    fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows, now = Rows(port), now_ns()
+        queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
+        port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
+        said = [status_text(it) for it in rows.of("status", len(queued))]
+    over = "not sent: expired"
+    assert said == [over, "ok", over, "ok", "ok", "ok"]
+    assert fast.peer.counters().missed == {Result.EXPIRED: 2}
+
+
+def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows, now = Rows(port), now_ns()
+        poll = read(1, period=1.0)
+        port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
+        assert rows.of("status", 1) == [0]
+
+
+def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(0), read(1), read(2)])
+        assert port.repeating
+        assert rows.of("value", 30)[:30] == [0, 1, 2] * 10
+        port.repeat([read(7)])
+        so_far = len(rows.of("value", 30))
+        assert rows.of("value", so_far + 10)[-1] == 7
+        port.repeat([])
+        assert not port.repeating
+        assert port.carry_out(read(9)).status == 0
+
+
+def test_how_far_the_repetition_was_is_told(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(0), read(1), read(2)])
+        rows.of("value", 20)
+        following = port.repeat([])
+        port.carry_out(read(9))  # after what was under way
+        assert following == (rows.of("value", 20)[-1] + 1) % 3
+
+
+def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(0)])
+        queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
+        port.submit(queued, [due_ns, due_ns])
+        wait_until(lambda: port.pending == 0)
+        port.stop()
+        values, sent = rows.of("value", 3), rows.of("sent", 3)
+    assert values[0] == 0  # nobody waited for what was not due
+    at = values.index(1)
+    assert values[at + 1] == 2
+    assert sent[at] >= due_ns
+
+
+def test_what_cannot_be_sent_is_not_tried_again_and_again(drive: Drive) -> None:
+    slow = Peer(least_timeout=0.01, most_timeout=0.02)
+    with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.repeat([read(1, peer=slow), read(2, peer=slow)])
+        wait_until(lambda: not port.repeating)
+        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+
+
+def test_the_client_is_called_when_a_drive_fails_and_when_it_is_back(drive: Drive) -> None:
+    silent = threading.Event()
+    silent.set()
+    peer = Peer(least_timeout=0.01, most_timeout=0.3)
+    fd = drive(lambda request: b"" if silent.is_set() else echo_start(request))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        row_queue = RowQueue()
+        port.report_to(row_queue, 17)
+        asked = [read(0, peer=peer)]
+        port.submit(asked, [0])
+        assert row_queue.await_calls(60) == [17]
+        assert peer.failures == 1
+        silent.clear()
+        wait_until(lambda: now_ns() > peer.late_until_ns)
+        port.repeat(asked)
+        while peer.failures:  # the queue's end was told of too
+            assert row_queue.await_calls(60) == [17]
+
+
+def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        row_queue = RowQueue()
+        port.report_to(row_queue, 3)
+        queued = [read(0), read(1), read(2)]
+        port.submit(queued, [0, 0, now_ns() + 60_000_000_000])
+        far.recv(1024)
+        far.send(build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
+        assert row_queue.await_calls(60) == [3]
+        far.close()
+        wait_until(lambda: port.lost)
+        assert row_queue.await_calls(60) == [3]
+    near.close()
+
+
+def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        row_queue = RowQueue(chunk_rows=10, most_chunks=2)
+        port.report_to(row_queue, 0)
+        queued = [read(start) for start in range(35)]
+        port.submit(queued, [0] * 35)
+        wait_until(lambda: port.pending == 0)
+        assert (row_queue.chunks, row_queue.dropped) == (2, 20)
+        kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
+        assert [it for columns in kept for it in columns.array("value")] == [*range(10), *range(30, 35)]
+
+
+def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        row_queue = RowQueue()
+        port.report_to(row_queue, 0)
+        queued = [read(start) for start in range(100)]
+        port.submit(queued, [0] * 100)
+        wait_until(lambda: port.pending == 0)
+        columns = row_queue.take()
+        assert columns is not None
+        values = columns.array("value")
+        del columns, row_queue
+        gc.collect()
+        assert list(values) == list(range(100))
+
+
+def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        row_queue = RowQueue()
+        port.report_to(row_queue, 0)
+        queued = [read(7)]
+        port.submit(queued, [0])
+        wait_until(lambda: port.pending == 0)
+        columns = row_queue.take()
+    assert columns is not None
+    ffi.release(row_queue.c)  # as a collector of garbage does that finds both at once
+    assert list(columns.array("value")) == [7]
+    del columns
+
+
+def test_a_port_that_was_forgotten_is_let_go_of() -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    port = Port(near.fileno(), NO_SETTINGS)
+    port.submit([read(0)], [now_ns() + 60_000_000_000])
+    del port
+    gc.collect()
+    far.send(b"not for the core")
+    assert near.recv(64) == b"not for the core"
+    near.close()
+    far.close()
+
+
+@pytest.mark.parametrize("way", ["queued", "repeated", "urgent"])
+def test_a_echo_probe_goes_first_where_the_adapter_is_not_known(drive: Drive, way: str) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        rows, asked = Rows(port), [read(7, echo_probe=read(99))]
+        if way == "urgent":
+            assert [port.carry_out(asked[0]).reply.data for _ in range(2)] == [words(7)] * 2
+        else:
+            port.submit(asked * 2, [0, 0]) if way == "queued" else port.repeat(asked)
+            assert rows.of("value", 2)[:2] == [7, 7]  # and no row of the echo_probe's
+        assert heard[:3] == [99, 7, 7]
+
+
+def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return b""
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        nobody = Peer(least_timeout=0.001, most_timeout=0.001)
+        asked = read(7, peer=nobody, echo_probe=read(99, peer=nobody))
+        asked.c.insists = asked.echo_probe.c.insists = 1
+        for _ in range(2):
+            assert port.carry_out(asked).result == Result.NO_REPLY
+        until(lambda: heard == [99, 7, 99, 7])  # which the far end may do later
+
+
+@pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
+def test_no_echo_probe_goes_first_where_the_echo_was_told(drive: Drive, echo: Echo) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        port.tell_echo(echo)
+        assert port.carry_out(read(7, echo_probe=read(99))).result == 7
+    assert heard == [7]
+
+
+def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        waiting = [read(0)]
+        port.submit(waiting, [now_ns() + 60_000_000_000])
+        found = port.carry_out(read(7))
+        assert (found.result, found.reply.data) == (7, words(7))
+        assert port.pending == 1
+
+
+def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        found = port.carry_out(read(3), expires_ns=now_ns() - 1)
+        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+        assert port.carry_out(read(4)).result == 7
+    assert heard == [4]
+
+
+def written(
+    address: int,
+    start: int,
+    *,
+    turnaround: float = 1e-4,
+    insists: bool = False,
+    permit: Permit | None = None,
+) -> Exchange:
+    return Exchange(
+        Framing.RTU,
+        Message(address, 6, start, data=bytes(2)),
+        Peer(least_timeout=30.0, most_timeout=30.0),
+        baudrate=115_200,
+        format="8N1",
+        character=1e-6,
+        silence=1e-4,
+        turnaround=turnaround,
+        insists=insists,
+        permit=permit,
+    )
+
+
+def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: Drive) -> None:
+    fd = drive(lambda request: echo_start(request) if request.address else b"")
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
+        found = port.carry_out(read(3), expires_ns=now_ns() + 50_000_000)
+        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+
+
+def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_its_drive(drive: Drive) -> None:
+    """Sent after it, a start would undo it; sent before it, it would move the motor first."""
+    latch, other = Latch(), Latch()
+    heard: list[int] = []
+    found: dict[int, Completion] = {}
+    go_on = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.start)
+        if len(heard) == 1:
+            go_on.wait(30)
+        return build_reply(Framing.RTU, request) if request.function == 6 else echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+
+        def carry_out(exchange: Exchange) -> None:
+            found[exchange.request.start] = port.carry_out(exchange)
+
+        start, others = written(2, 50, permit=latch.permit()), written(3, 51, permit=other.permit())
+        wanted = [read(0, timeout=30), read(1, timeout=30), start, others, written(2, 98, insists=True)]
+        threads = [threading.Thread(target=carry_out, args=[it]) for it in wanted]
+        for thread in threads:
+            thread.start()
+            time.sleep(0.05)  # those that wait come in this order
+        latch.rise("a stop was called")
+        late = [written(2, 52, permit=latch.permit()), written(2, 99, insists=True)]
+        for exchange in late:
+            threads.append(threading.Thread(target=carry_out, args=[exchange]))
+            threads[-1].start()
+            time.sleep(0.05)
+        go_on.set()
+        for thread in threads:
+            thread.join(30)
+    assert heard == [0, 98, 99, 1, 51, 52]
+    assert (found[50].result, found[50].sent_ns) == (Result.EXPIRED, 0)
+
+
+def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -> None:
+    latch = Latch()
+    before = latch.permit()
+    assert before.is_good
+    with latch.held("a stop"):
+        assert not before.is_good
+        during = latch.permit()
+        assert not during.is_good
+    assert not during.is_good
+    assert latch.permit().is_good
+    latch.shut("the bus was left")
+    assert not latch.permit().is_good
+
+
+def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: Drive) -> None:
+    """And what had not begun is never sent."""
+    came = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        came.set()
+        return b""
+
+    fd = drive(answer)
+    port = Port(fd, NO_SETTINGS)
+    found: list[Completion] = []
+    exchanges = [written(1, 50), written(1, 51)]
+
+    def carry_out(exchange: Exchange) -> None:
+        found.append(port.carry_out(exchange))
+
+    threads = [threading.Thread(target=carry_out, args=[it]) for it in exchanges]
+    threads[0].start()
+    assert came.wait(30)
+    threads[1].start()
+    time.sleep(0.05)  # it waits behind the other
+    port.stop()
+    for thread in threads:
+        thread.join(30)
+    port.close()
+    assert [it.result for it in found] == [Result.LINE_LOST] * 2
+    assert sorted(it.sent_ns > 0 for it in found) == [False, True]
+
+
+def wait_until_it_sleeps(thread: threading.Thread) -> None:
+    """Wait until the thread is in the core: asleep at every look, while nobody holds the interpreter."""
+    stat = Path(f"/proc/self/task/{thread.native_id}/stat")
+    asleep = 0
+    while asleep < 20:
+        time.sleep(0.001)
+        asleep = asleep + 1 if stat.read_text().rpartition(")")[2].split()[0] == "S" else 0
+
+
+@pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
+def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
+    drive: Drive, insists: bool
+) -> None:
+    """One exchange at a time, and never two in a row."""
+    asked: list[str] = []
+    go_on = threading.Event()
+
+    def answer(request: Message) -> bytes:
+        asked.append("urgent" if request.start else "polled")
+        if request.start == 9:
+            go_on.wait()
+        return echo_start(request)
+
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        wanted = [read(it, timeout=60.0, insists=insists) for it in (9, 1, 2, 3, 4)]
+        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+        for thread in threads:
+            thread.start()
+            wait_until_it_sleeps(thread)
+            port.repeat([read(0, timeout=60.0)])
+        go_on.set()
+        for thread in threads:
+            thread.join()
+        port.repeat([])
+    beside = asked[: len(asked) - asked[::-1].index("urgent")]
+    assert beside.count("urgent") == 5
+    assert ("polled" in beside) is not insists
+    assert ("polled", "polled") not in pairwise(beside)
+
+
+def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
+    first = Port(drive(echo_start), NO_SETTINGS)
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        first.close()
+        port.submit([read(1)], [now_ns() + 20_000_000])
+        until(lambda: not port.pending)
+
+
+def test_what_is_queued_lives_until_it_was_carried_out(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
+        gc.collect()
+        assert rows.of("value", 2) == [1, 2]
+
+
+def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
+    fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        assert port.carry_out(read(0)).status == EXCEPTION_STATUS + 2
+
+
+def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
+    fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        rows = Rows(port)
+        queued = [read(0), read(1, timeout=0.02), read(2)]
+        port.submit(queued, [0] * 3)
+        assert rows.of("status", 3) == [0, -Result.NO_REPLY, 0]
+
+
+def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> None:
+    slow = Peer(least_timeout=0.01, most_timeout=0.02)
+    fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
+    with closing(Port(fd, NO_SETTINGS)) as port:
+        rows = Rows(port)
+        queued = [read(1, peer=slow), read(2, peer=slow)]
+        port.submit(queued, [0] * 2)
+        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+        assert slow.failures == 1
+        wait_until(lambda: now_ns() > slow.late_until_ns)
+        assert port.carry_out(queued[1]).result == 7
+
+
+def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
+    heard: list[int] = []
+
+    def answer(request: Message) -> bytes:
+        heard.append(request.address)
+        return b"" if request.address == 0 else echo_start(request)
+
+    stop = Exchange(
+        Framing.RTU,
+        Message(0, 0x06, 0x2000, data=words(1)),
+        Peer(least_timeout=5, most_timeout=5),
+        baudrate=115_200,
+        format="8N1",
+        character=1e-6,
+        silence=1e-4,
+        turnaround=1e-3,
+    )
+    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+        sent, read_back = port.carry_out(stop), port.carry_out(read(7))
+    assert (sent.status, read_back.status) == (0, 0)
+    assert heard == [0, 1]
+    assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
+
+
+def test_all_that_is_queued_on_a_lost_port_says_so() -> None:
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        rows = Rows(port)
+        far.close()
+        queued = [read(0), read(1), read(2)]
+        port.submit(queued, [0] * 3)
+        assert rows.of("status", 3) == [-Result.LINE_LOST] * 3
+        assert port.lost
+        assert port.carry_out(read(0)).result == Result.LINE_LOST
+    near.close()
+
+
+def test_pty_whose_far_end_hangs_up() -> None:
+    master, slave = os.openpty()
+    os.set_blocking(slave, False)
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        os.close(master)
+        found = port.carry_out(read(0))
+        assert (found.result, found.error) in (
+            (Result.LINE_LOST, errno.EIO),
+            (Result.LINE_LOST, 0),  # the end of the file
+        )
+    os.close(slave)
+
+
+def test_refused_settings_that_must_be_taken() -> None:
+    """Nothing is sent with wrong parity. A pty takes none."""
+    master, slave = os.openpty()
+    os.set_blocking(slave, False)
+    os.set_blocking(master, False)
+    with closing(Port(slave, PARITY)) as port:
+        found = port.carry_out(read(0, format="8E1"))
+        assert (found.result, found.error, found.sent_ns) == (Result.SETTINGS_REFUSED, PARITY, 0)
+    with pytest.raises(BlockingIOError):
+        os.read(master, 1)
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        assert port.carry_out(read(0, format="8E1", timeout=0.001)).result == Result.NO_REPLY
+    os.close(slave)
+    os.close(master)
+
+
+def test_what_a_change_of_settings_takes_is_measured() -> None:
+    master, slave = os.openpty()
+    os.set_blocking(slave, False)
+    with closing(Port(slave, ANY_SETTINGS)) as port:
+        assert port.switching == 0
+        begun = now_ns()
+        for format in ("8N1", "8E1", "8N1"):
+            port.carry_out(read(0, format=format, timeout=0.001))
+        assert 0 < port.switching * 3e9 < now_ns() - begun
+    os.close(slave)
+    os.close(master)
+
+
+def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
+    with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
+        found = port.carry_out(read(0))
+        assert (found.result, found.error) == (Result.LINE_LOST, errno.ENOTTY)
+
+
+def test_a_descriptor_that_is_none_is_refused() -> None:
+    with pytest.raises(OSError, match="cannot be waited for"):
+        Port(-1, NO_SETTINGS)
+
+
+def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Drive) -> None:
+    heard = threading.Event()
+
+    def answer(_: Message) -> bytes:
+        heard.set()
+        return b""
+
+    port = Port(drive(answer), NO_SETTINGS)
+    found: list[int] = []
+    waiting = threading.Thread(target=lambda: found.append(port.carry_out(read(0, timeout=60)).result))
+    waiting.start()
+    heard.wait()
+    port.close()
+    waiting.join()
+    assert found == [Result.LINE_LOST]
+
+
+def test_ports_come_and_go(drive: Drive) -> None:
+    """Opened and closed a thousand times, under way or not, on one engine."""
+
+    def come_and_go(start: int) -> int:
+        near, far = socket.socketpair()
+        with near, far:
+            near.setblocking(False)
+            port = Port(near.fileno(), NO_SETTINGS, room=4)
+            queued = [read(start)]
+            port.submit(queued, [0])
+            port.close()
+        return len(list(Path("/dev/fd").iterdir()))
+
+    before = come_and_go(0)  # the engine has come by now, and stays
+    assert {come_and_go(start) for start in range(1, 1000)} == {before}
+
+
+@pytest.fixture
+def descriptors() -> Iterator[int]:
+    """As many as the system lets a process have."""
+    least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    yield most
+    resource.setrlimit(resource.RLIMIT_NOFILE, (least, most))
+
+
+def test_a_thousand_ports_come_and_go_at_once(descriptors: int) -> None:
+    """Twice over; each is closed while the others are still under way."""
+    if descriptors < 2500:
+        pytest.skip(f"a process may have no more than {descriptors} descriptors here")
+
+    def come_and_go() -> int:
+        with ExitStack() as stack:
+            lines: list[tuple[Port, Rows, Exchange, socket.socket]] = []
+            for number in range(1024):
+                near, far = map(stack.enter_context, socket.socketpair())
+                near.setblocking(False)
+                port = stack.enter_context(closing(Port(near.fileno(), NO_SETTINGS, room=4)))
+                lines.append((port, Rows(port), read(number, timeout=60.0), far))
+                port.submit([lines[-1][2]], [0])
+            for number, (port, rows, _, far) in enumerate(lines):
+                _, request = parse_request(Framing.RTU, far.recv(64))
+                assert request is not None
+                far.send(echo_start(request))
+                assert rows.of("value", 1) == [number]
+                port.close()
+        return len(list(Path("/dev/fd").iterdir()))
+
+    assert come_and_go() == come_and_go()
+
+
+@pytest.mark.parametrize("exchanges", [10_000, pytest.param(50_000, marks=pytest.mark.long)])
+def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> None:
+    asked, row_queue = read(0), RowQueue(chunk_rows=1000, most_chunks=4)
+    asked.c.silence_ns = 1000
+
+    def resident_after(exchanges: int) -> int:
+        """Bytes."""
+        while exchanges > 0:
+            time.sleep(0.01)
+            while columns := row_queue.take():
+                exchanges -= len(columns)
+        gc.collect()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        port.report_to(row_queue, 0)
+        port.repeat([asked])
+        before = resident_after(5_000)
+        assert resident_after(exchanges) - before < 1_000_000  # that is 20 bytes each, or 100
+
+
+@pytest.mark.parametrize("result", list(Result))
+def test_every_result_has_its_words(result: Result) -> None:
+    assert status_text(-result)
+    assert status_text(-result) == str(result)

@@ -1,0 +1,302 @@
+"""A process that forks: its child opens lines of its own, and leaves those of its parent alone."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+from lines import PATIENCE, plant, polled, rows_of, until
+from lines import line as declared
+from test_line_ports import SerialServer
+from toy import Toy
+
+from multidrop.bus import Bus
+from multidrop.core import Field, NumberFormat, Result, RowLayout, RowQueue
+from multidrop.core.fork import only_here
+from multidrop.drives import InvtCHE
+from multidrop.errors import LineError, NoReply
+from multidrop.poller import Poller
+from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*fork:DeprecationWarning",  # that a lock may be held there is what is tested
+    "ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning",
+)
+
+
+@contextmanager
+def child(act: Callable[[], object]) -> Iterator[Any]:
+    """What came of this in a child, which lives until the block is left."""
+    ours, theirs = multiprocessing.Pipe()
+
+    def run() -> None:
+        try:
+            theirs.send(act())
+        except Exception as failure:
+            theirs.send(failure)
+        theirs.recv()
+
+    process = multiprocessing.get_context("fork").Process(target=run)
+    process.start()
+    try:
+        assert ours.poll(PATIENCE), "the child hangs"
+        yield ours.recv()
+        ours.send("leave")
+        process.join(PATIENCE)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
+        process.join()
+        ours.close()
+        theirs.close()
+
+
+def in_child(act: Callable[[], object]) -> Any:
+    with child(act) as told:
+        if isinstance(told, Exception):
+            raise told
+        return told
+
+
+@contextmanager
+def held(*locks: Any) -> Iterator[None]:
+    """Another thread has them meanwhile."""
+    are_held, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with ExitStack() as stack:
+            for lock in locks:
+                stack.enter_context(lock)
+            are_held.set()
+            done.wait(PATIENCE)
+
+    holding = threading.Thread(target=hold)
+    holding.start()
+    assert are_held.wait(PATIENCE)
+    try:
+        yield
+    finally:
+        done.set()
+        holding.join()
+
+
+def wire(port: str = "pty") -> Wire:
+    drive = simulated(Toy(1))
+    drive["output_current"] = 3.25
+    return Wire([drive], unpaced=True, port=port)
+
+
+def current(bus: Bus) -> float:
+    drive = bus.drives[0] if bus.drives else bus.attach(Toy, 1)
+    return bus.read(drive, Toy.output_current)
+
+
+def is_polled(poller: Poller) -> bool:
+    """A value of `wire` has come."""
+    return any(row.value == 3.25 for row in rows_of(poller))
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    with Simulator([wire()]) as simulator:
+        yield simulator.wires[0].path
+
+
+@pytest.fixture(params=["pty", "socket", "rfc2217"])
+def any_port(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Of each kind, with a simulated drive behind it."""
+    with Simulator([wire("pty" if request.param == "pty" else "socket://127.0.0.1:0")]) as simulator:
+        if request.param != "rfc2217":
+            yield simulator.wires[0].path
+            return
+        server = SerialServer(simulator.wires[0].path)
+        yield server.url
+        server.close()
+
+
+def test_a_child_opens_lines_of_its_own(port: str) -> None:
+    def open_another() -> float:
+        with Bus(other.wires[0].path) as bus:
+            return current(bus)
+
+    with Simulator([wire()]) as other, Bus(port) as bus:
+        assert current(bus) == 3.25
+        for _ in range(2):
+            assert in_child(open_another) == 3.25
+        assert current(bus) == 3.25
+
+
+def test_a_child_of_a_child_too(port: str) -> None:
+    def open_it() -> float:
+        with Bus(port) as bus:
+            return current(bus)
+
+    def open_another() -> Any:
+        with Bus(other.wires[0].path):
+            return in_child(open_it)
+
+    with Simulator([wire()]) as other, Bus(port) as bus:
+        assert current(bus) == 3.25
+        bus.line.close()
+        assert in_child(open_another) == 3.25
+
+
+def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
+    def use() -> list[str]:
+        with bus:
+            stopped = [it.why for it in bus.stop_all().values()]
+            with pytest.raises(LineError) as failure:
+                current(bus)
+        return [*stopped, str(failure.value)]
+
+    with Bus(any_port) as bus:
+        assert current(bus) == 3.25
+        sentence = f"{any_port}: it was opened before this process was forked; open it again here"
+        assert in_child(use) == [sentence] * 2
+        assert current(bus) == 3.25
+
+
+def test_a_child_neither_hangs_nor_harms_when_it_lets_go_of_a_bus(any_port: str) -> None:
+    buses = [Bus(any_port)]
+
+    def let_go() -> None:
+        buses.clear()
+        gc.collect()
+
+    try:
+        assert current(buses[0]) == 3.25
+        assert in_child(let_go) is None
+        assert current(buses[0]) == 3.25
+    finally:
+        buses[0].close()
+
+
+def test_a_bridge_is_not_hung_up_by_a_child() -> None:
+    with Bus("loop://") as bus:
+        assert in_child(bus.close) is None
+        with pytest.raises(NoReply):
+            current(bus)
+
+
+def test_a_port_is_free_when_its_parent_closed_it_while_the_child_lives(port: str) -> None:
+    bus = Bus(port)
+    with child(lambda: None):
+        bus.close()
+        with Bus(port) as again:
+            assert current(again) == 3.25
+
+
+def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
+    def use() -> None:
+        bus.detach(bus.drives[0])
+        bus.line.require((9600, "8N1"))
+        bus.close()
+
+    with Bus(port) as bus:
+        assert current(bus) == 3.25
+        with held(bus.line._lock, bus._attaching, bus._performer._over):
+            assert in_child(use) is None
+        assert current(bus) == 3.25
+
+
+def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
+    def look() -> list[Any]:
+        found = [poller.take(), poller.summary()["lines"].keys(), poller.fileno() > 0]
+        poller.close()
+        return [str(it) for it in found]
+
+    def open_another() -> int:
+        with Poller(plant(declared(other.wires[0].path, toy))) as another:
+            until(lambda: is_polled(another))
+        return 1
+
+    toy = polled(Toy(1), [Toy.output_current])
+    with Simulator([wire()]) as other, Poller(plant(declared(port, toy))) as poller:
+        until(lambda: is_polled(poller))
+        assert in_child(look) == ["None", "dict_keys(['line'])", "True"]
+        assert in_child(open_another) == 1
+        until(lambda: is_polled(poller))
+
+
+def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
+    toy = polled(Toy(1), [Toy.output_current])
+
+    def use() -> None:
+        poller.summary()
+        poller.remove("line", toy.drive.name)
+        poller.close()
+
+    with Poller(plant(declared(port, toy))) as poller:
+        with held(poller._changing, poller._lines[0]._lock):
+            assert in_child(use) is None
+        until(lambda: is_polled(poller))
+
+
+def test_memory_that_a_thread_may_hold_is_not_given_back_in_a_child() -> None:
+    given: list[str] = []
+    give_back = only_here(given.append)
+
+    def act() -> list[str]:
+        give_back("there")
+        return given
+
+    give_back("here")
+    assert in_child(act) == ["here"]
+
+
+def test_rows_that_wait_are_the_parent_s_to_take() -> None:
+    row_queue, block = RowQueue(), RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
+    row_queue.add_miss(block, Result.NO_REPLY, 0)
+    assert in_child(row_queue.take) is None
+    found = row_queue.take()
+    assert found is not None
+    assert len(found) == 1
+
+
+PARENT = """
+import os, signal, sys, time
+from multidrop import Bus, InvtCHE
+with Bus(sys.argv[1]) as bus:
+    pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+    pump.set_frequency(20)
+    pump.start()
+    bus.stop_on_exit()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)  # where it hangs
+        {end}
+        sys.exit(0)
+    print(os.waitpid(child, 0)[1], flush=True)
+    sys.stdin.read()
+"""
+ENDS = {
+    "leaving": ("pass", 0),
+    "closing": ("bus.close()", 0),
+    "SIGTERM": ("signal.raise_signal(signal.SIGTERM)", signal.SIGTERM),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_child_stops_no_motor(end: str) -> None:
+    """However it ends; its parent still does, when it leaves."""
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.deceleration_time = 0.2
+    act, status = ENDS[end]
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        words = [sys.executable, "-W", "ignore", "-c", PARENT.format(end=act), simulator.wires[0].path]
+        with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+            assert parent.stdout is not None
+            assert parent.stdout.readline() == f"{int(status)}\n"
+            assert [it.raw for it in sim.counters.writes if it.name == "control"] == [1]
+            parent.communicate()
+        assert parent.returncode == 0
+        assert [it.raw for it in sim.counters.writes if it.name == "control"] == [1, 5]

@@ -1,0 +1,341 @@
+"""Frames: every one that the documents print, and replies that other libraries take for good."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import checksums
+import pytest
+from frames import PRINTED, Printed, words
+from line_driver import LineDriver
+from multidrop._core import lib
+
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Framing,
+    Message,
+    Peer,
+    Result,
+    build_reply,
+    build_request,
+    crc16,
+    parse_reply,
+    parse_request,
+    reply_length,
+)
+
+RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
+
+GOOD_REQUESTS = [it for it in PRINTED if it.direction == "request" and it.verdict != "bad checksum"]
+GOOD_REPLIES = [it for it in PRINTED if it.direction == "reply" and isinstance(it.says, Message)]
+REFUSED = [it for it in PRINTED if isinstance(it.says, Result)]
+MISPRINTED = "01 89 01 86 50"  # E13: what a drive may say, but our simulators never do
+
+
+def parse(printed: Printed, received: bytes) -> tuple[int, Message | None]:
+    if printed.direction == "request":
+        return parse_request(printed.framing, received)
+    assert printed.request is not None
+    return parse_reply(printed.framing, received, printed.request)
+
+
+def exchange(framing: Framing, request: Message) -> Exchange:
+    return Exchange(
+        framing,
+        request,
+        Peer(least_timeout=0.1, most_timeout=0.1),
+        baudrate=9600,
+        format="8N1",
+        character=1e-3,
+        silence=4e-3,
+        turnaround=0.2,
+    )
+
+
+def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 4096) -> Completion:
+    """What becomes of a request when these bytes are all that comes back, of an adapter without echo."""
+    line = LineDriver()
+    line.echo = lib.MD_NO_ECHO
+    line.begin(exchange(framing, request))
+    line.wait_until_write()
+    line.receive(received, piece)
+    line.wait_until_done()
+    return line.completion
+
+
+# ---- the documents' frames ----
+
+
+def test_all_printed_frames_have_a_meaning() -> None:
+    assert (
+        len({(it.framing, it.direction, it.frame) for it in PRINTED}) == 49 + 19
+    )  # 19 have a copy of themselves as the reply
+    assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
+
+
+@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
+def test_printed_frame_means_what_the_document_says(printed: Printed) -> None:
+    assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
+
+
+@pytest.mark.parametrize("printed", GOOD_REQUESTS, ids=str)
+def test_request_is_built_as_printed(printed: Printed) -> None:
+    assert isinstance(printed.says, Message)
+    assert build_request(printed.framing, printed.says) == printed.frame
+
+
+@pytest.mark.parametrize("printed", [it for it in GOOD_REPLIES if it.text != MISPRINTED], ids=str)
+def test_reply_is_built_as_printed(printed: Printed) -> None:
+    assert isinstance(printed.says, Message)
+    assert build_reply(printed.framing, printed.says) == printed.frame
+
+
+def test_89h_is_accepted_for_88h_but_never_said() -> None:
+    refusal = Message(1, 0x08, exception=1)
+    request = Message(1, 0x08, 0, data=words(0xA537))
+    assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
+    assert build_reply(RTU, refusal) == bytes.fromhex("01 88 01 87 C0")
+    # it is an exception to 08 and to nothing else
+    assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == Result.BAD_FUNCTION
+
+
+@pytest.mark.parametrize("printed", REFUSED, ids=str)
+def test_misprinted_frame_is_refused(printed: Printed) -> None:
+    assert parse(printed, printed.frame) == (printed.says, None)
+
+
+@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
+def test_part_of_a_frame_is_incomplete(printed: Printed) -> None:
+    for length in range(len(printed.frame)):
+        assert parse(printed, printed.frame[:length]) == (Result.INCOMPLETE, None)
+
+
+@pytest.mark.parametrize("after", [b"\x00", b":", b"\x01\x03\x02", b"\xff" * 300])
+@pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
+def test_what_follows_a_frame_is_left_alone(printed: Printed, after: bytes) -> None:
+    assert parse(printed, printed.frame + after) == (len(printed.frame), printed.says)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("before", [b"", b"\x00", b"\x01", b":01", b"\xff\x00" * 40], ids=bytes.hex)
+@pytest.mark.parametrize("printed", GOOD_REPLIES, ids=str)
+def test_reply_is_found_behind_junk(printed: Printed, before: bytes, piece: int) -> None:
+    assert printed.request is not None
+    found = carry_out(printed.framing, printed.request, before + printed.frame, piece)
+    assert (found.result, found.raw, found.skipped) == (len(printed.frame), printed.frame, len(before))
+    assert found.reply == printed.says
+
+
+def test_text_frame_that_breaks_off_does_not_hide_the_next() -> None:
+    found = carry_out(ASCII, WRITE_ONE, b":010600" + b":010600101234A3\r\n")
+    assert (found.result, found.skipped) == (17, 7)
+
+
+@pytest.mark.parametrize("printed", GOOD_REPLIES, ids=str)
+def test_length_of_a_good_reply_is_known_beforehand(printed: Printed) -> None:
+    assert printed.request is not None
+    assert isinstance(printed.says, Message)
+    if not printed.says.exception:
+        assert reply_length(printed.framing, printed.request) == len(printed.frame)
+
+
+@pytest.mark.parametrize(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])
+def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], bytes]) -> None:
+    data = bytes(range(250))
+    frame = finish(f"0103FA{data.hex().upper()}")
+    used, reply = parse_reply(framing, frame, Message(1, 0x03, 0, 125))
+    assert (used, reply and reply.data) == (len(frame), data)
+    assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (Result.INCOMPLETE, None)
+
+
+# ---- never wrong data: what others were seen to take for an answer ----
+
+
+def rtu(text: str) -> bytes:
+    body = bytes.fromhex(text)
+    checksum: int = crc16(body, len(body))
+    return body + checksum.to_bytes(2, "little")
+
+
+READ_TWO = Message(1, 0x03, 0, 2)
+WRITE_COIL = Message(1, 0x05, 3, data=words(0xFF00))
+WRITE_ONE = Message(1, 0x06, 0x10, data=words(0x1234))
+WRITE_TWO = Message(1, 0x10, 0x10, 2, words(1, 2))
+LOOPBACK = Message(1, 0x08, 0, data=words(0xA537))
+RUN_FORWARD = Message(1, 2, 2, data=words(0, 0))
+STORE_50_HZ = Message(1, 6, 2, data=words(0, 5000))
+ASK_FREQUENCY = Message(1, 7, 500, data=words(0, 0))
+ASK_STATE = Message(1, 3, 0, data=words(0, 0))
+
+WRONG = [
+    # pymodbus, modbus-tk and uModbus take a reply of another function for data
+    (
+        "input registers for holding registers",
+        RTU,
+        READ_TWO,
+        rtu("01 04 04 11 11 22 22"),
+        Result.BAD_FUNCTION,
+    ),
+    ("one input register for two holding ones", RTU, READ_TWO, rtu("01 04 02 11 11"), Result.BAD_FUNCTION),
+    ("coils for registers", RTU, READ_TWO, rtu("01 01 04 11 11 22 22"), Result.BAD_FUNCTION),
+    ("exception to another function", RTU, READ_TWO, rtu("01 84 02"), Result.BAD_FUNCTION),
+    ("exception without a code", RTU, READ_TWO, rtu("01 83 00"), Result.BAD_FUNCTION),
+    # pymodbus takes another number of registers
+    ("one register for two", RTU, READ_TWO, rtu("01 03 02 11 11"), Result.BAD_LENGTH),
+    ("three registers for two", RTU, READ_TWO, rtu("01 03 06 11 11 22 22 33 33"), Result.BAD_LENGTH),
+    ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), Result.BAD_LENGTH),
+    ("no register", RTU, READ_TWO, rtu("01 03 00"), Result.BAD_LENGTH),
+    ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), Result.BAD_LENGTH),
+    # pymodbus takes another value, libmodbus another address or value of 05, 06 and 10H
+    ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), Result.BAD_ECHO),
+    ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), Result.BAD_ECHO),
+    ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), Result.BAD_ECHO),
+    ("another register confirmed", RTU, WRITE_ONE, rtu("01 06 00 11 12 34"), Result.BAD_ECHO),
+    ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), Result.BAD_ECHO),
+    ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), Result.BAD_ECHO),
+    ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), Result.BAD_ECHO),
+    # everybody takes a late reply, if only it has the right shape; what can be told apart is
+    (
+        "late reply to a longer read",
+        RTU,
+        READ_TWO,
+        rtu("01 03 08 00 00 00 00 00 00 00 00"),
+        Result.BAD_LENGTH,
+    ),
+    ("late reply to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), Result.BAD_FUNCTION),
+    ("late reply of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), Result.BAD_ADDRESS),
+    ("broadcast as a reply", RTU, READ_TWO, rtu("00 03 04 11 11 22 22"), Result.BAD_ADDRESS),
+    (
+        "checksum's bytes swapped",
+        RTU,
+        READ_TWO,
+        bytes.fromhex("01 03 04 11 11 22 22 00 00"),
+        Result.BAD_CHECKSUM,
+    ),
+    # the text framings
+    ("another value as text", ASCII, WRITE_ONE, b":010600101235A2\r\n", Result.BAD_ECHO),
+    ("wrong checksum as text", ASCII, WRITE_ONE, b":010600101234A4\r\n", Result.BAD_CHECKSUM),
+    ("Delixi's sum for the checksum", ASCII, WRITE_ONE, b":0106001012345D\r\n", Result.BAD_CHECKSUM),
+    ("lower case", ASCII, WRITE_ONE, b":010600101234a3\r\n", Result.BAD_CHARACTER),
+    ("no line end", ASCII, WRITE_ONE, b":010600101234A3\n\r", Result.BAD_CHARACTER),
+    # Delixi's own protocol
+    ("run command confirmed as stop", DELIXI, RUN_FORWARD, b":010200010000000004\r\n", Result.BAD_ECHO),
+    ("another value stored", DELIXI, STORE_50_HZ, b":0106000200001389A5\r\n", Result.BAD_ECHO),
+    ("another parameter's value", DELIXI, ASK_FREQUENCY, b":010701F50000138899\r\n", Result.BAD_ECHO),
+    ("setting for query", DELIXI, ASK_FREQUENCY, b":010601F40000138897\r\n", Result.BAD_FUNCTION),
+    ("a state with a value", DELIXI, ASK_STATE, b":010300020000000107\r\n", Result.BAD_ECHO),
+    ("a refusal that is none", DELIXI, RUN_FORWARD, b":01F1000000000000F2\r\n", Result.BAD_FUNCTION),
+]
+
+
+@pytest.mark.parametrize(
+    ("framing", "request_", "received", "reason"), [it[1:] for it in WRONG], ids=[it[0] for it in WRONG]
+)
+def test_wrong_reply_is_never_data(
+    framing: Framing, request_: Message, received: bytes, reason: Result
+) -> None:
+    assert parse_reply(framing, received, request_) == (reason, None)
+    for piece in (4096, 1):
+        found = carry_out(framing, request_, received, piece)
+        assert (found.result, found.raw, found.skipped) == (reason, received, len(received))
+        assert found.reply == Message(0, 0)
+
+
+def test_stray_zero_before_every_reply_loses_nothing() -> None:
+    line = LineDriver()
+    for value in range(30):
+        line.begin(exchange(RTU, READ_TWO))
+        line.wait_until_write()
+        line.receive(b"\x00" + rtu(f"01 03 04 {value:04X} 00 00"))
+        line.wait_until_done()
+        assert line.completion.reply.data == words(value, 0)
+        assert (line.completion.result, line.completion.skipped, line.completion.stale) == (9, 1, 0)
+
+
+@pytest.mark.parametrize("code", [0xF0, 0xFC, 0xFD, 0xFE, 0xFF])
+def test_delixi_s_refusals(code: int) -> None:
+    frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
+    assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
+    assert parse_request(DELIXI, frame) == (Result.BAD_FUNCTION, None)  # note 2: the master never says so
+
+
+def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
+    used, reply = parse_reply(DELIXI, b":010300020000000006\r\n", ASK_STATE)
+    assert (used, reply) == (21, Message(1, 3, 2, data=words(0, 2)))
+
+
+# ---- what cannot be said ----
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message(1, 0x03, 0, 126),
+        Message(1, 0x03, 0xFFFF, 2),
+        Message(1, 0x03, 0, 0),
+        Message(0, 0x03, 0, 1),
+        Message(248, 0x03, 0, 1),
+        Message(1, 0x05, 0, data=b"\x01\x00"),
+        Message(1, 0x06, 0, data=b"\x01"),
+        Message(1, 0x10, 0, 2, b"\x00" * 5),
+        Message(1, 0x2B, 0, 1),
+    ],
+    ids=str,
+)
+def test_request_out_of_bounds(message: Message) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"no rtu frame can say {message}")):
+        build_request(RTU, message)
+    with pytest.raises(ValueError, match="no rtu frame can say"):
+        exchange(RTU, message)
+
+
+def test_the_last_address_and_the_one_behind_it() -> None:
+    reply = Message(247, 0x03, data=words(7))
+    assert build_reply(RTU, reply) == checksums.rtu("F7 03 02 00 07")
+    with pytest.raises(ValueError, match="no rtu frame can say"):
+        build_reply(RTU, Message(248, 0x03, data=words(7)))
+
+
+@pytest.mark.parametrize("function", [0x00, 0x07, 0x2B, 0xFF])
+def test_nobody_replies_to_what_is_no_function(function: int) -> None:
+    reply = Message(1, function, data=words(7))
+    with pytest.raises(ValueError, match=re.escape(f"no rtu frame can say {reply}")):
+        build_reply(RTU, reply)
+
+
+def test_request_with_too_much_data() -> None:
+    with pytest.raises(ValueError, match="251 data bytes do not fit a frame: 250 at most"):
+        build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))
+
+
+@pytest.mark.parametrize("count", [0, 126, 127, 128, 0xFFFF])
+def test_impossible_count_may_be_refused_but_never_answered(count: int) -> None:
+    """An sniffed master may ask for anything; exceptions are replies to that too."""
+    request = Message(1, 0x03, 0, count)
+    data_len = 2 * count & 0xFF
+    assert parse_reply(RTU, bytes([1, 3, data_len]) + bytes(300), request) == (Result.BAD_LENGTH, None)
+    assert parse_reply(RTU, rtu("01 83 03"), request) == (5, Message(1, 3, exception=3))
+
+
+def test_drive_s_side_hears_of_a_count_that_it_cannot_answer() -> None:
+    frame = rtu("01 03 00 00 00 7E")
+    assert parse_request(RTU, frame) == (8, Message(1, 0x03, 0, 126))
+
+
+@pytest.mark.parametrize("function", [0x83, 0xFF, 0x2B])
+@pytest.mark.parametrize("framing", [RTU, ASCII])
+def test_nothing_answers_what_is_no_function(framing: Framing, function: int) -> None:
+    body = bytes([1, function, 1])
+    frames = {
+        RTU: rtu(body.hex()),
+        ASCII: f":{(body + bytes([-sum(body) & 0xFF])).hex().upper()}\r\n".encode(),
+    }
+    assert parse_reply(framing, frames[framing], Message(1, function, 0, 1)) == (Result.BAD_FUNCTION, None)
+
+
+@pytest.mark.parametrize("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])
+def test_a_number_that_no_frame_has_room_for_is_a_mistake(odd: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="no frame can say this"):
+        build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))

@@ -1,0 +1,554 @@
+"""What a line learns of its drives: when to look for a reply, how long to wait, what may come late."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from frames import words
+from line_driver import MS, LineDriver
+from multidrop._core import ffi, lib
+
+from multidrop.core import (
+    Exchange,
+    Field,
+    Framing,
+    Message,
+    NumberFormat,
+    Peer,
+    Result,
+    RowLayout,
+    build_reply,
+    build_request,
+)
+
+CHARACTER = 1 * MS
+SILENCE = 4 * MS
+LEAST, MOST = 20 * MS, 300 * MS
+READ, OTHER, LONGER = Message(1, 3, 0, 1), Message(1, 3, 50, 1), Message(1, 3, 0, 2)
+WRITE = Message(1, 6, 2, data=words(7))
+
+
+@pytest.fixture
+def line() -> LineDriver:
+    return LineDriver()
+
+
+@pytest.fixture
+def drive() -> Peer:
+    return Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+
+
+def exchange(request: Message, drive: Peer, framing: Framing = Framing.RTU, **details: Any) -> Exchange:
+    return Exchange(
+        framing,
+        request,
+        drive,
+        baudrate=9600,
+        format="8N1",
+        character=CHARACTER / 1e9,
+        silence=SILENCE / 1e9,
+        **details,
+    )
+
+
+def reply(value: int = 0) -> bytes:
+    return build_reply(Framing.RTU, Message(1, 3, data=words(value)))
+
+
+def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
+    """Send the request; when its last bit has left."""
+    line.begin(exchange(request, drive))
+    line.wait_until_write()
+    return line.now + 8 * CHARACTER
+
+
+def answer(line: LineDriver, drive: Peer, delay: int) -> None:
+    """A whole exchange, whose reply comes character by character, the first after `delay`."""
+    left = ask(line, drive)
+    for at, character in enumerate(reply()):
+        line.now = left + delay + (at + 1) * CHARACTER
+        assert line.listens
+        line.receive(bytes([character]))
+    assert line.want == "done"
+
+
+def test_the_response_delay_is_learnt(line: LineDriver, drive: Peer) -> None:
+    assert drive.response_delay == 0
+    for _ in range(40):
+        answer(line, drive, 15 * MS)
+    assert drive.response_delay == pytest.approx(15e-3, rel=0.01)
+
+
+def test_nothing_is_looked_at_before_a_reply_can_be_whole(line: LineDriver, drive: Peer) -> None:
+    for _ in range(40):
+        answer(line, drive, 15 * MS)
+    left = ask(line, drive)
+    whole = left + 15 * MS + 7 * CHARACTER
+    assert line.want == "wait"
+    assert whole - 2 * CHARACTER <= line.wake <= whole
+
+
+def attend(line: LineDriver, drive: Peer, delay: int) -> int:
+    """An exchange as the engine does it: how long the reply was whole when it was seen so."""
+    left = ask(line, drive)
+    times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
+    seen = 0
+    while line.want != "done":
+        line.wait_for_look()
+        if line.now < times[seen]:
+            line.now = times[seen]
+        come = sum(1 for it in times if it <= line.now)
+        line.receive(reply()[seen:come])
+        seen = come
+    return line.now - times[-1]
+
+
+def test_a_reply_is_looked_for_before_it_is_whole(line: LineDriver, drive: Peer) -> None:
+    for _ in range(20):
+        assert attend(line, drive, 15 * MS) == attend(line, drive, 16 * MS) == 0
+
+
+def test_the_rest_of_a_reply_is_waited_for_by_its_length(line: LineDriver, drive: Peer) -> None:
+    ask(line, drive)
+    line.now += 60 * MS
+    line.receive(reply()[:3])
+    assert (line.want, line.wake) == ("wait", line.now + 3 * CHARACTER)  # four are missing: look at the last
+    line.now = line.wake
+    line.receive(reply()[3:6])
+    assert line.want == "read"
+    line.receive(reply()[6:])
+    assert line.want == "done"
+
+
+def test_an_exception_is_not_waited_past(line: LineDriver, drive: Peer) -> None:
+    refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
+    ask(line, drive, Message(1, 3, 0, 100))
+    line.receive(refusal[:2])
+    assert line.want == "read"
+    line.receive(refusal[2:])
+    assert line.want == "done"
+
+
+def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer) -> None:
+    """Its reply is whole long before it is looked at; each look comes a little earlier."""
+    for _ in range(40):
+        answer(line, drive, 40 * MS)
+    for _ in range(120):
+        attend(line, drive, 5 * MS)
+    assert drive.response_delay < 10e-3
+
+
+def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
+    """How long after the request's last bit a silent drive is given up."""
+    left = ask(line, drive, request)
+    line.wait_until_done()
+    assert line.completion.result == Result.NO_REPLY
+    return line.now - left
+
+
+def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
+    """The same without its reply's own time, for which a line waits that knows nothing of its adapter."""
+    return given_up(line, drive, request) - 7 * CHARACTER
+
+
+def test_a_time_out_follows_the_drive_s_own_delay(line: LineDriver, drive: Peer) -> None:
+    for number in range(200):
+        answer(line, drive, (40 + number % 3) * MS)
+    assert 45 * MS < given_up(line, drive) - AWAITED < 60 * MS
+
+
+def test_a_time_out_is_never_under_its_floor(line: LineDriver, drive: Peer) -> None:
+    for _ in range(100):
+        answer(line, drive, MS // 10)
+    assert given_up(line, drive) == LEAST + AWAITED
+
+
+def test_a_silent_drive_has_all_its_time_once_and_then_rarely(line: LineDriver, drive: Peer) -> None:
+    found, reckoned = [], []
+    for _ in range(20):
+        line.now = max(line.now, drive.late_until_ns)
+        reckoned.append(drive.vain_ns // MS)
+        found.append(time_out(line, drive) // MS)
+    assert found == reckoned == [60, 300, *(15 * [60]), 300, 60, 60]
+    assert drive.failures == 20
+    line.now = drive.late_until_ns
+    answer(line, drive, 5 * MS)
+    assert drive.failures == 0
+
+
+def test_a_write_is_waited_for_as_long_as_it_may_take(line: LineDriver, drive: Peer) -> None:
+    """However quick the drive was at reads: a write that is wrongly told to be unconfirmed costs more."""
+    for _ in range(12):
+        answer(line, drive, 2 * MS)
+    assert given_up(line, drive) < 100 * MS
+    line.begin(exchange(WRITE, drive, timeout=1.0))
+    line.wait_until_write()
+    left = line.now + 8 * CHARACTER
+    line.wait_until_done()
+    assert line.now - left == 1000 * MS + 8 * CHARACTER
+
+
+# ---- nothing has begun ----
+
+AWAITED = 3 * CHARACTER  # where characters come one by one: that one, and two
+LONG = Message(1, 3, 0, 100)  # with a reply of 205 characters
+
+
+def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
+    """A whole exchange, whose reply comes when it is whole."""
+    left = ask(line, drive, request)
+    text = build_reply(Framing.RTU, Message(1, 3, data=bytes(2 * request.count)))
+    while line.now < left + 15 * MS + len(text) * CHARACTER:
+        assert line.listens
+        line.now = min(left + 15 * MS + len(text) * CHARACTER, max(line.wake, line.now + CHARACTER))
+    line.receive(text)
+    assert line.want == "done"
+
+
+@pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
+def test_a_reply_that_has_not_begun_is_not_waited_for_to_its_end(
+    line: LineDriver, drive: Peer, asked: Message
+) -> None:
+    answer(line, drive, 2 * MS)
+    assert given_up(line, drive, asked) == LEAST + AWAITED
+
+
+def test_a_reply_that_has_begun_is_waited_for(line: LineDriver, drive: Peer) -> None:
+    answer(line, drive, 2 * MS)
+    left = ask(line, drive, LONG)
+    text = build_reply(Framing.RTU, Message(1, 3, data=bytes(200)))
+    line.now = left + LEAST + CHARACTER
+    line.receive(text[:1])
+    while line.listens:
+        line.now += 10 * CHARACTER
+        arrived = min(len(text), (line.now - left - LEAST) // CHARACTER)
+        line.receive(text[line.completion.skipped : arrived])
+    assert line.completion.result == len(text)
+
+
+def test_a_drive_that_has_just_failed_is_given_all_its_time(line: LineDriver, drive: Peer) -> None:
+    answer(line, drive, 2 * MS)
+    given_up(line, drive)
+    line.now = drive.late_until_ns
+    assert given_up(line, drive) == MOST + 7 * CHARACTER
+
+
+def test_the_adapter_s_echo_is_no_beginning(line: LineDriver, drive: Peer) -> None:
+    answer(line, drive, 2 * MS)
+    left = ask(line, drive)
+    line.receive(build_request(Framing.RTU, READ))
+    line.wait_until_done()
+    assert line.now == left + LEAST + AWAITED
+
+
+@pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
+def test_an_adapter_that_gathers_replies_is_waited_for(line: LineDriver, drive: Peer, asked: Message) -> None:
+    """Nothing of a reply is seen before its end."""
+    for _ in range(20):
+        gathered(line, drive, asked)
+    assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
+
+
+def test_noise_does_not_tell_of_the_adapter(line: LineDriver, drive: Peer) -> None:
+    ask(line, drive)
+    line.receive(b"\x01")
+    line.receive(b"\x03\x07")
+    line.now += 20 * MS
+    line.receive(reply())
+    assert line.want == "done"
+    assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
+
+
+def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Peer) -> None:
+    answer(line, drive, 2 * MS)
+    given_up(line, drive)
+    line.begin(exchange(OTHER, drive))
+    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    line.receive(reply(1111))
+    assert (drive.counters().late, drive.late_until_ns) == (1, 0)
+
+
+# ---- answers that come late ----
+
+
+def test_what_a_late_answer_could_be_taken_for_is_not_sent(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    line.begin(exchange(OTHER, drive))
+    assert line.want == "done"
+    assert (line.completion.result, line.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    assert drive.failures == 1  # nothing was asked, so nothing failed
+
+
+def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(line: LineDriver, drive: Peer) -> None:
+    ask(line, drive)
+    line.lose(0)
+    again = LineDriver()
+    again.now = line.now
+    again.begin(exchange(OTHER, drive))
+    assert (again.completion.result, again.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    again.now = drive.late_until_ns
+    ask(again, drive, OTHER)
+
+
+@pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "by hand"])
+def test_a_value_that_may_answer_an_earlier_question_has_its_time(
+    line: LineDriver, drive: Peer, is_row: bool
+) -> None:
+    """Whoever asks by hand gets none: another question is to prove first that no answer is on its way."""
+    drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
+    rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
+    asked = exchange(READ, drive, block=rows)
+    line.begin(asked)
+    line.wait_until_write()
+    first_ns = line.completion.sent_ns
+    line.wait_until_done()
+    line.now = drive.late_until_ns
+    line.begin(asked)
+    line.wait_until_write()
+    line.now += 20 * MS
+    line.receive(reply(1234))
+    assert line.want == "done"
+    found = line.completion
+    if is_row:
+        assert (found.result, found.sent_ns, found.reply.data) == (7, first_ns, words(1234))
+        assert found.first_ns == line.now
+    else:
+        assert (found.result, found.reply.data) == (Result.LATE_ANSWER_DUE, b"")
+    assert drive.counters().late == 1
+
+
+@pytest.mark.parametrize(("asked", "again"), [(READ, 1), (WRITE, 0)], ids=["a read", "a write"])
+def test_nothing_but_a_read_is_asked_again(drive: Peer, asked: Message, again: int) -> None:
+    """Whatever became of it: a write may have started a motor."""
+    in_doubt = ffi.new("struct md_completion *", {"result": Result.LATE_ANSWER_DUE, "sent_ns": 1})
+    before = ffi.new("struct md_before *")
+    assert lib.md_is_asked_again(before, exchange(asked, drive).c, in_doubt) == again
+
+
+def test_a_request_that_never_left_has_no_late_answer(line: LineDriver, drive: Peer) -> None:
+    line.begin(exchange(READ, drive))
+    line.lose(0)
+    assert drive.late_until_ns == 0
+
+
+def test_what_no_late_answer_could_be_taken_for_is_sent(line: LineDriver, drive: Peer) -> None:
+    """A stop is a write: it never waits."""
+    time_out(line, drive)
+    ask(line, drive, WRITE)
+
+
+def test_a_refusal_does_not_say_of_which_read_it_is(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    line.begin(exchange(LONGER, drive))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+
+
+def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    first_until = drive.late_until_ns
+    time_out(line, drive, WRITE)  # no answer to the first could be taken for its reply
+    assert drive.late_until_ns > first_until
+    line.begin(exchange(OTHER, drive))
+    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    line.receive(build_request(Framing.RTU, WRITE))  # as its confirmation is
+    assert drive.counters().late == 1
+    line.begin(exchange(OTHER, drive))  # the answer to the first is still to come
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+
+
+def test_a_refusal_does_not_say_of_which_write_it_is(line: LineDriver, drive: Peer) -> None:
+    """Told that it was refused one would take a motor for standing that the second write has started."""
+    time_out(line, drive, WRITE)
+    line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+    ask(line, drive, READ)  # no refusal of a write is one of a read
+
+
+def delixi(function: int, start: int, value: int = 0) -> Message:
+    return Message(1, function, start, data=words(0, value))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (delixi(7, 500), delixi(7, 501)),  # a reply names its parameter, a refusal nothing
+        (delixi(7, 500), delixi(7, 500)),
+        (delixi(3, 0), delixi(3, 0)),
+        (delixi(3, 0), delixi(7, 0)),
+        (delixi(6, 2, 5000), delixi(6, 3, 1)),
+        (delixi(7, 500), delixi(2, 1)),
+    ],
+    ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
+)
+def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
+    line: LineDriver, drive: Peer, first: Message, second: Message
+) -> None:
+    line.begin(exchange(first, drive, Framing.DELIXI))
+    line.wait_until_write()
+    line.wait_until_done()
+    assert line.completion.result == Result.NO_REPLY
+    line.begin(exchange(second, drive, Framing.DELIXI))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+
+
+def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive, WRITE)
+    stop = exchange(WRITE, drive)
+    stop.c.insists = 1
+    line.begin(stop)
+    assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
+
+
+def test_a_stop_is_given_longer_step_by_step(line: LineDriver, drive: Peer) -> None:
+    """It must not wait all the time that the document allows before it is repeated.
+
+    A look before it that is not answered, the first failure, makes it none longer: other drives wait.
+    """
+    found = []
+    for _ in range(5):
+        stop = exchange(WRITE, drive)
+        stop.c.insists = 1
+        line.begin(stop)
+        line.wait_until_write()
+        left = line.now + 8 * CHARACTER
+        line.wait_until_done()
+        found.append((line.now - left - 8 * CHARACTER) // MS)
+    assert found == [60, 60, 120, 240, 300]
+
+
+def test_what_looks_like_a_damaged_reply_inside_another_frame_is_none(line: LineDriver, drive: Peer) -> None:
+    ask(line, drive)
+    inside = bytes([1, 3, 2, 0, 0, 0, 0])  # a reply with a wrong checksum
+    line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
+    line.wait_until_done()
+    assert line.completion.result == Result.BAD_CHECKSUM
+    line.begin(exchange(OTHER, drive))
+    assert line.completion.result == Result.LATE_ANSWER_DUE
+
+
+def test_other_drives_are_not_concerned(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    other = Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+    ask(line, other, Message(2, 3, 0, 1))
+
+
+def test_the_ceiling_of_the_document_ends_the_waiting(line: LineDriver, drive: Peer) -> None:
+    left = line.now + SILENCE + 8 * CHARACTER
+    time_out(line, drive)
+    assert drive.late_until_ns >= left + MOST
+    line.now = drive.late_until_ns
+    ask(line, drive, OTHER)
+
+
+@pytest.mark.parametrize("piece", [7, 1], ids=["whole", "byte by byte"])
+def test_a_late_answer_is_recognised_and_ends_the_waiting(line: LineDriver, drive: Peer, piece: int) -> None:
+    time_out(line, drive)
+    line.receive(reply(1111), piece)
+    assert drive.late_until_ns == 0
+    assert drive.counters().late == 1
+    ask(line, drive, OTHER)
+    line.receive(reply(2222))
+    assert line.want == "done"
+    found = line.completion
+    assert (found.reply.data, found.stale) == (words(2222), 7)
+
+
+def peer() -> Peer:
+    return Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+
+
+def answer_of(address: int, *values: int) -> bytes:
+    return build_reply(Framing.RTU, Message(address, 3, data=words(*values)))
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize(
+    "junk", [b"", b"\x00", b"\x02", b"\x01"], ids=["", "00", "our address", "its address"]
+)
+def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
+    line: LineDriver, drive: Peer, junk: bytes, piece: int
+) -> None:
+    time_out(line, drive)
+    ask(line, peer(), Message(2, 3, 0, 1))
+    line.receive(junk + reply(1111), piece)
+    assert line.listens
+    assert (drive.counters().late, drive.late_until_ns) == (1, 0)
+    line.receive(answer_of(2, 5), piece)
+    assert line.want == "done"
+    assert (line.completion.reply.data, line.completion.skipped) == (words(5), len(junk) + 7)
+    ask(line, drive, OTHER)  # it need not be waited for any more
+
+
+def test_all_who_owe_an_answer_are_recognised(line: LineDriver) -> None:
+    drives = {address: peer() for address in (1, 2, 3)}
+    for address, it in drives.items():
+        time_out(line, it, Message(address, 3, 0, address))
+    ask(line, peer(), Message(9, 3, 0, 1))
+    line.receive(answer_of(3, 1, 2, 3) + answer_of(1, 1))
+    assert [it.counters().late for it in drives.values()] == [1, 0, 1]
+    assert [bool(it.late_until_ns) for it in drives.values()] == [False, True, False]
+    line.receive(answer_of(2, 1, 2) + answer_of(9, 4))
+    assert line.completion.reply.data == words(4)
+    assert drives[2].counters().late == 1
+
+
+def test_a_late_answer_of_the_drive_that_is_asked_something_else(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    ask(line, drive, WRITE)
+    line.receive(reply(1111))
+    assert line.listens
+    assert (drive.counters().late, drive.late_until_ns) == (1, 0)
+    line.receive(build_request(Framing.RTU, WRITE) * 2)  # and its echo
+    assert line.completion.result == 8
+
+
+def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    ask(line, other := peer(), Message(2, 3, 0, 1))
+    line.receive(reply(1111))
+    line.wait_until_done()
+    assert (line.completion.result, line.completion.skipped) == (Result.NO_REPLY, 7)
+    assert other.late_until_ns > line.now
+
+
+def test_what_the_reply_s_own_data_look_like_is_no_late_answer(line: LineDriver, drive: Peer) -> None:
+    """Whether it comes at once or byte by byte: the bar stays, and the reply is read."""
+    time_out(line, drive)
+    until = drive.late_until_ns
+    inside = reply(1111) + b"\x00"
+    ask(line, peer(), Message(2, 3, 0, 4))
+    line.receive(build_reply(Framing.RTU, Message(2, 3, data=inside)), 1)
+    assert line.completion.reply.data == inside
+    assert (drive.counters().late, drive.late_until_ns) == (0, until)
+
+
+def test_a_frame_of_a_drive_that_owes_nothing_any_more_is_a_stray_one(line: LineDriver, drive: Peer) -> None:
+    time_out(line, drive)
+    line.now = drive.late_until_ns
+    ask(line, peer(), Message(2, 3, 0, 1))
+    line.receive(reply(1111))
+    line.wait_until_done()
+    assert (line.completion.result, drive.counters().late) == (Result.BAD_ADDRESS, 0)
+
+
+def test_damage_is_not_silence(line: LineDriver, drive: Peer) -> None:
+    for _ in range(5):
+        ask(line, drive)
+        line.receive(reply(1)[:-1] + b"\x00")
+        line.wait_until_done()
+        assert line.completion.result == Result.BAD_CHECKSUM
+    assert drive.failures == 0
+
+
+def test_everything_is_counted(line: LineDriver, drive: Peer) -> None:
+    answer(line, drive, 5 * MS)
+    time_out(line, drive)
+    line.begin(exchange(OTHER, drive))
+    line.now = drive.late_until_ns
+    ask(line, drive)
+    line.receive(b"\xff" + build_reply(Framing.RTU, Message(1, 3, exception=2)))
+    counters = drive.counters()
+    assert (counters.exchanges, counters.answered, counters.values, counters.exceptions) == (4, 2, 1, 1)
+    assert counters.missed == {Result.NO_REPLY: 1, Result.LATE_ANSWER_DUE: 1}
+    assert (counters.stray_bytes, counters.late) == (1, 0)

@@ -1,0 +1,662 @@
+"""One line's state machine, on a clock that the test sets: silence, request, reply or time-out."""
+
+from __future__ import annotations
+
+import errno
+import random
+from dataclasses import replace
+
+import pytest
+from frames import words
+from line_driver import MS, LineDriver
+from multidrop._core import lib
+
+from multidrop.core import Exchange, Framing, Message, Peer, Result, build_reply, build_request, crc16
+
+CHARACTER = 1 * MS  # a round number: requests of 8 characters take 8 ms
+SILENCE = 4 * MS
+TIMEOUT = 100 * MS
+TURNAROUND = 200 * MS
+
+READ = Message(1, 0x03, 0, 1)
+READ_TWO = Message(1, 0x03, 0, 2)
+WRITE = Message(1, 0x06, 2, data=words(5000))
+BROADCAST = Message(0, 0x06, 2, data=words(0))
+
+
+def exchange(request: Message, *, silence: int = SILENCE, framing: Framing = Framing.RTU) -> Exchange:
+    return Exchange(
+        framing,
+        request,
+        Peer(least_timeout=TIMEOUT / 1e9, most_timeout=TIMEOUT / 1e9),
+        baudrate=9600,
+        format="8N1",
+        character=CHARACTER / 1e9,
+        silence=silence / 1e9,
+        turnaround=TURNAROUND / 1e9,
+    )
+
+
+def rtu(text: str) -> bytes:
+    body = bytes.fromhex(text)
+    checksum: int = crc16(body, len(body))
+    return body + checksum.to_bytes(2, "little")
+
+
+def reply_of(value: int, address: int = 1) -> bytes:
+    return rtu(f"{address:02X} 03 02 {value:04X}")
+
+
+@pytest.fixture
+def line() -> LineDriver:
+    return LineDriver()
+
+
+def ask(line: LineDriver, request: Message = READ) -> None:
+    """Send the request; the clock then stands at its first bit."""
+    line.begin(exchange(request))
+    line.wait_until_write()
+
+
+def answer(line: LineDriver, received: bytes, piece: int = 4096) -> None:
+    line.receive(received, piece)
+    line.wait_until_done()
+
+
+# ---- silence ----
+
+
+def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
+    """The port held the thread up when it took the request, which may have left long before."""
+    line.begin(exchange(READ))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    begun = line.now
+    line.take(held_up=10 * MS)
+    line.receive(reply_of(7))  # it was there when the thread went on
+    assert line.want == "done"
+    assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
+
+
+def test_a_request_that_may_have_left_late_has_its_whole_time_out(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    line.take(held_up=10 * MS)
+    left = line.now + 8 * CHARACTER
+    line.wait_until_done()
+    assert line.now == left + TIMEOUT + 7 * CHARACTER
+
+
+def test_no_request_before_the_silence_is_over(line: LineDriver) -> None:
+    opened = line.now
+    line.begin(exchange(READ))
+    for now in (opened, opened + SILENCE // 2, opened + SILENCE - 1):
+        line.now = now
+        assert line.listens
+        assert line.wake == opened + SILENCE
+    line.now = opened + SILENCE
+    assert [line.want, line.want] == ["read", "write"]  # one look for bytes that came meanwhile
+
+
+@pytest.mark.parametrize(("before", "after"), [(4, 10), (10, 4), (7, 7)])
+def test_silence_is_the_longer_of_after_one_and_before_the_next(
+    line: LineDriver, before: int, after: int
+) -> None:
+    line.begin(exchange(READ, silence=before * MS))
+    line.wait_until_write()
+    line.now += 20 * MS
+    answer(line, reply_of(1))
+    ended = line.now
+    line.begin(exchange(READ, silence=after * MS))
+    line.wait_until_write()
+    assert line.now == ended + max(before, after) * MS
+
+
+def test_silence_counts_from_the_end_of_what_was_heard_last(line: LineDriver) -> None:
+    opened = line.now
+    line.begin(exchange(READ))
+    line.now = opened + 3 * MS
+    assert line.listens
+    line.receive(b"\xff\xff")
+    line.wait_until_write()
+    assert line.now == opened + 3 * MS + SILENCE
+    answer(line, reply_of(1))
+    assert line.completion.stale == 2
+
+
+def test_bytes_found_in_the_last_look_renew_the_silence(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE
+    assert line.listens
+    line.receive(b"\x00")
+    assert line.listens
+    assert line.wake == line.now + SILENCE
+
+
+def test_babbling_line_does_not_hold_a_request_up_for_ever(line: LineDriver) -> None:
+    """After a time-out's length it is sent all the same: it may be a stop, and the noise only ours."""
+    opened = line.now
+    line.begin(exchange(READ))
+    reads = 0
+    while line.listens:
+        line.receive(b"\xff")
+        line.now += MS
+        reads += 1
+    assert line.now <= opened + SILENCE + TIMEOUT + MS
+    line.take()
+    line.receive(b"\xff" * 10 + reply_of(7))
+    assert line.want == "done"
+    assert (line.completion.reply.data, line.completion.stale) == (words(7), reads)
+
+
+def test_flooded_line_is_given_up_even_when_time_stands_still(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE + TIMEOUT
+    for _ in range(3):
+        if line.want == "write":
+            return
+        line.receive(b"\xff" * 1024)
+    raise AssertionError("it still looks at the flood")
+
+
+def test_a_flood_while_nothing_is_asked_is_no_part_of_any_exchange(line: LineDriver) -> None:
+    """Also before the first one: there is nobody yet to be told of it."""
+    for value in range(3):
+        line.receive(b"\xff" * 4000)
+        ask(line)
+        answer(line, reply_of(value))
+        assert (line.completion.reply.data, line.completion.skipped) == (words(value), 0)
+
+
+def test_request_counts_to_its_last_bit(line: LineDriver) -> None:
+    """A reply that a fast peer gives at once does not shorten the silence after the request's own time."""
+    ask(line)
+    sent = line.now
+    answer(line, reply_of(1))
+    line.begin(exchange(READ))
+    line.wait_until_write()
+    assert line.now == sent + 8 * CHARACTER + SILENCE
+
+
+# ---- sending ----
+
+
+def test_port_that_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE
+    assert [line.want, line.want] == ["read", "write"]
+    sent = line.now
+    request = line.take(3)
+    line.now += 20 * MS
+    assert line.want == "write"
+    request += line.take(0) + line.take(5)
+    assert request == rtu("01 03 00 00 00 01")
+    assert line.listens
+    assert line.wake == sent + 20 * MS + 5 * CHARACTER + TIMEOUT + 7 * CHARACTER
+    line.wait_until_done()
+    assert line.completion.sent_ns == sent
+
+
+def test_port_that_takes_nothing_is_lost(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE
+    assert [line.want, line.want] == ["read", "write"]
+    line.take(0)
+    line.now = line.wake - 1
+    assert line.want == "write"
+    line.now += 1
+    assert line.want == "done"
+    found = line.completion
+    assert (found.result, found.error, found.sent_ns) == (Result.LINE_LOST, errno.ETIMEDOUT, 0)
+
+
+def test_noise_while_the_port_takes_nothing_renews_the_silence(line: LineDriver) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE
+    assert [line.want, line.want] == ["read", "write"]
+    line.take(0)
+    line.now += MS
+    line.receive(b"\xff")
+    assert line.want == "wait"
+    assert line.wake == line.now + SILENCE
+
+
+@pytest.mark.parametrize("taken", [0, 3])
+def test_what_comes_before_the_request_is_out_is_not_its_reply(line: LineDriver, taken: int) -> None:
+    line.begin(exchange(READ))
+    line.now += SILENCE + TIMEOUT  # a babbling line is written to all the same
+    assert [line.want, line.want] == ["read", "write"]
+    line.take(taken)
+    line.receive(reply_of(1111))
+    line.take()
+    answer(line, reply_of(2222))
+    found = line.completion
+    assert (found.reply.data, found.stale, found.skipped) == (words(2222), 7, 0)
+
+
+@pytest.mark.parametrize("step", ["silent", "listening"])
+def test_port_that_fails(line: LineDriver, step: str) -> None:
+    line.begin(exchange(READ))
+    if step == "listening":
+        line.wait_until_write()
+        line.receive(b"\x01\x03")
+    line.lose(errno.EIO)
+    assert line.want == "done"
+    found = line.completion
+    assert (found.result, found.error) == (Result.LINE_LOST, errno.EIO)
+    assert found.raw == (b"\x01\x03" if step == "listening" else b"")
+    line.lose(errno.ENODEV)  # nothing is under way: nothing to end
+    assert line.completion.error == errno.EIO
+
+
+# ---- the reply ----
+
+
+@pytest.mark.parametrize("piece", [7, 3, 1])
+def test_reply_in_pieces(line: LineDriver, piece: int) -> None:
+    ask(line)
+    sent = line.now
+    frame = reply_of(5000)
+    line.now += 15 * MS
+    for at in range(0, len(frame), piece):
+        assert line.listens
+        line.receive(frame[at : at + piece])
+        line.now += MS
+    assert line.want == "done"
+    found = line.completion
+    assert (found.result, found.raw, found.reply.data) == (7, frame, words(5000))
+    last = sent + 15 * MS + (len(frame) - 1) // piece * MS
+    # What comes in one piece took its characters' time all the same.
+    assert found.first_ns == min(sent + 15 * MS, last - (len(frame) - 1) * CHARACTER)
+    assert (found.sent_ns, found.last_ns) == (sent, last)
+    assert (found.stale, found.skipped) == (0, 0)
+
+
+def test_exception_ends_the_exchange_at_once(line: LineDriver) -> None:
+    ask(line)
+    line.receive(rtu("01 83 02"))
+    assert line.want == "done"
+    assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x03, exception=2))
+
+
+def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_reply(line: LineDriver) -> None:
+    ask(line)
+    sent = line.now
+    assert line.listens
+    assert line.wake == sent + 8 * CHARACTER + TIMEOUT + 7 * CHARACTER
+    line.now = line.wake
+    assert [line.want, line.want] == ["read", "done"]  # a last look: the host may be late, not the drive
+    found = line.completion
+    assert (found.result, found.raw, found.first_ns, found.last_ns) == (Result.NO_REPLY, b"", 0, 0)
+
+
+def test_reply_found_in_the_last_look_counts(line: LineDriver) -> None:
+    ask(line)
+    assert line.listens
+    line.now = line.wake + 50 * MS
+    assert line.listens
+    line.receive(reply_of(3))
+    assert line.want == "done"
+    assert line.completion.reply.data == words(3)
+
+
+def test_last_look_is_the_last_whatever_it_finds(line: LineDriver) -> None:
+    ask(line)
+    assert line.listens
+    line.now = line.wake
+    assert line.listens
+    line.receive(b"\xff" * 1024)
+    assert line.want == "done"
+    assert line.completion.result == Result.BAD_ADDRESS
+
+
+def test_frame_from_another_address_does_not_end_the_exchange(line: LineDriver) -> None:
+    ask(line)
+    line.receive(reply_of(9, address=2))
+    line.now += 30 * MS
+    assert line.listens
+    answer(line, reply_of(8))
+    assert (line.completion.reply.data, line.completion.skipped) == (words(8), 7)
+
+
+def test_damaged_reply_and_then_the_right_one(line: LineDriver) -> None:
+    ask(line)
+    line.receive(reply_of(9)[:-1] + b"\x00")
+    assert line.listens
+    answer(line, reply_of(8))
+    assert (line.completion.reply.data, line.completion.skipped) == (words(8), 7)
+
+
+REASONS = [
+    ("nothing", b"", Result.NO_REPLY),
+    ("only the adapter's echo", rtu("01 03 00 00 00 02"), Result.NO_REPLY),
+    ("cut off", b"\x01\x03\x04\x11", Result.CUT_SHORT),
+    ("cut off behind junk", b"\x00\xff\x01\x03\x04\x11", Result.CUT_SHORT),
+    ("damaged", b"\x01\x03\x04\x11\x11\x22\x22\x00\x00", Result.BAD_CHECKSUM),
+    ("damaged, behind junk", b"\x00\x01\x03\x04\x11\x11\x22\x22\x00\x00", Result.BAD_CHECKSUM),
+    ("damaged, with an address in it", b"\x01\x03\x04\x11\x11\x22\x01\x00\x00", Result.BAD_CHECKSUM),
+    ("another address, with ours in it", rtu("02 03 04 00 01 00 05"), Result.BAD_ADDRESS),
+    ("another function", rtu("01 04 04 11 11 22 22"), Result.BAD_FUNCTION),
+    ("another length", rtu("01 03 02 11 11"), Result.BAD_LENGTH),
+    ("junk", b"\xff\xfe\xfd", Result.BAD_ADDRESS),
+]
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize(("received", "reason"), [it[1:] for it in REASONS], ids=[it[0] for it in REASONS])
+def test_time_out_tells_what_went_wrong(
+    line: LineDriver, received: bytes, reason: Result, piece: int
+) -> None:
+    ask(line, READ_TWO)
+    sent = line.now
+    answer(line, received, piece)
+    assert line.now == sent + (8 + 9) * CHARACTER + TIMEOUT  # never before the time-out
+    found = line.completion
+    assert (found.result, found.raw, found.skipped) == (reason, received, len(received))
+    assert found.reply == Message(0, 0)
+
+
+# ---- late replies, doubled replies, noise ----
+
+
+def test_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None:
+    ask(line)
+    line.wait_until_done()
+    assert line.completion.result == Result.NO_REPLY
+    line.begin(exchange(READ))
+    line.now += SILENCE // 2
+    assert line.listens
+    line.receive(reply_of(1111))
+    late = line.now
+    line.wait_until_write()
+    assert line.now == late + SILENCE
+    answer(line, reply_of(2222))
+    found = line.completion
+    assert (found.reply.data, found.stale, found.skipped) == (words(2222), 7, 0)
+
+
+def test_doubled_reply_is_not_the_next_ones(line: LineDriver) -> None:
+    ask(line)
+    answer(line, reply_of(1111))
+    line.begin(exchange(READ))
+    assert line.listens
+    line.receive(reply_of(1111))
+    line.wait_until_write()
+    answer(line, reply_of(2222))
+    assert (line.completion.reply.data, line.completion.stale) == (words(2222), 7)
+
+
+def test_bytes_behind_the_reply_are_counted(line: LineDriver) -> None:
+    ask(line)
+    answer(line, reply_of(1) + reply_of(1) + bytes(2000))
+    assert (line.completion.raw, line.completion.skipped) == (reply_of(1), 2007)
+
+
+@pytest.mark.parametrize("piece", [4096, 100, 1])
+@pytest.mark.parametrize("seed", range(3))
+def test_reply_behind_4096_bytes_of_noise(line: LineDriver, seed: int, piece: int) -> None:
+    noise = random.Random(seed).randbytes(4096)
+    ask(line)
+    answer(line, noise + reply_of(77), piece)
+    found = line.completion
+    assert (found.reply.data, found.raw, found.skipped) == (words(77), reply_of(77), 4096)
+
+
+@pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
+def test_endless_garbage_is_looked_at_again_only_within_a_frames_length(
+    line: LineDriver, received: bytes
+) -> None:
+    ask(line, Message(1, 0x03, 0, 125))
+    garbage = received * 20_000
+    for at in range(0, len(garbage), 64):
+        line.receive(garbage[at : at + 64])
+        assert line.still_open < 255
+    line.wait_until_done()
+    found = line.completion
+    assert (found.skipped, found.raw) == (len(garbage), garbage[-513:])
+
+
+# ---- broadcasts ----
+
+
+def test_broadcast_is_over_when_sent_and_followed_by_the_turnaround_delay(line: LineDriver) -> None:
+    ask(line, BROADCAST)
+    sent = line.now
+    assert line.want == "done"
+    assert (line.completion.result, line.completion.sent_ns, line.completion.first_ns) == (0, sent, 0)
+    line.begin(exchange(READ))
+    line.wait_until_write()
+    assert line.now == sent + 8 * CHARACTER + TURNAROUND
+
+
+def test_noise_does_not_shorten_the_turnaround_delay(line: LineDriver) -> None:
+    ask(line, BROADCAST)
+    sent = line.now
+    line.now += MS
+    line.receive(b"\xff")  # while the broadcast is still leaving
+    line.begin(exchange(READ))
+    line.wait_until_write()
+    assert line.now == sent + 8 * CHARACTER + TURNAROUND
+
+
+def test_exchange_that_fails_unsent_does_not_cancel_the_turnaround_delay(line: LineDriver) -> None:
+    ask(line, BROADCAST)
+    sent = line.now
+    line.begin(exchange(READ))
+    line.lose(errno.EIO)
+    line.begin(exchange(READ))
+    line.wait_until_write()
+    assert line.now == sent + 8 * CHARACTER + TURNAROUND
+
+
+# ---- an adapter that echoes what it sends ----
+
+
+def teach_echo(line: LineDriver) -> None:
+    ask(line)
+    answer(line, rtu("01 03 00 00 00 01") + reply_of(1))
+    assert (line.completion.result, line.completion.skipped) == (7, 8)
+
+
+def confirmation() -> bytes:
+    return build_reply(Framing.RTU, WRITE)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+def test_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -> None:
+    teach_echo(line)
+    ask(line, WRITE)
+    line.receive(confirmation(), piece)
+    line.now += 20 * MS
+    assert line.listens
+    line.receive(confirmation(), piece)
+    assert line.want == "done"
+    assert (line.completion.result, line.completion.skipped) == (8, 8)
+
+
+def test_dead_drive_behind_an_echo_confirms_nothing(line: LineDriver) -> None:
+    teach_echo(line)
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.reply) == (Result.NO_REPLY, Message(0, 0))
+
+
+def test_refusal_behind_the_echo_of_a_write(line: LineDriver) -> None:
+    teach_echo(line)
+    ask(line, WRITE)
+    answer(line, confirmation() + rtu("01 86 02"))
+    assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x06, exception=2))
+
+
+def test_echo_that_comes_while_the_port_still_takes_the_request(line: LineDriver) -> None:
+    teach_echo(line)
+    line.begin(exchange(WRITE))
+    while line.want != "write":
+        line.now = max(line.now, line.wake)
+    line.receive(line.take(5))
+    line.receive(line.take(3))
+    assert line.listens
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.stale, line.completion.skipped) == (8, 0, 8)
+
+
+def test_echo_behind_a_stray_byte(line: LineDriver) -> None:
+    teach_echo(line)
+    ask(line, WRITE)
+    line.receive(b"\x00" + confirmation())
+    assert line.listens
+    answer(line, b"\x00" + confirmation())
+    assert (line.completion.result, line.completion.skipped) == (8, 10)
+
+
+DAMAGED_ECHOES = {
+    "its end is missing": confirmation()[:5],
+    "its begin is missing": confirmation()[3:],
+    "a bit is wrong": bytes([confirmation()[0] ^ 4]) + confirmation()[1:],
+    "its middle is missing": confirmation()[:2] + confirmation()[4:],
+}
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("echo", DAMAGED_ECHOES)
+def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
+    """Nor does what comes then: it may be the echo, and what came before it noise. It can be read back."""
+    teach_echo(line)
+    ask(line, WRITE)
+    line.receive(DAMAGED_ECHOES[echo] + confirmation(), piece)
+    line.wait_until_done()
+    assert line.completion.result < 0
+    line.now += 10 * TIMEOUT
+    ask(line)
+    answer(line, rtu("01 03 00 00 00 01") + reply_of(2))
+    assert line.completion.reply.data == words(2)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+@pytest.mark.parametrize("cut", [(0, 5), (3, 8), (0, 1), (7, 8)])
+def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int, int], piece: int) -> None:
+    teach_echo(line)
+    ask(line)
+    echo = rtu("01 03 00 00 00 01")[slice(*cut)]
+    answer(line, echo + reply_of(2), piece)
+    assert (line.completion.reply.data, line.completion.skipped) == (words(2), len(echo))
+    ask(line, WRITE)
+    answer(line, confirmation())  # the line is still known to echo
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
+    """Not at once: one echo may have been lost."""
+    teach_echo(line)
+    ask(line)
+    answer(line, reply_of(1))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.MAYBE_ECHO
+    line.now += 10 * TIMEOUT
+    ask(line)
+    answer(line, reply_of(1))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.skipped) == (8, 0)
+
+
+@pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
+def test_the_beginning_of_an_echo_is_no_reply(line: LineDriver, piece: int) -> None:
+    """Seven of its eight bytes are a good reply with one register."""
+    echo = rtu("06 03 02 11 00 01")
+    assert echo[:7] == rtu("06 03 02 11 00")
+    ask(line, Message(6, 3, 0x0211, 1))
+    answer(line, echo + reply_of(7, address=6), piece)
+    assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
+
+
+def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_echo_shows(
+    line: LineDriver,
+) -> None:
+    line.tell_echo(lib.MD_NO_ECHO)
+    for _ in range(2):
+        ask(line, WRITE)
+        answer(line, confirmation())
+        assert (line.completion.result, line.completion.skipped) == (8, 0)
+    teach_echo(line)  # who said that there is none was mistaken
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -> None:
+    line.tell_echo(lib.MD_ECHO)
+    for _ in range(3):
+        ask(line)
+        answer(line, reply_of(1))  # its echo was lost
+        assert line.completion.result == 7
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line: LineDriver) -> None:
+    query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
+    line.tell_echo(lib.MD_ECHO)
+    line.begin(exchange(query, framing=Framing.DELIXI))
+    line.wait_until_write()
+    reply = build_reply(Framing.DELIXI, replace(query, data=value))
+    answer(line, build_request(Framing.DELIXI, query) + reply)
+    assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
+
+
+def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.raw) == (Result.MAYBE_ECHO, confirmation())
+    ask(line, WRITE)
+    answer(line, confirmation() + confirmation())  # it was
+    assert (line.completion.result, line.completion.skipped) == (8, 8)
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_a_reply_without_an_echo_before_it_tells_that_there_is_none(line: LineDriver) -> None:
+    ask(line)
+    answer(line, reply_of(1))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert (line.completion.result, line.completion.skipped) == (8, 0)
+
+
+@pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
+def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
+    """A drive's driver that brings a zero before every reply costs no confirmation."""
+    ask(line)
+    answer(line, bytes(stray) + reply_of(1))
+    assert line.completion.reply.data == words(1)
+    ask(line, WRITE)
+    answer(line, bytes(stray) + confirmation())
+    assert (line.completion.result == 8) is told
+
+
+def test_an_echo_alone_tells_of_itself(line: LineDriver) -> None:
+    """No reply to a read is a copy of its request: the drive is dead."""
+    ask(line)
+    answer(line, rtu("01 03 00 00 00 01"))
+    ask(line, WRITE)
+    answer(line, confirmation())
+    assert line.completion.result == Result.NO_REPLY
+
+
+def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:
+    """Its echo is a reply that says 0; the state query, which has no such answer, tells of the echo."""
+    state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
+    value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
+    line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
+    assert line.wait_until_write() == ask_state
+    answer(line, ask_state + state)
+    assert line.completion.reply.start == 3
+    for reply, frequency in ((value, 5000), (ask_value, 0)):
+        line.begin(exchange(Message(1, 7, 500, data=words(0, 0)), framing=Framing.DELIXI))
+        assert line.wait_until_write() == ask_value
+        answer(line, ask_value + reply)
+        assert (line.completion.reply.data, line.completion.skipped) == (words(0, frequency), 21)

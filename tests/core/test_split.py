@@ -1,0 +1,216 @@
+"""Sniffed bytes are cut into frames of both directions: the documents' own frames, mixed and damaged."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+from itertools import pairwise
+
+import pytest
+from frames import PRINTED, Printed
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop.core import HEARD_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
+
+Pair = tuple[Printed, Printed]
+REPLIES = [it for it in PRINTED if it.request is not None and isinstance(it.says, Message)]
+WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # confirmed by its own copy
+READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
+OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
+ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # as long as ANSWER
+
+
+def split(*pieces: bytes) -> list[FrameSpan]:
+    """Spans of pieces that came one after another, piece i at time i."""
+    stream = Stream()
+    for time, piece in enumerate(pieces):
+        stream.put(piece, time)
+    stream.end(True)
+    return list(Splitter().spans(stream))
+
+
+def kinds(spans: Iterable[FrameSpan]) -> list[Kind]:
+    return [span.kind for span in spans]
+
+
+def raw(spans: Iterable[FrameSpan]) -> list[tuple[Kind, bytes]]:
+    return [(span.kind, span.raw) for span in spans]
+
+
+@pytest.mark.parametrize("reply", REPLIES, ids=str)
+def test_a_printed_exchange_is_a_request_and_its_reply(reply: Printed) -> None:
+    asked, answered = split(reply.request_frame, reply.frame)
+    assert (answered.kind, answered.framing) == (Kind.REPLY, reply.framing)
+    assert asked.kind in (Kind.REQUEST, Kind.EITHER)
+    assert (asked.message, answered.message) == (reply.request, reply.says)
+    assert (asked.raw, answered.raw) == (reply.request_frame, reply.frame)
+
+
+@given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
+def test_a_mixed_line_is_cut_alike_however_its_bytes_come(line: list[Printed], data: st.DataObject) -> None:
+    bytes_ = READ + ANSWER + b"".join(it.request_frame + it.frame for it in line)
+    stream, splitter, spans = Stream(), Splitter(), []
+    at = 0
+    while at < len(bytes_):
+        size = data.draw(st.integers(1, 60))
+        stream.put(bytes_[at : at + size], at)
+        spans += splitter.spans(stream)
+        at += size
+    stream.end(True)
+    spans += splitter.spans(stream)
+    expected = [(Kind.REQUEST, READ), (Kind.REPLY, ANSWER)]
+    for it in line:
+        expected += [(Kind.REQUEST, it.request_frame), (Kind.REPLY, it.frame)]
+    assert raw(spans) == expected
+
+
+@given(
+    st.lists(st.binary(min_size=1, max_size=40) | st.sampled_from([it.frame for it in REPLIES]), max_size=30)
+)
+def test_no_byte_is_lost_or_told_twice(pieces: list[bytes]) -> None:
+    assert b"".join(span.raw for span in split(*pieces)) == b"".join(pieces)
+
+
+def test_a_time_is_that_of_the_piece_in_which_a_frame_begins() -> None:
+    spans = split(READ[:3], READ[3:] + ANSWER[:2], ANSWER[2:], b"\xff")
+    assert [span.time_ns for span in spans] == [0, 1, 3]
+
+
+def test_copies_that_confirm_are_told_from_requests_by_their_order() -> None:
+    assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
+
+
+def test_a_copy_is_neither_where_its_order_is_lost() -> None:
+    assert kinds(split(WRITE)) == [Kind.EITHER]
+    assert kinds(split(READ, ANSWER, WRITE[:-1], WRITE, READ)) == [
+        *(Kind.REQUEST, Kind.REPLY, Kind.JUNK, Kind.EITHER, Kind.REQUEST)
+    ]
+
+
+def test_an_answered_query_is_no_request_though_it_looks_like_one() -> None:
+    (query,) = {it for it in REPLIES if it.request_frame.startswith(b":0107")}
+    assert raw(split(query.request_frame[:-3], query.frame, query.request_frame, query.frame)) == [
+        (Kind.JUNK, query.request_frame[:-3]),
+        (Kind.STRAY, query.frame),
+        (Kind.REQUEST, query.request_frame),
+        (Kind.REPLY, query.frame),
+    ]
+
+
+def test_a_side_that_is_known_tells_a_copy_from_a_request() -> None:
+    stream = Stream()
+    stream.put(WRITE, 0, side=Side.ANSWERING)
+    stream.put(WRITE, 1, side=Side.ASKING)
+    stream.put(WRITE, 2, side=Side.ASKING)
+    stream.put(WRITE, 3, side=Side.ANSWERING)
+    stream.end(True)
+    spans = list(Splitter().spans(stream))
+    assert kinds(spans) == [Kind.JUNK, Kind.REQUEST, Kind.REQUEST, Kind.REPLY]
+    assert b"".join(span.raw for span in spans) == 4 * WRITE
+
+
+def test_a_reply_is_not_given_to_an_earlier_request_than_its_own() -> None:
+    damaged = bytes([OTHER_READ[0] ^ 1]) + OTHER_READ[1:]
+    assert kinds(split(READ, damaged, ALSO_ANSWER)) == [Kind.REQUEST, Kind.JUNK, Kind.STRAY]
+
+
+def test_what_was_lost_is_not_forgotten_when_a_stray_reply_comes() -> None:
+    lost = OTHER_READ[:-1]
+    assert kinds(split(READ, ANSWER, WRITE, lost, ALSO_ANSWER, WRITE, WRITE)) == [
+        *(Kind.REQUEST, Kind.REPLY, Kind.REQUEST, Kind.JUNK, Kind.STRAY, Kind.REQUEST, Kind.REPLY)
+    ]
+
+
+def test_a_stray_reply_does_not_end_an_exchange() -> None:
+    other = bytes.fromhex("02 83 02 30 F1")
+    assert kinds(split(READ, other, ANSWER)) == [Kind.REQUEST, Kind.STRAY, Kind.REPLY]
+
+
+def test_a_request_that_is_repeated_is_answered_once() -> None:
+    assert kinds(split(READ, READ, ANSWER, ANSWER)) == [*(Kind.REQUEST, Kind.REQUEST, Kind.REPLY, Kind.STRAY)]
+
+
+def test_noise_between_a_request_and_its_reply_does_no_harm() -> None:
+    assert raw(split(READ, b"\xff\x00", ANSWER)) == [
+        (Kind.REQUEST, READ),
+        (Kind.JUNK, b"\xff\x00"),
+        (Kind.REPLY, ANSWER),
+    ]
+
+
+@pytest.mark.parametrize("first", ["", "FF"])
+def test_a_pause_ends_what_begins_amid_junk(first: str) -> None:
+    """The junk looks like the begin of a long write, which the next frames would fill up."""
+    junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
+    stream, splitter = Stream(), Splitter()
+    stream.put(READ + ANSWER[:2], 0)
+    stream.put(junk, 1)
+    stream.put(OTHER_READ, 2, after_pause=True)
+    stream.put(ALSO_ANSWER, 3, after_pause=True)
+    spans = list(splitter.spans(stream))
+    assert raw(spans)[-2:] == [(Kind.REQUEST, OTHER_READ), (Kind.REPLY, ALSO_ANSWER)]
+    assert b"".join(span.raw for span in spans if span.kind is Kind.JUNK) == ANSWER[:2] + junk
+
+
+def test_without_pauses_it_waits_until_the_long_frame_could_be_whole() -> None:
+    stream, splitter = Stream(), Splitter()
+    stream.put(bytes.fromhex("01 10 00 00 00 7B F6") + OTHER_READ, 0)
+    assert list(splitter.spans(stream)) == []
+    stream.end(True)
+    assert kinds(splitter.spans(stream)) == [Kind.JUNK, Kind.REQUEST]
+
+
+def test_what_cannot_be_a_frame_is_junk_at_once() -> None:
+    stream, splitter = Stream(), Splitter()
+    stream.put(b"\xff" * 1000, 0)
+    assert sum(len(span.raw) for span in splitter.spans(stream)) > 990
+
+
+def test_more_than_fits_is_refused() -> None:
+    stream = Stream()
+    stream.put(bytes(HEARD_ROOM), 0)
+    with pytest.raises(BufferError, match="split it first"):
+        stream.put(b"\0", 1)
+
+
+def damaged(frame: bytes, chance: random.Random) -> bytes:
+    """One byte in a hundred is changed, lost or doubled."""
+    found = bytearray()
+    for byte in frame:
+        kind = chance.choice(["changed", "lost", "doubled"]) if chance.random() < 0.01 else ""
+        if kind != "lost":
+            found.append(byte ^ chance.randrange(1, 256) if kind == "changed" else byte)
+        if kind == "doubled":
+            found.append(byte)
+    return bytes(found)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
+    chance = random.Random(seed)
+    line = chance.choices(REPLIES, k=2000)
+    sent = [frame for it in line for frame in (it.request_frame, it.frame)]
+    came = [damaged(frame, chance) for frame in sent]
+    found = split(*came)
+    spans = {(span.kind, span.time_ns, span.raw) for span in found}
+    whole = [came[i] == sent[i] for i in range(len(sent))]
+    expected = range(2, len(sent) - 2, 2)
+    expected = [i for i in expected if all(whole[i - 2 : i + 4])]
+    assert len(expected) > 500
+    for i in expected:
+        assert (Kind.REQUEST, i, sent[i]) in spans
+        assert (Kind.REPLY, i + 1, sent[i + 1]) in spans
+    frames = [span for span in found if span.kind is not Kind.JUNK]
+    for asked, answered in pairwise(frames):  # and no reply is given to a request that is not its own
+        if answered.kind is Kind.REPLY:
+            assert answered.time_ns == asked.time_ns + 1 or answered.raw == asked.raw
+
+
+def test_framings_may_change_from_frame_to_frame() -> None:
+    by_framing = {it.framing: it for it in REPLIES}
+    assert set(by_framing) == set(Framing)
+    frames = [it.request_frame + it.frame for it in by_framing.values()]
+    assert [span.framing for span in split(*frames, *frames)] == [
+        framing for framing in (*by_framing, *by_framing) for _ in range(2)
+    ]

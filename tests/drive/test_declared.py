@@ -1,0 +1,172 @@
+"""Declarations: every mistake of a class is told when the class is made, with its register's name."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop.drive import Drive
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import (
+    COIL,
+    HOLDING,
+    INPUT,
+    NumberFormat,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
+from multidrop.drives import DelixiNative
+
+
+class Run(IntEnum):
+    STOP = 0
+    GO = 1
+
+
+def declare(**registers: Register[Any]) -> type[Drive]:
+    return type("Fan", (Drive,), registers)
+
+
+def told(**registers: Register[Any]) -> tuple[str, ...]:
+    """The mistakes of a class with these registers."""
+    with pytest.raises(DeclarationError) as refusal:
+        declare(**registers)
+    assert str(refusal.value) == "\n".join(f"Fan.{mistake}" for mistake in refusal.value.mistakes)
+    return refusal.value.mistakes
+
+
+WRONG: dict[str, dict[str, Any]] = {
+    "step = 0: every value would be 0": {"step": 0},
+    "step = '0.1' is no number": {"step": "0.1"},
+    "step = nan is no number": {"step": float("nan")},
+    "step = True is no number": {"step": True},
+    "number_format = 'f32' is no number format: write NumberFormat.F32": {"number_format": "f32"},
+    "number_format = 7 is no number format: write NumberFormat.U16": {"number_format": 7},
+    "number_format = NumberFormat.BIT does not fit a holding register": {"number_format": NumberFormat.BIT},
+    "number_format = NumberFormat.F32 does not fit a coil": {
+        "number_format": NumberFormat.F32,
+        "table": COIL,
+    },
+    "number_format = U32_EITHER leaves the order of its words open": {
+        "number_format": NumberFormat.U32_EITHER
+    },
+    "span = (60, 0) is the wrong way round": {"span": (60, 0)},
+    "span = 60 is not two numbers": {"span": 60},
+    "span = (0, inf) is not two numbers": {"span": (0, float("inf"))},
+    "an end of its span cannot be written: speed = 70000 does not fit: 0 to 65535 rpm": {"span": (0, 70000)},
+    "default = 70 is outside its span of 0 to 60": {"span": (0, 60), "default": 70},
+    "default = 'slow' is no number": {"default": "slow"},
+    "table = 'coil' is no table": {"table": "coil"},
+    "a input register cannot be written": {"table": INPUT},
+    "kept = 'RAM' is none of": {"kept": "RAM"},
+    "harmless = <Run.STOP: 0> is no tuple of raw counts": {"harmless": Run.STOP},
+    "never = True is no text": {"never": True},
+    "while_running = 'no' is neither True nor False": {"while_running": "no"},
+    "its bound fastest is neither an option nor a number that can be read": {"at_most": "fastest"},
+    "function 15 cannot write a word: its table has 06H or 10H for it": {"table": Table("relay", 3, 0x0F)},
+    "function 101 cannot read a word": {"table": Table("fifo", 101, 0x10)},
+    "ram_address 10000H is outside 0 to FFFFH": {"ram_address": 0x10000},
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_mistake_is_told_with_the_register_s_name(mistake: str) -> None:
+    (sentence,) = told(speed=setting(5, "rpm", **WRONG[mistake]))
+    assert sentence.startswith(f"speed: {mistake}")
+
+
+def test_all_mistakes_of_a_class_are_told_at_once() -> None:
+    mistakes = told(
+        speed=reading(1, "rpm", step=0),
+        level=reading(0xFFFF, "m", number_format=NumberFormat.F32),
+        start=setting(2),
+        registers=setting(3),
+        address=setting(4),
+        perform=setting(5),
+        lost=reading("6", "V"),  # type: ignore[call-overload]
+        run=command(7, "GO", number_format="u16", span=(5, 1)),  # type: ignore[arg-type]
+    )
+    assert [it.partition(":")[0] for it in mistakes] == [
+        *("speed", "level", "start", "registers", "address", "perform", "lost", "run", "run")
+    ]
+    assert mistakes[1] == "level: address FFFFH: its 2 words reach beyond FFFFH"
+    assert mistakes[2] == ("start: this is a name that every drive has for something else; call it otherwise")
+    assert mistakes[6] == "lost: address '6' is outside 0 to FFFFH"
+
+
+@given(st.fixed_dictionaries({}, optional={key: st.just(value) for key, value in {
+    "step": "0.1", "span": (2, 1), "number_format": "f32", "kept": "RAM", "table": "coil", "default": "x",
+    "harmless": (1.5,), "broadcast": 3, "never": 1, "ram_address": -1, "at_least": "none", "moves": 7,
+}.items()}))  # fmt: skip
+def test_any_mistakes_together_are_sentences(wrong: dict[str, Any]) -> None:
+    register = setting(1, "V", **wrong)
+    if wrong:
+        assert told(v=register)
+        assert all(it.startswith("v: ") and "\n" not in it for it in told(v=register))
+    else:
+        declare(v=register)
+
+
+def test_two_settings_at_one_place_mean_the_same() -> None:
+    for other in (
+        setting(8, "V", number_format=NumberFormat.I16),
+        setting(8, "V", step=0.1),
+        command(8, "V"),
+        setting(7, number_format=NumberFormat.U32),
+    ):
+        (mistake,) = told(volts=setting(8, "V"), other=other)
+        assert mistake.startswith("other: volts is written at the same address with another format, step")
+    several = Table("holding register, several", 0x03, 0x10)
+    assert told(volts=setting(8), other=setting(8, table=several, number_format=NumberFormat.U32))
+
+
+def test_what_may_share_its_place() -> None:
+    family = declare(
+        volts=setting(8, "V"),
+        volts_again=setting(8, "V", span=(0, 5)),
+        held=reading(8, "V", number_format=NumberFormat.I16),
+        relay=setting(8, table=COIL),
+        input=reading(8, table=INPUT),
+        status=reading(0x20),
+        control=command(0x20, Run, harmless=(0,)),
+        alias=setting(9, ram_address=8),
+    )
+    assert len(family.registers) == 8
+    assert DelixiNative.registers  # a parameter by two function codes
+
+
+def test_a_register_has_one_name_and_one_class() -> None:
+    speed = reading(1, "rpm")
+    assert told(speed=speed, rpm=speed) == (
+        "rpm: this is the register speed already; declare one of its own",
+    )
+
+    class Base(Drive):
+        """Has two registers."""
+
+        speed = reading(1, "rpm")
+        torque = reading(2, "%")
+
+    class Less(Base):
+        """Has one of them no more."""
+
+        speed = None  # type: ignore[assignment]
+
+    assert list(Less.registers) == ["torque"]
+    assert list(Base.registers) == ["speed", "torque"]
+
+
+def test_the_words_of_a_register_are_what_its_table_can_do() -> None:
+    blind = Table("output", None, 0x06)
+    assert told(v=reading(1, table=blind)) == ("v: a output cannot be read, and so holds no reading",)
+    assert told(v=reading(1, harmless=(0,)))
+    assert declare(v=command(1, table=blind, harmless=(0,)))
+    assert declare(v=setting(1, table=INPUT, never="it is the maker's"))
+    assert HOLDING.read == 3

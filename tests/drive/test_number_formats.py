@@ -1,0 +1,243 @@
+"""Numbers of every format, from a program to the wire, into a drive and back."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+from halls import Hall
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from multidrop.cli.monitor.watched import told
+from multidrop.cli.support.values import as_json, taken
+from multidrop.control.outcome import Effect
+from multidrop.core import Message
+from multidrop.drive import Drive
+from multidrop.drive.register import Carrier, Kept, NumberFormat, Register, Table, command, reading, setting
+from multidrop.drive.request import write_request
+from multidrop.errors import Refused
+from multidrop.sim import SimulatedDrive
+
+SEVERAL = Table("holding register, several at once", 0x03, 0x10)
+RELAYS = Table("coil, several at once", 0x01, 0x0F, Carrier.BIT)
+LOW_FIRST = (NumberFormat.U32_SWAPPED, NumberFormat.I32_SWAPPED, NumberFormat.F32_SWAPPED)
+PACKED = {  # what a document calls them
+    NumberFormat.U16: ">H",
+    NumberFormat.I16: ">h",
+    NumberFormat.U32: ">I",
+    NumberFormat.I32: ">i",
+    NumberFormat.U32_SWAPPED: ">I",
+    NumberFormat.I32_SWAPPED: ">i",
+    NumberFormat.F32: ">f",
+    NumberFormat.F32_SWAPPED: ">f",
+}
+
+
+class Meter(Drive):
+    """A setting of each format, and what a drive's manual says besides; no limit on a read is stated."""
+
+    u16 = setting(0, "V", kept=Kept.RAM)
+    i16 = setting(1, "V", number_format=NumberFormat.I16, kept=Kept.RAM)
+    u32 = setting(2, "V", number_format=NumberFormat.U32, kept=Kept.RAM)
+    i32 = setting(4, "V", number_format=NumberFormat.I32, kept=Kept.RAM)
+    u32_swapped = setting(6, "V", number_format=NumberFormat.U32_SWAPPED, kept=Kept.RAM)
+    i32_swapped = setting(8, "V", number_format=NumberFormat.I32_SWAPPED, kept=Kept.RAM)
+    f32 = setting(10, "V", number_format=NumberFormat.F32, kept=Kept.RAM)
+    f32_swapped = setting(12, "V", number_format=NumberFormat.F32_SWAPPED, kept=Kept.RAM)
+
+    scaled = setting(14, "V", number_format=NumberFormat.F32, step=0.1, kept=Kept.RAM)
+    narrow = setting(16, "V", number_format=NumberFormat.F32, span=(0, 0.1), kept=Kept.RAM)
+    unscaled = setting(18, number_format=NumberFormat.F32, step=None, kept=Kept.RAM)
+    downwards = setting(20, "V", step=-0.1, kept=Kept.RAM)
+    alone = setting(22, "V", table=SEVERAL, kept=Kept.RAM)
+    lamp = setting(3, table=RELAYS)
+    total = reading(24, "kWh", number_format=NumberFormat.U32)
+    status = reading(30)
+    control = command(30, span=(0, 7), moves=False)
+
+
+FORMATS = [Meter.register(wire.name.lower()) for wire in PACKED]
+formats = pytest.mark.parametrize("register", FORMATS, ids=lambda it: it.name)
+
+
+def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
+    """What it can hold."""
+    if register.is_float:
+        return st.floats(width=32, allow_nan=False, allow_infinity=False)
+    low, high = {"H": (0, 0xFFFF), "h": (-0x8000, 0x7FFF), "I": (0, 0xFFFFFFFF), "i": (-(2**31), 2**31 - 1)}[
+        PACKED[register.number_format][1]
+    ]
+    return st.integers(low, high)
+
+
+def on_the_wire(wire: NumberFormat, number: float) -> bytes:
+    data = struct.pack(PACKED[wire], number)
+    return data[2:] + data[:2] if wire in LOW_FIRST else data
+
+
+@formats
+@given(data=st.data())
+def test_a_number_is_packed_as_its_format_says(register: Register[float], data: st.DataObject) -> None:
+    number = data.draw(numbers(register))
+    request = write_request(Meter(1), register, register.encode(number))
+    assert request.data == on_the_wire(register.number_format, number or 0)  # a zero has no sign
+    function, count = (0x10, 2) if register.words == 2 else (0x06, 0)
+    assert (request.function, request.start, request.count) == (function, register.address, count)
+
+
+@pytest.fixture(scope="module")
+def attached() -> Any:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sim = SimulatedDrive(Meter(1))
+        hall = Hall(monkeypatch, sim)
+        yield hall, hall.attach(Meter(1, confirmed=1)), sim
+
+
+@formats
+@settings(max_examples=30)
+@given(data=st.data())
+def test_a_number_is_written_held_and_read_back(
+    attached: Any, register: Register[float], data: st.DataObject
+) -> None:
+    hall, meter, sim = attached
+    number = data.draw(numbers(register))
+    outcome = hall.bus.try_write(meter, register, number)
+    assert (outcome.effect, outcome.held) == (Effect.DONE, number)
+    assert hall.bus.read(meter, register) == number == sim[register.name]
+    sim[register.name] = number  # as from its keypad
+    assert hall.bus.read(meter, register) == number
+
+
+@settings(max_examples=50)
+@given(st.floats(-3e38, 3e38))
+@example(12.1)
+@example(16_777_217)
+def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> None:
+    hall, meter, sim = attached
+    (nearest,) = struct.unpack(">f", struct.pack(">f", value))
+    assert hall.bus.write(meter, Meter.f32, value) == nearest == sim["f32"]
+    assert Meter.f32.encode(value) == nearest
+
+
+@pytest.mark.parametrize("name", ["f32", "f32_swapped", "scaled", "unscaled", "u16"])
+@pytest.mark.parametrize(
+    "value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7)
+)
+def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value: float) -> None:
+    hall, meter, _ = attached
+    before = len(hall.written)
+    with pytest.raises(Refused, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
+        hall.bus.write(meter, meter.register(name), value)
+    assert len(hall.written) == before
+
+
+@given(st.floats(width=32, allow_nan=False, allow_infinity=False))
+@example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
+@pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda it: it.name)
+def test_a_float_is_shown_as_what_it_holds(register: Register[float], raw: float) -> None:
+    shown = register.format(register.decode(raw)).partition(" ")[0]
+    assert register.encode(register.parse(shown)) == raw
+    assert len(shown.lstrip("-").replace(".", "").partition("e")[0].strip("0")) <= 9
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(12.5, "12.5 V"), (12.0, "12 V"), (12.1, "12.1 V"), (0.1, "0.1 V"), (-0.0, "0 V"),
+     (1 / 3, "0.33333334 V"), (1e20, "1e+20 V"), (math.nan, "nan V"), (math.inf, "inf V"),
+     (16_777_217, "16777216 V")],
+)  # fmt: skip
+def test_floats_read_well(value: float, text: str) -> None:
+    assert Meter.f32.format(value) == text
+    if math.isfinite(value):
+        assert Meter.f32.format(Meter.f32.decode(Meter.f32.encode(value))) == text
+
+
+def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:
+    hall, meter, _ = attached
+    assert hall.bus.write(meter, Meter.narrow, 0.1) == pytest.approx(0.1)
+    with pytest.raises(Refused, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
+        hall.bus.write(meter, Meter.narrow, 0.10001)
+
+
+def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
+    sim = SimulatedDrive(Meter(1))
+
+    def answer(value: float) -> Message:
+        reply = sim.answer(Message(1, 0x10, 16, 2, struct.pack(">f", value)), 0.0)
+        assert reply is not None
+        return reply
+
+    assert not answer(0.05).exception
+    for value in (0.2, -1e-9, math.nan, math.inf):
+        assert answer(value).exception == 3
+    assert sim["narrow"] == pytest.approx(0.05)
+    sim["f32"] = 1e300  # cut off where it does not fit
+    assert sim["f32"] == math.inf
+
+
+def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str]) -> None:
+    (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
+    assert taken(Meter.f32, Meter.f32.parse("12.1")) == single
+    assert capsys.readouterr().err == ""  # shown as it was typed
+    assert taken(Meter.f32, 16_777_217.0) == 16_777_216
+    assert capsys.readouterr().err == (
+        "multidrop: f32 holds single-precision numbers: 16777217.0 is taken as 16777216 V\n"
+    )
+    assert as_json(Meter.f32, 12.5) == {"value": 12.5, "unit": "V"}
+    assert as_json(Meter.unscaled, 12.5) == {"value": None, "raw": 12.5}
+    assert as_json(Meter.unscaled, math.nan) == {"value": None, "raw": None}
+    assert as_json(Meter.f32, math.inf)["value"] is None
+
+
+@pytest.mark.parametrize(("value", "text"), [(12.345678, "12.345678 raw"), (1_234_567, "1234567 raw")])
+def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, text: str) -> None:
+    assert told(Meter.unscaled, value) == text
+
+
+# ---- what is common in devices ----
+
+
+def test_a_long_register_is_read_where_no_limit_is_stated(attached: Any) -> None:
+    hall, meter, sim = attached
+    sim["total"] = 0x12345
+    assert hall.bus.read(meter, Meter.total) == 0x12345
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
+    declared = [("status", reading(5)), ("control", command(5, span=(0, 7), moves=False))][::order]
+    both = type("Both", (Drive,), dict(declared))
+    hall = Hall(monkeypatch, SimulatedDrive(both(1)))
+    drive = hall.attach(both(1, confirmed=1))
+    assert hall.bus.write(drive, drive.control, 3) == 3
+    assert hall.bus.read(drive, drive.status) == 3
+    reply = hall.sims[0].answer(Message(1, 6, 5, data=bytes([0, 8])), hall.seconds)
+    assert reply is not None
+    assert reply.exception == 3  # the command's span holds
+
+
+def test_a_single_register_of_a_table_that_is_written_several_at_once(attached: Any) -> None:
+    hall, meter, sim = attached
+    assert write_request(meter, Meter.alone, 7) == Message(1, 0x10, 22, 1, bytes([0, 7]))
+    assert hall.bus.write(meter, Meter.alone, 7) == 7
+    assert hall.bus.write(meter, Meter.lamp, 1) == 1
+    assert (sim["alone"], sim["lamp"]) == (7, 1)
+    assert hall.frames[-2][0].function == 0x0F
+
+
+def test_a_step_may_be_negative(attached: Any) -> None:
+    hall, meter, sim = attached
+    assert hall.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
+    assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
+    with pytest.raises(Refused, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
+        hall.bus.write(meter, Meter.downwards, 5)
+
+
+@pytest.mark.parametrize(
+    ("step", "decimals"), [(1, 0), (0.1, 1), (0.01, 2), (100, 0), (1e-7, 7), (-0.05, 2), (2.5, 1), (1e6, 0)]
+)
+def test_a_step_says_how_many_digits_there_are(step: float, decimals: int) -> None:
+    assert reading(1, "V", step=step).decimals == decimals

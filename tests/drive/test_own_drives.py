@@ -1,0 +1,212 @@
+"""A drive of a user's own: what can move its motor is not written by mistake, and its stop always is."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from pathlib import Path
+
+import pytest
+from halls import Hall
+
+from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
+from multidrop.drive.register import Kept, command, reading, setting
+from multidrop.drive.verbs import verb
+from multidrop.errors import Refused
+from multidrop.plant.loader import load_plant
+from multidrop.sim import simulated
+
+
+class Word(IntEnum):
+    STOP = 0
+    RUN = 1
+
+
+class Fan(Drive):
+    """As README declares it."""
+
+    speed = reading(0x10, "rpm")
+    frequency = setting(0x20, "Hz", step=0.1, span=(0, 60))
+
+
+class Pump(Fan):
+    """With a control word, of which its author says nothing, and verbs."""
+
+    control = command(0x30, Word)
+    target = command(0x31, "Hz", step=0.1, span=(0, 60), moves=False)
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start it."""
+        yield from write(self.control, Word.RUN)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop it, as somebody writes it who has not read of `insist`."""
+        yield from write(self.control, Word.STOP)
+
+    @verb
+    def coast(self) -> Script[None]:
+        """Stop it."""
+        yield from insist(self.control, Word.STOP)
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the setpoint."""
+        yield from write(self.target, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Running while it turns."""
+        speed = yield from read(self.speed)
+        return State(Condition.RUNNING if speed else Condition.STOPPED)
+
+
+class Known(Pump):
+    """One that says what it is."""
+
+    kind = reading(0x40)
+    control = command(0x30, Word, harmless=(Word.STOP,))
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Its kind is 0."""
+        if (yield from read(self.kind)) != 0:
+            raise Refused(f"{self.name} is no pump")
+
+
+STOP, RUN = "01 06 00 30 00 00", "01 06 00 30 00 01"
+
+
+def written(hall: Hall) -> list[str]:
+    return [frame[:17] for frame in hall.written]
+
+
+def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = Hall(monkeypatch, simulated(Fan(1)))
+    fan = hall.attach(Fan(1))
+    assert hall.bus.write(fan, fan.frequency, 25.0) == 25.0
+    assert "confirmed" not in Fan.options
+
+
+@pytest.mark.parametrize("confirmed", [0, 1])
+@pytest.mark.parametrize("word", Word)
+def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
+    monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
+) -> None:
+    hall = Hall(monkeypatch, simulated(Pump(1)))
+    pump = hall.attach(Pump(1, name="pump", confirmed=confirmed))
+    with pytest.raises(Refused) as refusal:
+        hall.bus.write(pump, pump.control, word)
+    assert str(refusal.value) == (
+        f"control of pump is not written: {word.name} commands the motor, which verbs alone do: "
+        "use start(), stop()"
+    )
+    assert hall.frames == []
+
+
+def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Bare(Drive):
+        """Has a command and nothing else."""
+
+        level = reading(1)
+        run = command(2)
+
+    hall = Hall(monkeypatch, simulated(Bare(1)))
+    bare = hall.attach(Bare(1, confirmed=1))
+    with pytest.raises(
+        Refused, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
+    ):
+        hall.bus.write(bare, bare.run, 1)
+    assert hall.frames == []
+
+
+def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stoppable(Pump):
+        """Its author says what is harmless."""
+
+        control = command(0x30, Word, harmless=(Word.STOP,))
+
+    hall = Hall(monkeypatch, simulated(Stoppable(1)))
+    pump = hall.attach(Stoppable(1))
+    hall.bus.write(pump, pump.control, Word.STOP)
+    with pytest.raises(Refused, match="RUN commands the motor"):
+        hall.bus.write(pump, pump.control, Word.RUN)
+    assert written(hall) == [STOP]
+
+
+@pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
+def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def command_it(hall: Hall, pump: Pump) -> None:
+        acts = {
+            "start": pump.start,
+            "set_frequency": lambda: pump.set_frequency(20.0),
+            "target": lambda: hall.bus.write(pump, pump.target, 20.0),
+        }
+        acts[name]()
+
+    hall = Hall(monkeypatch, simulated(Pump(1)))
+    pump = hall.attach(Pump(1, name="pump"))
+    with pytest.raises(Refused) as refusal:
+        command_it(hall, pump)
+    assert str(refusal.value) == (
+        f"{name} is not sent to pump: its class has no `identify` that could tell a Pump from another drive, "
+        "to which the same may mean a start; look at its name plate, and declare confirmed = 1"
+    )
+    assert hall.frames == []
+    hall.bus.detach(pump)
+    command_it(hall, hall.attach(Pump(1, confirmed=1)))
+    assert len(hall.written) == 1
+
+
+@pytest.mark.parametrize("name", ["stop", "coast"])
+def test_a_stop_is_never_withheld_for_want_of_a_confirmation(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    hall = Hall(monkeypatch, simulated(Pump(1)))
+    getattr(hall.attach(Pump(1)), name)()
+    assert written(hall) == [STOP]
+
+
+def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = Hall(monkeypatch, simulated(Pump(1)))
+    hall.attach(Pump(1))
+    hall.bus.stop_all()
+    assert written(hall) == [STOP]
+
+
+def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "confirmed" in Pump.options
+    hall = Hall(monkeypatch, simulated(Known(1)))
+    hall.attach(Known(1)).start()
+    assert written(hall) == [RUN]
+
+
+def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Readable(Drive):
+        """Its control word can be read."""
+
+        control = setting(1, Word, moves=True, harmless=(Word.STOP,), kept=Kept.RAM)
+        mode = setting(2, moves=True, kept=Kept.RAM)
+
+    hall = Hall(monkeypatch, simulated(Readable(1)))
+    drive = hall.attach(Readable(1, confirmed=1))
+    for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
+        with pytest.raises(Refused, match="commands the motor"):
+            hall.bus.write(drive, register, value)
+    hall.bus.write(drive, drive.control, Word.STOP)
+    assert len(hall.written) == 1
+
+
+def test_a_plant_file_and_a_command_confirm_it(tmp_path: Path) -> None:
+    (tmp_path / "pump.py").write_text(
+        "from multidrop import Drive, command, reading\n"
+        "class Pump(Drive):\n    speed = reading(1)\n    run = command(2)\n"
+    )
+    (tmp_path / "plant.toml").write_text(
+        '[[line]]\nname = "a"\nport = "/dev/none"\n[[line.drive]]\nname = "p"\nmodel = "pump.py:Pump"\n'
+        "address = 1\nconfirmed = 1\n"
+    )
+    drive = load_plant(tmp_path / "plant.toml").lines[0].drives[0].drive
+    assert drive.option == {"confirmed": 1}

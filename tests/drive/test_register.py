@@ -1,0 +1,137 @@
+"""Registers: scaling that is exact, spans that hold, names that read well."""
+
+from enum import IntEnum, IntFlag
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop.drive import Drive
+from multidrop.drive.register import COIL, Kept, NumberFormat, Register, command, reading, setting
+
+
+class Run(IntEnum):
+    STOP = 1
+    GO = 2
+
+
+class Bits(IntFlag):
+    RUN = 1
+    FAULT = 8
+
+
+class Example(Drive):
+    """A drive for these tests."""
+
+    current = reading(3, "A", step=0.1)
+    unknown = reading(4, "V", step=None)
+    temperature = reading(5, "degC", number_format=NumberFormat.I16)
+    bits = reading(6, Bits)
+    energy = reading(8, "kWh", step=0.01, number_format=NumberFormat.U32)
+    frequency = setting(0x2001, "Hz", step=0.01, span=(0, 400), kept=Kept.RAM)
+    run = command(0x2000, Run)
+    word = command(0x2002, Bits)
+    coil = command(1, table=COIL)
+    coarse = setting(9, "V", step=5)
+    choice = setting(10, span=(0, 2))
+
+
+@pytest.mark.parametrize(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
+def test_a_raw_count_times_a_step_is_the_nearest_number(raw: int, value: float) -> None:
+    assert Example.current.decode(raw) == value
+
+
+def test_names_come_from_the_class() -> None:
+    assert Example.current.name == "current"
+    assert list(Example.registers)[:2] == ["current", "unknown"]
+
+
+def test_an_enumeration_decodes_to_its_member_and_a_stranger_to_its_number() -> None:
+    assert Example.run.decode(2) is Run.GO
+    assert Example.run.decode(9) == 9
+    assert Example.bits.decode(9) == Bits.RUN | Bits.FAULT
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "error"),
+    [
+        (Example.frequency, 400.01, ValueError),
+        (Example.frequency, -0.01, ValueError),
+        (Example.frequency, float("nan"), ValueError),
+        (Example.frequency, float("inf"), ValueError),
+        (Example.frequency, "50", TypeError),
+        (Example.frequency, True, TypeError),
+        (Example.run, 2, TypeError),
+        (Example.word, Bits(2), ValueError),  # a reserved bit
+        (Example.temperature, 40000, ValueError),
+        (Example.coil, 2, ValueError),
+        (Example.coarse, 5 * 65536, ValueError),
+        (Example.unknown, 2.5, ValueError),  # a raw count
+        (Example.choice, 1.5, ValueError),
+    ],
+)
+def test_what_a_register_does_not_take(
+    register: Register[Any], value: object, error: type[Exception]
+) -> None:
+    with pytest.raises(error, match=register.name):
+        register.encode(value)
+
+
+@given(st.integers(0, 40000))
+def test_every_count_survives_the_round_trip(raw: int) -> None:
+    assert Example.frequency.encode(Example.frequency.decode(raw)) == raw
+
+
+@given(st.floats(0, 400))
+def test_encoding_takes_the_nearest_count(value: float) -> None:
+    assert abs(Example.frequency.decode(Example.frequency.encode(value)) - value) <= 0.00501
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "text"),
+    [
+        (Example.current, 2.5, "2.5 A"),
+        (Example.frequency, 50.0, "50.00 Hz"),
+        (Example.unknown, 311, "311 (scale not stated)"),
+        (Example.bits, Bits.RUN | Bits.FAULT, "RUN|FAULT"),
+        (Example.bits, Bits(0), "none"),
+        (Example.run, Run.STOP, "STOP"),
+        (Example.coarse, 15.0, "15 V"),
+    ],
+)
+def test_values_read_well(register: Register[Any], value: object, text: str) -> None:
+    assert register.format(value) == text
+
+
+def test_typed_text_becomes_a_value() -> None:
+    assert Example.frequency.parse("25.5") == 25.5
+    assert Example.run.parse("go") is Run.GO
+    assert Example.word.parse("run|fault") == Bits.RUN | Bits.FAULT
+    with pytest.raises(ValueError, match="number in Hz"):
+        Example.frequency.parse("fast")
+    with pytest.raises(ValueError, match="it takes stop, go"):
+        Example.run.parse("jump")
+    with pytest.raises(ValueError, match="one of"):
+        Example.run.parse("go|stop")
+
+
+def test_how_many_addresses_a_register_takes() -> None:
+    assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
+
+
+def test_an_unknown_register_is_answered_with_its_neighbours() -> None:
+    with pytest.raises(ValueError, match="did you mean current"):
+        Example.register("curent")
+
+
+def test_an_address_outside_the_protocol_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^Far\.frequency: address 10000H is outside 0 to FFFFH$"):
+        type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**400), 1 << 64])
+@pytest.mark.parametrize("name", ["current", "energy", "frequency", "choice", "unknown"])
+def test_a_number_that_no_float_can_hold_is_refused(name: str, number: int) -> None:
+    with pytest.raises(ValueError, match=rf"^{name} "):
+        Example.register(name).encode(number)

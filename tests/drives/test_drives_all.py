@@ -1,0 +1,303 @@
+"""Every family: declarations that hold together, and no verb that does what its document forbids."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable
+from enum import Flag, IntFlag
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import multidrop.drives
+from multidrop.core import Message, build_reply, build_request, parse_reply, parse_request, raw_value
+from multidrop.drive import Condition, Direction, Drive, State, Unsupported
+from multidrop.drive.register import Access, Carrier, NumberFormat, Register, reading
+from multidrop.drive.request import write_request
+from multidrop.drive.verbs import VERBS
+from multidrop.drives import MODELS
+from multidrop.drives.invt_che import CHEStatus
+from multidrop.planning.blocks import blocks
+
+FAMILIES = list(MODELS.values())
+
+family = pytest.mark.parametrize("family", FAMILIES, ids=lambda it: it.model)
+
+
+def registers(wanted: Callable[[Register[Any]], object] = lambda it: True) -> pytest.MarkDecorator:
+    """Runs a test for each register of each family that is wanted."""
+    found = [(family, it) for family in FAMILIES for it in family.registers.values() if wanted(it)]
+    ids = [f"{family.model}-{it.name}" for family, it in found]
+    return pytest.mark.parametrize(("family", "register"), found, ids=ids)
+
+
+def test_the_models_by_name() -> None:
+    assert list(MODELS) == [
+        "erman-er-g-220",
+        "invt-che",
+        "innovert-ibd",
+        "delixi-modbus",
+        "delixi-native",
+        "yd1000",
+    ]
+    assert all(name == it.model for name, it in MODELS.items())
+    assert len({it.title for it in FAMILIES}) == len(FAMILIES)
+
+
+@family
+def test_a_family_says_what_it_is(family: type[Drive]) -> None:
+    assert family.__doc__
+    assert len(family.__doc__) > 500
+    assert family.manual
+    assert family.title
+    assert family.watchdog
+    assert family(family.addresses[0]).name == f"{family.model}@{family.addresses[0]}"
+
+
+@family
+@pytest.mark.parametrize("name", ["start", "jog"])
+@pytest.mark.parametrize("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
+def test_a_direction_is_never_guessed(family: type[Drive], name: str, given: object) -> None:
+    """A word that is no Direction must not turn the motor the other way; nothing is sent."""
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = drive.check_identity = pytest.fail
+    sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
+    for words, named in (((given,), {}), ((), {"direction": given})):
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name)(*words, **named)
+        with pytest.raises(TypeError, match=sentence):
+            getattr(drive, name).script(*words, **named)
+
+
+@family
+@pytest.mark.parametrize("given", ["25", None, True, Direction.FORWARD])
+def test_a_frequency_is_a_number(family: type[Drive], given: object) -> None:
+    drive = family(family.addresses[0], name="pump")
+    drive.perform = drive.check_identity = pytest.fail
+    with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
+        drive.set_frequency(given)  # type: ignore[arg-type]
+
+
+@family
+def test_a_register_is_not_called_as_a_verb_is(family: type[Drive]) -> None:
+    assert not set(family.registers) & set(VERBS)
+    assert not [name for name in family.registers if name in vars(Drive)]
+
+
+@family
+def test_verbs_have_docstrings(family: type[Drive]) -> None:
+    assert all(getattr(family, name).__doc__ for name in (*VERBS, "identify"))
+
+
+@family
+def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
+    """But for a command and the reading that shows it."""
+    places = [
+        (it.table, it.address + at, it.access is Access.COMMAND)
+        for it in family.registers.values()
+        for at in range(it.words)
+    ]
+    assert len(places) == len(set(places))
+
+
+@family
+def test_every_framing_has_its_formats(family: type[Drive]) -> None:
+    assert set(family.formats) == set(family.framings)
+    for framing in family.framings:
+        for format in family.formats[framing]:
+            for baudrate in family.baudrates:
+                drive = family(1, framing=framing, format=format, baudrate=baudrate)
+                assert drive.response_timeout > drive.response_delay
+
+
+@family
+def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None:
+    tables = {it.table for it in family.registers.values()}
+    assert {*family.most_registers, *family.readable_gaps} <= tables
+
+
+@registers()
+def test_a_register_says_where_it_comes_from(family: type[Drive], register: Register[Any]) -> None:
+    assert register.place or register.outside
+    assert family.registers[register.name] is register
+    assert getattr(family, register.name) is register
+
+
+@registers(lambda it: it.span)
+def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
+    family: type[Drive], register: Register[Any]
+) -> None:
+    assert register.span
+    low, high = register.span
+    step = float(register.scale)
+    assert register.decode(register.encode(low)) == low
+    assert register.decode(register.encode(high)) == high
+    for beyond in (low - step, high + step, math.nan, math.inf):
+        with pytest.raises(ValueError, match=register.name):
+            register.encode(beyond)
+
+
+@registers(lambda it: it.span and it.default is not None)
+def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
+    assert register.decode(register.encode(register.default)) == register.default
+
+
+@registers(lambda it: it.values)
+def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
+    assert register.values
+    for member in register.values:
+        assert register.decode(register.encode(member)) is member
+        assert register.parse(register.format(member)) == member
+    if issubclass(register.values, IntFlag):
+        known = sum(member.value for member in register.values)
+        bits = 16 if register.words == 1 else 32
+        for at in range(bits):
+            if not known >> at & 1:
+                with pytest.raises(ValueError, match="reserved"):
+                    register.encode(register.values(1 << at))
+    else:
+        with pytest.raises(TypeError, match=register.name):
+            register.encode(max(it.value for it in register.values) + 1)
+
+
+@registers(lambda it: it.never)
+def test_what_is_never_written_is_not_writable(family: type[Drive], register: Register[Any]) -> None:
+    assert not register.writable
+
+
+@registers(lambda it: it.broadcast)
+def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
+    for raw in register.broadcast:
+        assert family.broadcasts
+        value = register.decode(raw)
+        if isinstance(value, Flag):
+            assert {bit.name for bit in value} <= {"COMMAND_VALID", "FREQUENCY_VALID"}
+        else:
+            assert raw == 0 or value.name == "STOP"
+
+
+@registers(lambda it: it.step is None)
+def test_an_unknown_scale_is_not_written(family: type[Drive], register: Register[Any]) -> None:
+    assert not register.writable
+
+
+@registers(lambda it: not it.values)
+@settings(max_examples=20)
+@given(data=st.data())
+def test_a_raw_count_survives_its_value(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
+    low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)
+    if register.number_format is NumberFormat.I16:
+        low, high = -0x8000, 0x7FFF
+    if register.table.carrier is Carrier.LONG:
+        high = 0xFFFF_FFFF
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    raw = data.draw(st.integers(low, high))
+    value = register.decode(raw)
+    assert register.encode(value) == raw
+    assert register.format(value).startswith(f"{value:.{register.decimals}f}")
+
+
+@registers(lambda it: it.writable)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
+    """Written in any framing, taken by the drive as it stands in the frame, and read back."""
+    drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
+    value = data.draw(_values(register))
+    asked = write_request(drive, register, register.encode(value))
+    frame = build_request(drive.framing, asked)
+    used, taken = parse_request(drive.framing, frame)
+    assert taken is not None
+    assert (used, taken) == (len(frame), asked)
+    if register.table.carrier is Carrier.NUMBER:
+        kept = bytes(2) + taken.start.to_bytes(2, "big")
+    elif register.table.carrier is Carrier.BIT:
+        kept = bytes([taken.data[0] & 1])
+    else:
+        kept = taken.data
+    if register.readable:
+        (block,) = blocks(drive, [register])
+        answer = Message(drive.address, block.request(drive.address).function, block.start, data=kept)
+        frame = build_reply(drive.framing, answer)
+        used, told = parse_reply(drive.framing, frame, block.request(drive.address))
+        assert told is not None
+        assert (used, told.data) == (len(frame), kept)
+    assert register.decode(raw_value(kept, 0, register.number_format)) == value
+
+
+def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
+    """What may be written."""
+    if register.values is not None:
+        members = [
+            it for it in register.values if not any(it & mask == mask for mask in register.never_together)
+        ]
+        return st.sampled_from(members)
+    low, high = 0, (1 << 16 * register.words) - 1
+    if register.number_format is NumberFormat.BIT:
+        high = 1
+    if register.number_format in (NumberFormat.I16, NumberFormat.I32, NumberFormat.I32_SWAPPED):
+        low, high = -(high + 1) // 2, high // 2
+    if register.span is not None:
+        low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)
+    return st.integers(low, high).map(register.decode)
+
+
+@registers(lambda it: it.values is None and it.writable)
+@settings(max_examples=10)
+@given(data=st.data())
+def test_what_is_shown_can_be_typed(
+    family: type[Drive], register: Register[Any], data: st.DataObject
+) -> None:
+    value = data.draw(_values(register))
+    shown = register.format(value).removesuffix(register.unit).strip()
+    assert register.encode(register.parse(shown)) == register.encode(value)
+
+
+def test_drives_import_what_they_may() -> None:
+    for path in Path(multidrop.drives.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            assert not isinstance(node, ast.Import) or all(
+                not it.name.startswith("multidrop") for it in node.names
+            )
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
+                room = node.module.split(".")[1]
+                assert room in {"drive", "register", "drives"}, f"{path.name} imports {node.module}"
+
+
+def test_a_family_without_a_verb_says_so() -> None:
+    class Mute(Drive):
+        """Can only be read."""
+
+        speed = reading(0, "rpm")
+
+    with pytest.raises(ValueError, match=r"^Mute has no option 'rated_frequency'; its options: none$"):
+        Mute(1, rated_frequency=50)
+    for name in VERBS:
+        given = (5.0,) if name == "set_frequency" else ()
+        with pytest.raises(Unsupported, match="the document of Mute has no "):
+            next(getattr(Mute(1), name).script(*given))
+
+
+def test_a_state_is_told_with_all_that_is_known() -> None:
+    said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
+    assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
+    assert str(State(Condition.UNKNOWN)) == "unknown"
+
+
+@family
+def test_a_register_is_no_attribute_to_assign_to(family: type[Drive]) -> None:
+    drive = family(1)
+    name = next(iter(drive.registers))
+    with pytest.raises(
+        AttributeError, match=rf"^{name} is a register, which bus.write\(drive, drive.{name}, VALUE\)"
+    ):
+        setattr(drive, name, 1)
+    assert drive.register(name) is drive.registers[name]

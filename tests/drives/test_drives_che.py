@@ -1,0 +1,289 @@
+"""INVT CHE: its table (CHE100 manual v1.4), and what its verbs send."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import checksums
+import pytest
+from halls import one
+from scripts import Wire, rows, typed
+
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.drive import (
+    Condition,
+    Direction,
+    DriveRefused,
+    NotDone,
+    Refused,
+    State,
+    Unconfirmed,
+    Unsupported,
+)
+from multidrop.drive.register import HOLDING, Kept, NumberFormat
+from multidrop.drives.invt_che import (
+    CHEControl,
+    CHEFault,
+    CHEStatus,
+    CommunicationFault,
+    InvtCHE,
+    parameter,
+    stored_parameter,
+)
+
+FORWARD = "01 06 10 00 00 01 4C CA"
+STOP = "01 06 10 00 00 05 4D 09"
+COAST = "01 06 10 00 00 06 0D 08"
+RESET = "01 06 10 00 00 07 CC C8"
+HALF = "01 06 20 00 13 88 8F 5C"
+ZERO = "01 06 20 00 00 00 82 0A"
+
+STANDBY = {"status": CHEStatus.STANDBY, "fault": CHEFault.NONE, "setpoint": 40.0}
+
+TURNS = {
+    FORWARD: {"status": CHEStatus.FORWARD},
+    "01 06 10 00 00 02 0C CB": {"status": CHEStatus.REVERSE},
+    RESET: {"status": CHEStatus.STANDBY},
+}
+
+TABLE = """
+03/06 1000 control                - CHEControl
+03/06 1001 status                 - CHEStatus
+03/06 2000 setpoint            0.01 %
+03/06 3000 output_frequency    0.01 Hz
+03/06 3001 reference_frequency 0.01 Hz
+03/06 3002 dc_bus_voltage         ? V
+03/06 3003 output_voltage         1 V
+03/06 3004 output_current       0.1 A
+03/06 3005 motor_speed            1 rpm
+03/06 3006 output_power         0.1 %
+03/06 3007 output_torque        0.1 %
+03/06 3008 pid_setpoint         0.1 %
+03/06 3009 pid_feedback         0.1 %
+03/06 300A inputs                 1
+03/06 300B outputs                1
+03/06 300C analog_input_1      0.01 V
+03/06 300D analog_input_2      0.01 V
+03/06 3010 pulse_frequency        ? kHz
+03/06 3012 stage                  1
+03/06 3013 length                 ?
+03/06 3014 counter                1
+03/06 3016 device                 - Device
+03/06 5000 fault                  - CHEFault
+03/06 5001 communication_fault    - CommunicationFault
+"""
+
+
+def test_the_registers_are_those_of_the_che100() -> None:
+    assert rows(InvtCHE) == typed(TABLE)
+    assert all(it.outside for it in InvtCHE.registers.values())
+    signed = {name for name, it in InvtCHE.registers.items() if it.number_format is NumberFormat.I16}
+    assert signed == {"setpoint", "output_power", "output_torque"}
+
+
+def test_numbers() -> None:
+    assert [(it.value, it.name) for it in CHEControl] == [
+        (1, "FORWARD"),
+        (2, "REVERSE"),
+        (3, "JOG_FORWARD"),
+        (4, "JOG_REVERSE"),
+        (5, "STOP"),
+        (6, "COAST"),
+        (7, "RESET_FAULT"),
+        (8, "STOP_JOG"),
+    ]
+    assert [it.value for it in CHEFault] == list(range(24))
+    assert [it.value for it in CommunicationFault] == list(range(9))
+    assert CHEFault(18) is CHEFault.CE_COMMUNICATION
+    assert CHEFault(10) is CHEFault.UV_UNDERVOLTAGE
+
+
+def test_the_line_and_its_limits() -> None:
+    assert str(InvtCHE(247).settings) == "9600 8N1"
+    assert InvtCHE.most_registers == {HOLDING: 16}
+    assert set(InvtCHE.exceptions) == {1, 2, 3, 6, 0x10, 0x11, 0x12, 0x13}
+    assert "PC.04" in InvtCHE.watchdog
+    assert "PC.05" in InvtCHE.watchdog
+
+
+def test_start() -> None:
+    wire = Wire(InvtCHE(1), STANDBY, turns=TURNS)
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start()
+    assert wire.sent == [FORWARD, FORWARD]
+    wire.drive.start(Direction.REVERSE)
+    assert wire.sent[2].startswith("01 06 10 00 00 02")
+
+
+def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None:
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.REVERSE, "setpoint": 40.0})
+    wire.drive.start()
+    wire.drive.jog()
+    assert [it[:17] for it in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
+
+
+def test_stop_waits_for_standby() -> None:
+    wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.FORWARD, CHEStatus.STANDBY]})
+    wire.drive.stop()
+    assert wire.sent == [STOP]
+    assert wire.reads == ["status"] * 3
+
+
+def test_a_jog_that_does_not_stop_is_stopped_as_one() -> None:
+    wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
+    with pytest.raises(Unconfirmed, match="20 s"):
+        wire.drive.stop()
+    assert wire.sent[0] == STOP
+    assert [it[:17] for it in wire.sent[1:]] == ["01 06 10 00 00 08"]
+
+
+def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
+    refusal = DriveRefused("drive", 1, "")
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
+    wire.drive.stop()
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3})
+    with pytest.raises(DriveRefused):
+        wire.drive.stop()
+
+
+def test_coast_and_reset() -> None:
+    wire = Wire(InvtCHE(1), STANDBY)
+    wire.drive.coast()
+    wire.drive.reset_fault()
+    assert wire.sent == [COAST, RESET]
+    wire = Wire(InvtCHE(1), STANDBY, {RESET: [Unconfirmed("drive", "reset", "no reply")]})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [RESET]
+
+
+def test_a_fault_is_reset_before_a_start_and_not_by_it() -> None:
+    says = {**STANDBY, "status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
+    wire = Wire(InvtCHE(1), says, turns=TURNS)
+    for verb in (wire.drive.start, wire.drive.jog):
+        with pytest.raises(Refused, match=r"OC1.*reset_fault"):
+            verb()
+    assert wire.sent == []
+    wire.drive.reset_fault()
+    assert wire.sent == [RESET]
+    stubborn = Wire(InvtCHE(1), says)
+    with pytest.raises(NotDone, match="OC1"):
+        stubborn.drive.reset_fault()
+    assert stubborn.sent == [RESET]
+    with pytest.raises(Refused, match="runs"):
+        Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}).drive.reset_fault()
+
+
+def test_a_trip_while_starting_is_told() -> None:
+    tripped = {"status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
+    wire = Wire(InvtCHE(1), STANDBY, turns={FORWARD: tripped})
+    with pytest.raises(NotDone, match="tripped: OC1"):
+        wire.drive.start()
+    assert wire.sent == [FORWARD]
+
+
+def test_the_setpoint_is_a_percentage_of_the_maximum_frequency() -> None:
+    wire = Wire(InvtCHE(1, maximum_frequency=80))
+    wire.drive.set_frequency(40)
+    wire.drive.set_frequency(0)
+    assert wire.sent == [HALF, ZERO]
+    for wrong in (-0.1, 80.1, float("nan")):
+        with pytest.raises(ValueError, match="0 to 80 Hz"):
+            wire.drive.set_frequency(wrong)
+    wire.held.clear()
+    wire.says["setpoint"] = [30.0]
+    with pytest.raises(NotDone, match=r"30\.00 %"):
+        wire.drive.set_frequency(40)
+    with pytest.raises(Refused, match="maximum_frequency"):
+        Wire(InvtCHE(1)).drive.set_frequency(40)
+
+
+def test_a_negative_setpoint_cannot_be_written_at_all() -> None:
+    with pytest.raises(ValueError, match="0 to 100 %"):
+        InvtCHE.setpoint.encode(-1)
+
+
+@pytest.mark.parametrize(
+    ("says", "state"),
+    [
+        (STANDBY, State(Condition.STOPPED)),
+        ({"status": CHEStatus.FORWARD}, State(Condition.RUNNING, Direction.FORWARD)),
+        ({"status": CHEStatus.REVERSE}, State(Condition.RUNNING, Direction.REVERSE)),
+        (
+            {"status": CHEStatus.FAULT, "fault": CHEFault.OL1_MOTOR_OVERLOAD},
+            State(Condition.FAULT, fault="OL1_MOTOR_OVERLOAD"),
+        ),
+        ({"status": CHEStatus.FAULT, "fault": 99}, State(Condition.FAULT, fault="99")),
+        ({"status": 9}, State(Condition.UNKNOWN, note="1001H = 9 is not explained")),
+    ],
+)
+def test_state(says: dict[str, object], state: State) -> None:
+    assert Wire(InvtCHE(1), says).drive.state() == state
+
+
+def test_identify_refuses_what_is_no_che() -> None:
+    for device in (0x0101, 0x0102):
+        Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
+    with pytest.raises(Refused, match="010AH"):
+        Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
+
+
+def test_a_parameter_of_ones_own_is_written_to_ram() -> None:
+    class Mine(InvtCHE):
+        """A CHE whose owner has its manual."""
+
+        acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
+        way = parameter(13, CHEStatus)
+
+    assert Mine.acceleration_time.ram_address == 0x800C  # as printed in section 11.6.4
+    assert Mine.acceleration_time.kept is Kept.EEPROM
+    assert Mine.acceleration_time.readable
+    assert parameter(58).address == 0x003A
+    assert Mine.way.decode(3) is CHEStatus.STANDBY
+    for wrong in (-1, 512):
+        with pytest.raises(ValueError, match="0 to 511"):
+            parameter(wrong)
+
+
+def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Written where it is kept, and counted; 11.6.2 has the frame, with a value that means nothing here."""
+
+    class Mine(InvtCHE):
+        """A CHE whose owner has its manual."""
+
+        jump = stored_parameter(8, place="P0.08")
+        ramp = parameter(11, "s", step=0.1)
+
+    assert (Mine.jump.kept, Mine.jump.ram_address) == (Kept.EEPROM, None)
+    with pytest.raises(ValueError, match="0 to 511"):
+        stored_parameter(512)
+    ledger = Ledger(tmp_path / "wear", budget=100)
+    hall, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
+    hall.bus.write(drive, drive.ramp, 3.0)
+    assert ledger.wear(hall.seconds) == []
+    hall.bus.write(drive, drive.jump, 0x1388)
+    assert hall.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
+    with pytest.raises(Refused, match="less often"):
+        hall.bus.write(drive, drive.jump, 0x1389)
+    assert sim.counters.eeprom_writes == {"jump": 1}
+
+
+def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
+    jog = checksums.rtu("01 06 10 00 00 03").hex(" ").upper()
+    wire = Wire(
+        InvtCHE(1),
+        STANDBY,
+        turns={**TURNS, jog: {"status": CHEStatus.FORWARD}, STOP: {"status": CHEStatus.STANDBY}},
+    )
+    wire.drive.jog()
+    with pytest.raises(Refused, match=r"may still jog.*call stop\(\) first"):
+        wire.drive.start()
+    wire.drive.stop()
+    wire.drive.start()
+    wire.drive.start()  # while it runs
+    assert wire.sent == [jog, STOP, FORWARD, FORWARD]
+
+
+def test_there_is_no_emergency_stop() -> None:
+    with pytest.raises(Unsupported, match="emergency stop"):
+        Wire(InvtCHE(1)).drive.emergency_stop()

@@ -1,0 +1,82 @@
+"""Mutants are the mistakes they should be, and each that is explained away can still be made."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from mutation.edits import mutants
+
+ROOT = Path(__file__).parents[2]
+EXPLAINED = tomllib.loads((ROOT / "tests" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
+
+C = """\
+static int clamp(int *at, int most) /* not < mutated */
+{
+    if (*at < most)
+        return -1;
+    *at += 0x0F;
+    return most ? 1 : *at;
+}
+"""
+OF_C = {
+    "if (*at <= most)",
+    "if (*at >= most)",
+    "if (!(*at < most))",
+    ";",  # return -1; *at += 0x0F; return most ? 1 : *at;
+    "return 1;",
+    "return 0;",
+    "return -0;",
+    "return -2;",
+    "return -1;",
+    "*at -= 0x0F;",
+    "*at += 16;",
+    "*at += 14;",
+    "return !(most) ? 1 : *at;",
+    "return most ? 2 : *at;",
+    "return most ? 0 : *at;",
+}
+
+PYTHON = '''\
+def most(found: list[int] | None, limit: int = 9) -> int:
+    """Not - mutated."""
+    if not found:
+        return 0
+    at = min(found) + limit  # nor < this
+    return at
+'''
+OF_PYTHON = {
+    "def most(found: list[int] | None, limit: int = 10) -> int:",
+    "def most(found: list[int] | None, limit: int = 8) -> int:",
+    "if found:",
+    "if (not (not found)):",
+    "return 1",
+    "return -1",
+    "pass",
+    "pass # nor < this",
+    "at = max(found) + limit # nor < this",
+    "at = min(found) - limit # nor < this",
+    "return None",
+}
+
+
+@pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
+def test_mistakes_that_are_made(path: str, source: str, made: set[str]) -> None:
+    found = mutants(path, source)
+    assert {it.after for it in found} == made
+    assert len({it.text for it in found}) == len(found)
+    assert {it.function for it in found} == {"clamp" if path == "a.c" else "most"}
+
+
+def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
+    (negated,) = (it.after for it in mutants("a.c", "    if (a\n        || b)\n") if "!(" in it.after)
+    assert negated == "if (!(a || b))"
+
+
+def test_explained_mutants_can_be_made() -> None:
+    files = {it["file"] for it in EXPLAINED}
+    names = {it.name for path in files for it in mutants(path, (ROOT / path).read_text("utf-8"))}
+    for row in EXPLAINED:
+        assert row["why"]
+        assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names

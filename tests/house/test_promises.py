@@ -1,0 +1,64 @@
+"""The page of promises is true: every promise has its row, and everything that is named there exists."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "tests" / "README.md").read_text("utf-8")
+PROMISES = (
+    "the wire is the limit",
+    "the host costs almost nothing",
+    "Python never disturbs the cadence",
+    "many lines",
+    "dead drives cost nothing",
+    "noise costs one exchange",
+    "a late reply is never taken for another's answer",
+    "what is recorded is true",
+    "memory is flat",
+)
+CODE = re.findall(r"`([^`\n]+)`", PAGE)
+FILE = r"(?:tests|bench|csrc|src|docs|\.ci)/[\w./]*\w/?"
+
+
+def rows() -> dict[str, list[str]]:
+    """The first table's cells, by the promise."""
+    table = PAGE.partition("## The promises")[2].partition("\n## ")[0]
+    cells = [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*", table, re.M)
+    ]
+    return {promise: others for promise, *others in cells[2:]}
+
+
+def test_every_promise_has_its_row() -> None:
+    assert tuple(rows()) == PROMISES
+    for _, decided, measured in rows().values():
+        assert re.search(r"`tests/\w+/test_\w+\.py`", decided)
+        assert re.search(r"bench/?\w*", measured)
+
+
+def named(pattern: str) -> list[str]:
+    return sorted({it for code in CODE for it in re.findall(rf"(?<![\w./]){pattern}", code)})
+
+
+@pytest.mark.parametrize("path", named(FILE))
+def test_files_that_are_named_exist(path: str) -> None:
+    assert (ROOT / path).exists()
+
+
+@pytest.mark.parametrize("name", named(r"test_\w+(?![\w.])"))
+def test_tests_that_are_named_exist(name: str) -> None:
+    """In the file that was named last before it."""
+    for before in re.findall(rf"^(.*)`{name}`", PAGE, re.MULTILINE):
+        file = re.findall(r"tests/\w+/test_\w+\.py", before)[-1]
+        assert f"def {name}(" in (ROOT / file).read_text("utf-8")
+
+
+@pytest.mark.parametrize("command", [it for it in CODE if " --" in it and re.search(FILE, it)])
+def test_options_that_are_named_exist(command: str) -> None:
+    (script,) = re.findall(FILE, command)
+    sources = "".join((ROOT / it).read_text("utf-8") for it in (script, "tests/conftest.py"))
+    assert all(f'"{option}"' in sources for option in re.findall(r"--[\w-]+", command))

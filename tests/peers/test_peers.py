@@ -1,0 +1,104 @@
+"""Servers that we did not write, read and written through a drive that a user declares."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from peers import build_with_libmodbus, require_module
+from ptys import linked_ptys
+
+from multidrop.bus import Bus
+from multidrop.cli import main
+from multidrop.drives.registry import find_model
+from multidrop.errors import DriveRefused, NoReply
+
+SERVERS = Path(__file__).parents[1] / "support" / "servers"
+DEVICE = f"{Path(__file__).parents[1] / 'support' / 'device.py'}:Device"
+Device = find_model(DEVICE)
+ADDRESS = 7
+
+
+def libmodbus(built: Path) -> list[str]:
+    return [str(build_with_libmodbus(SERVERS / "libmodbus_server.c", built)), "PORT", str(ADDRESS)]
+
+
+def pymodbus(framing: str) -> list[str]:
+    require_module("pymodbus")
+    return [sys.executable, str(SERVERS / "pymodbus_server.py"), "PORT", str(ADDRESS), framing]
+
+
+COMMANDS: dict[str, Callable[[Path], list[str]]] = {
+    "libmodbus rtu": libmodbus,
+    "pymodbus rtu": lambda _: pymodbus("rtu"),
+    "pymodbus ascii": lambda _: pymodbus("ascii"),
+}
+
+
+@pytest.fixture(params=COMMANDS)
+def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str, str]]:
+    """Our port, with the server behind it, and the framing that it speaks."""
+    command = COMMANDS[request.param](tmp_path)
+    with linked_ptys() as (theirs, ours):
+        started = [theirs if word == "PORT" else word for word in command]
+        with subprocess.Popen(started, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            yield ours, request.param.split()[1]
+            process.kill()
+
+
+def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
+    port, framing = server
+    with Bus(port) as bus:
+        device = bus.attach(Device, ADDRESS, framing=framing)
+        assert bus.read_many(device, Device.registers.values()) == {
+            "current": 101.0,  # input register 10 holds 1010
+            "voltage": 1011,
+            "temperature": 1012,
+            "frequency": 10.2,  # holding register 20 holds 1020
+            "energy": (1022 << 16 | 1023) / 100,
+            "relay": 1,  # coil 5
+            "door": 1,
+        }
+
+
+def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
+    port, framing = server
+    with Bus(port) as bus:
+        device = bus.attach(Device, ADDRESS, framing=framing)
+        for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
+            assert bus.write(device, device.register(name), value) == value
+
+
+def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
+    port, framing = server
+    with Bus(port) as bus:
+        device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS, framing=framing)
+        with pytest.raises(DriveRefused, match="illegal address") as refusal:
+            bus.read(device, device.register("absent"))
+        assert refusal.value.code == 2
+
+
+def test_another_address_is_silence(server: tuple[str, str]) -> None:
+    port, framing = server
+    with Bus(port) as bus:
+        device = bus.attach(Device, ADDRESS + 1, framing=framing)
+        with pytest.raises(NoReply):
+            bus.read(device, device.register("current"))
+
+
+def test_the_command_line_reads_and_writes_it_too(
+    server: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    port, framing = server
+    where = [port, DEVICE, str(ADDRESS), "--framing", framing]
+    assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0
+    assert main(["read", *where, "frequency", "current"]) == 0
+    shown = capsys.readouterr().out
+    assert "frequency = 31.40 Hz" in shown
+    assert ["frequency", "31.40", "Hz"] in map(str.split, shown.splitlines())
+    assert ["current", "101.0", "A"] in map(str.split, shown.splitlines())

@@ -1,0 +1,341 @@
+"""Plans: never over a limit, never into what the document forbids, never dearer than brute force."""
+
+import math
+from collections.abc import Iterator
+from itertools import permutations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from multidrop.core import Framing, Message, build_request, reply_length
+from multidrop.drive import Drive
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    NumberFormat,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
+from multidrop.drive.request import write_request
+from multidrop.drives import MODELS
+from multidrop.planning.blocks import Block, blocks, plan, planned
+from multidrop.planning.bus_time import duration, gap, in_order, sending
+
+
+class Example(Drive):
+    """Room for four registers in a read, reserved addresses readable up to 20."""
+
+    most_registers = {HOLDING: 4, INPUT: 2}
+    readable_gaps = {HOLDING: range(0, 21)}
+    a = reading(1)
+    b = reading(2)
+    c = reading(4)
+    d = reading(5, number_format=NumberFormat.U32)
+    far = reading(30)
+    farther = reading(32)
+    state_1 = reading(1, table=INPUT)
+    state_2 = reading(2, table=INPUT)
+    state_3 = reading(3, table=INPUT)
+    coil = setting(3, table=COIL)
+    long = setting(40, number_format=NumberFormat.U32)
+    swapped = setting(42, number_format=NumberFormat.I32_SWAPPED)
+    run = command(0x2000)
+
+
+def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
+    return [(it.start, it.count) for it in blocks(drive, [drive.register(name) for name in names])]
+
+
+def test_neighbours_are_read_together_up_to_the_limit() -> None:
+    drive = Example(1)
+    assert spans(drive, "a", "b") == [(1, 2)]
+    assert spans(drive, "a", "b", "c") == [(1, 4)]
+    assert spans(drive, "a", "b", "c", "d") in ([(1, 2), (4, 3)], [(1, 4), (5, 2)])
+    assert spans(drive, "state_1", "state_2", "state_3") in ([(1, 2), (3, 1)], [(1, 1), (2, 2)])
+
+
+def test_forbidden_addresses_are_never_read_across() -> None:
+    assert spans(Example(1), "far", "farther") == [(30, 1), (32, 1)]
+
+
+def test_order_and_repetition_do_not_matter() -> None:
+    assert spans(Example(1), "c", "a", "b", "a") == [(1, 4)]
+
+
+def test_what_cannot_be_read_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"run of .* cannot be read: it is a command"):
+        blocks(Example(1), [Example.run])
+
+
+def test_requests_are_the_standard_s() -> None:
+    (block,) = blocks(Example(7), [Example.a, Example.b])
+    assert block.request(7) == Message(7, 3, 1, 2)
+    assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
+    assert write_request(Example(7), Example.run, 2) == Message(7, 6, 0x2000, data=b"\0\2")
+    assert write_request(Example(7), Example.long, 0x1_0002) == Message(7, 16, 40, 2, b"\0\1\0\2")
+    assert write_request(Example(7), Example.swapped, -2) == Message(7, 16, 42, 2, b"\xff\xfe\xff\xff")
+    with pytest.raises(ValueError, match="cannot be written"):
+        write_request(Example(7), Example.a, 1)
+
+
+def test_a_block_takes_its_characters_silence_and_delay() -> None:
+    drive = Example(1, baudrate=9600, format="8N1")
+    (block,) = blocks(drive, [Example.a])
+    characters = 8 + 7
+    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit more, for a second stop bit
+    expected = characters * 10 / 9600 + silence + drive.response_delay
+    assert duration(drive, block) == pytest.approx(expected)
+
+
+def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
+    class Sparse(Drive):
+        """Nothing may be read that is not declared."""
+
+        most_registers = {HOLDING: 10}
+        low = reading(1)
+        between = reading(2)
+        high = reading(3)
+        order = command(4)
+        beyond = reading(5)
+
+    assert spans(Sparse(1), "low", "high") == [(1, 3)]
+    assert spans(Sparse(1), "high", "beyond") == [(3, 1), (5, 1)]
+
+
+def test_each_rate_has_blocks_of_its_own() -> None:
+    drive = Example(1)
+    found = planned(drive, [(Example.a, 0.1), (Example.b, None), (Example.c, 0.1)])
+    assert [(it.block.start, it.block.count, it.every) for it in found] == [(1, 4, 0.1), (2, 1, None)]
+
+
+# ---- against all other plans ----
+
+
+def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[float]]]]:
+    if not registers:
+        yield []
+    for end in range(1, len(registers) + 1):
+        for rest in partitions(registers[end:]):
+            yield [registers[:end], *rest]
+
+
+def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float | None = None) -> float:
+    """By trying every way to cut the sorted registers of one table into requests."""
+    table = registers[0].table
+    limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
+    readable = {at for it in drive.registers.values() if it.table == table and it.readable for at in span(it)}
+    best = float("inf")
+    for cut in partitions(sorted(registers, key=lambda it: it.address)):
+        total = 0.0
+        for group in cut:
+            start, end = group[0].address, max(it.address + it.words for it in group)
+            legal = all(at in readable or at in gaps for at in range(start, end))
+            if len(group) > 1 and (end - start > limit or not legal):
+                break
+            total += duration(drive, Block(table, start, end - start, tuple(group)), delay)
+        else:
+            best = min(best, total)
+    return best
+
+
+def span(register: Register[float]) -> range:
+    return range(register.address, register.address + register.words)
+
+
+@settings(max_examples=150)
+@given(
+    st.dictionaries(st.integers(0, 17).map(lambda half: 2 * half), st.booleans(), min_size=1, max_size=7),
+    st.sampled_from([1200, 9600, 38400, 115200]),
+    st.sampled_from([Framing.RTU, Framing.ASCII]),
+)
+def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
+    """Pairs of words and single ones, some side by side, and reserved addresses between them."""
+    registers = {
+        f"r{address}": reading(address, number_format=NumberFormat.U32 if pair else NumberFormat.U16)
+        for address, pair in pairs.items()
+    }
+    kind = type(
+        "Random",
+        (Drive,),
+        {
+            **registers,
+            "__doc__": "Drawn by lot.",
+            "framings": (framing,),
+            "most_registers": {HOLDING: 5},
+            "readable_gaps": {HOLDING: range(0, 21)},
+        },
+    )
+    drive = kind(1, baudrate=baudrate)
+    found = blocks(drive, registers.values())
+    assert sorted(it.name for block in found for it in block.registers) == sorted(registers)
+    assert all(block.start <= it.address for block in found for it in block.registers)
+    assert all(
+        it.address + it.words <= block.start + block.count for block in found for it in block.registers
+    )
+    total = sum(duration(drive, block) for block in found)
+    assert total == pytest.approx(cheapest_of_all(drive, list(registers.values())))
+
+
+class Scattered(Drive):
+    """Registers with gaps of many lengths between them, all of which may be read."""
+
+    framings = (Framing.RTU, Framing.ASCII)
+    most_registers = {HOLDING: 90}
+    readable_gaps = {HOLDING: range(2000)}
+    addresses_of = (0, 1, 9, 40, 41, 60, 61, 62, 90, 140)
+    r0, r1, r2, r3, r4, r5, r6, r7, r8, r9 = (reading(address) for address in addresses_of)
+
+
+@settings(max_examples=200)
+@given(
+    st.sets(st.sampled_from(list(Scattered.registers.values())), min_size=1, max_size=8),
+    st.sampled_from([1200, 9600, 38400, 115200]),
+    st.sampled_from([Framing.RTU, Framing.ASCII]),
+    st.floats(0, 0.2),
+    st.floats(0, 1),
+)
+def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
+    wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
+) -> None:
+    drive = Scattered(1, baudrate=baudrate, framing=framing)
+    registers = sorted(wanted, key=lambda register: register.address)
+    found = plan(drive, [(register, None) for register in registers], delay)
+
+    def excess(at: float) -> float:
+        """Seconds by which another plan is quicker at this response delay."""
+        own = sum(duration(drive, one.block, at) for one in found.planned)
+        return own - cheapest_of_all(drive, registers, at)
+
+    assert found.suits(delay)
+    most = min(found.most, 10.0)
+    for inside in (found.least, found.least + part * (most - found.least), most):
+        assert excess(inside) == pytest.approx(0, abs=1e-9)
+    for outside in (found.least - 1e-4, found.most + 1e-4):
+        if 0 <= outside < math.inf:
+            assert not found.suits(outside)
+            assert excess(outside) > 1e-6
+
+
+def test_a_plan_of_several_rates_suits_the_delays_that_suit_each() -> None:
+    drive = Scattered(1, baudrate=9600)
+    rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
+    apart = [plan(drive, [(it, every) for it in registers], 0.02) for every, registers in rates.items()]
+    together = plan(drive, [(it, every) for every, registers in rates.items() for it in registers], 0.02)
+    assert len({(one.least, one.most) for one in apart}) == 2
+    assert together.least == max(one.least for one in apart)
+    assert together.most == min(one.most for one in apart)
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+@pytest.mark.parametrize("table", [HOLDING, INPUT, COIL, DISCRETE])
+def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Table) -> None:
+    drive = Example(1)
+    drive.framing = framing
+    for count in range(1, 126):
+        block = Block(table, 0, count, ())
+        request = block.request(1)
+        if framing is Framing.DELIXI:
+            request = Message(1, 7, 0, data=bytes(4))
+        frames = len(build_request(framing, request)) + reply_length(framing, request)
+        assert sending(drive, block) == pytest.approx(frames * drive.settings.character)
+
+
+FORBIDDEN = {  # addresses of which the documents do not say that they can be read, within the tables
+    "erman-er-g-220": {"holding register": (89, 0xFFFF), "input register": (0x1000, 0xFFFF)},
+    "invt-che": {"holding register": (0x1000, 0x1000, 0x3017, 0x4FFF, 0x5002, 0xFFFF)},
+    "innovert-ibd": {"holding register": (0, 2, 5, 21, 0x2000, 0x2001)},
+}
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
+    model = data.draw(st.sampled_from(sorted(MODELS)))
+    family = MODELS[model]
+    tables: dict[Table, list[Register[float]]] = {}
+    for register in family.registers.values():
+        if register.readable:
+            tables.setdefault(register.table, []).append(register)
+    registers = data.draw(st.sampled_from([*tables.values()]))
+    first = data.draw(st.integers(0, len(registers) - 1))
+    near = registers[first : first + 12]  # so that some can share a request
+    wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
+    drive = family(
+        1,
+        framing=data.draw(st.sampled_from(family.framings)),
+        baudrate=data.draw(st.sampled_from(family.baudrates)),
+    )
+    found = blocks(drive, wanted)
+    assert {it.name for block in found for it in block.registers} == {it.name for it in wanted}
+    assert sum(duration(drive, it) for it in found) == pytest.approx(cheapest_of_all(drive, wanted))
+    for block in found:
+        bounds = FORBIDDEN.get(model, {}).get(block.table.name, ())
+        forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
+        asked = range(block.start, block.start + block.count)
+        assert not any(at in part for at in asked for part in forbidden)
+        if model.startswith(("delixi", "yd1000")):  # their documents show reads of one register only
+            assert len(block.registers) == 1
+
+
+# ---- the order of a bus cycle ----
+
+
+def silences(order: list[Drive], switching: float = 0.0) -> float:
+    return sum(gap(order[at - 1], drive, switching) for at, drive in enumerate(order))
+
+
+@st.composite
+def companies(draw: st.DrawFn) -> list[Drive]:
+    """Up to six drives of any families, with any settings."""
+    kinds = draw(st.lists(st.sampled_from(sorted(MODELS)), min_size=1, max_size=6))
+    return [
+        MODELS[kind](
+            address,
+            framing=draw(st.sampled_from(MODELS[kind].framings)),
+            baudrate=draw(st.sampled_from(MODELS[kind].baudrates)),
+        )
+        for address, kind in enumerate(kinds, 1)
+    ]
+
+
+@settings(max_examples=100)
+@given(companies())
+def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
+    order = in_order(drives)
+    assert sorted(it.address for it in order) == [it.address for it in drives]
+    least = min(silences([drives[0], *rest]) for rest in permutations(drives[1:]))
+    assert silences(order) == pytest.approx(least, abs=1e-8)
+
+
+def test_where_switching_takes_time_it_is_done_seldom() -> None:
+    families = ("invt-che", "delixi-modbus", "innovert-ibd")
+    drives = [
+        MODELS[model](address, baudrate=baudrate)
+        for address, (model, baudrate) in enumerate(
+            ((model, baudrate) for baudrate in (9600, 19200, 38400) for model in families), 1
+        )
+    ]
+    order = in_order(drives, switching=0.05)
+    switches = [it.settings != order[at - 1].settings for at, it in enumerate(order)]
+    assert sum(switches) == len({it.settings for it in drives})
+    assert silences(order, 0.05) < silences(drives, 0.05)
+
+
+def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
+    slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
+    longer = 24 * 11 / 9600 + 1 / 9600
+    assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
+    assert gap(fast, slow, switching=0.002) == pytest.approx(longer + 0.002)
+    assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
+
+
+def test_what_has_no_read_function_is_no_block() -> None:
+    table = Table("command word", None, 0x06)
+    with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
+        Block(table, 0, 1, ()).request(1)

@@ -1,0 +1,269 @@
+"""Predictions: against frame lengths counted by hand, and what must be true of any line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from line_driver import LineDriver
+
+from multidrop.bus import exchange
+from multidrop.core import Peer, build_reply
+from multidrop.drive import Drive, Framing
+from multidrop.drive.register import HOLDING, reading
+from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.planning.blocks import Planned, planned
+from multidrop.planning.bus_time import in_order
+from multidrop.planning.prediction import LATENESS
+from multidrop.planning.prediction import predict as predict_with_host
+from multidrop.planning.schedule import TURN_SHARE
+from multidrop.planning.suggestions import Remedies, duration_text, remedies
+from multidrop.sim import EncodedDrive
+
+BIT = 1 / 9600
+predict = partial(predict_with_host, lateness=0.0)
+
+
+class Simple(Drive):
+    """Four registers in two requests."""
+
+    title = "SIMPLE"
+    baudrates = (9600, 19200, 38400)
+    most_registers = {HOLDING: 2}
+    response_delay = 4e-3
+    a = reading(1)
+    b = reading(2)
+    c = reading(11)
+    d = reading(12)
+
+
+OWN = (8 + 9) * 10 * BIT + 4e-3  # request and reply of two registers, 8N1
+SILENCE = 3.5 * 10 * BIT + BIT
+
+
+def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned]:
+    registers = [drive.register(name) for name in names] or drive.readings()
+    return planned(drive, [(register, every) for register in registers])
+
+
+def test_a_cycle_is_characters_delays_and_silences() -> None:
+    drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
+    found = predict([it for drive in drives for it in asked(drive)])
+    assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
+    assert found.utilisation == 1
+    assert [(it.requests, len(it.registers)) for it in found.rates] == [(2, 4), (2, 4)]
+    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 2)
+    assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
+
+
+def test_a_shorter_silence_is_reckoned_with() -> None:
+    usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
+    cycles = [predict(asked(it, None, "output_current")).cycle for it in (usual, short)]
+    assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
+
+
+def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
+    """Of three gaps two are the IBD's, whatever t3.5 is at the other drives' baud rate."""
+    che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
+    exchanges = [asked(it, None, "output_current") for it in (che, other, ibd)]
+    found = predict([it for each in exchanges for it in each])
+    own = 3 * (8 + 7) * 10 * BIT + 2 * che.response_delay + ibd.response_delay
+    assert found.cycle == pytest.approx(own + 2 * (10e-3 + BIT) + SILENCE)
+
+
+def test_each_switch_of_settings_adds_its_time() -> None:
+    drives = [ErmanERG220(1), YD1000(2), ErmanERG220(3)]
+    exchanges = [it for drive in drives for it in asked(drive, None, "output_frequency")]
+    free, dear = predict(exchanges), predict(exchanges, switching=0.01)
+    assert dear.cycle - free.cycle == pytest.approx(2 * 0.01)
+    assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
+
+
+def test_a_remedy_reckons_with_the_switching() -> None:
+    drives = [ErmanERG220(1), YD1000(2)]
+    exchanges = [it for drive in drives for it in asked(drive, 0.06, "output_frequency")]
+    periods = []
+    for switching in (0.0, 0.05):
+        found = remedies(exchanges, predict(exchanges, switching=switching), switching)
+        assert found.every is not None
+        periods.append(found.every[0][1])
+        changed = [it for drive in drives for it in asked(drive, periods[-1], "output_frequency")]
+        assert predict(changed, switching=switching).fits
+    assert periods[1] > periods[0]
+
+
+def test_measured_delays_take_the_place_of_the_document_s() -> None:
+    one, two = Simple(1), Simple(2)
+    exchanges = [*asked(one), *asked(two)]
+    assert predict(exchanges, {one: 9e-3}).cycle == pytest.approx(predict(exchanges).cycle + 2 * 5e-3)
+
+
+def test_slow_rates_leave_the_rest_of_the_line_to_the_others() -> None:
+    timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
+    found = predict([*asked(timed, 0.1), *asked(eager)])
+    load = 2 * (OWN + SILENCE) / 0.1
+    assert [it.reached for it in found.rates] == pytest.approx([10, (1 - load) / (2 * (OWN + SILENCE))])
+    assert found.fits
+    assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
+
+
+def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
+    drives = [Simple(address, format="8N1") for address in range(1, 5)]
+    found = predict([it for drive in drives for it in asked(drive, 0.05)])
+    assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
+    assert not found.fits
+    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
+
+
+def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> None:
+    hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
+    found = predict([*asked(hasty, 0.02), *asked(eager)])
+    assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", True)]
+    assert found.rates[1].reached == pytest.approx(TURN_SHARE / (2 * (OWN + SILENCE)))
+    assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
+
+
+def test_a_host_is_late_in_each_exchange() -> None:
+    exchanges = [*asked(Simple(1)), *asked(Simple(2))]
+    assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
+
+
+# ---- against the core's own line, on a clock that only the test moves ----
+
+
+def carried_out(exchanges: Sequence[Planned]) -> float:
+    """Seconds of a bus cycle in which every drive answers after its document's delay."""
+    drives = in_order(dict.fromkeys(it.drive for it in exchanges))
+    order = [it for drive in drives for it in exchanges if it.drive is drive]
+    peers = {it: Peer(least_timeout=0.02, most_timeout=it.response_timeout) for it in drives}
+    made = [exchange(it.drive, it.block.request(it.drive.address), peers[it.drive]) for it in order]
+    answers = [EncodedDrive(it.drive).answer(it.block.request(it.drive.address), 0) for it in order]
+    line = LineDriver()
+    begun = []
+    for _ in range(3):
+        begun.append(line.now)
+        for planned_, asked_, answer in zip(order, made, answers, strict=True):
+            assert answer is not None
+            reply = build_reply(planned_.drive.framing, answer)
+            line.begin(asked_)
+            request = line.wait_until_write()
+            characters = len(request) + len(reply)
+            own = characters * planned_.drive.settings.character + planned_.drive.response_delay
+            line.now += round(own * 1e9)
+            assert line.listens
+            line.receive(reply)
+            assert line.want == "done"
+            assert line.completion.result == len(reply)
+    return (begun[2] - begun[1]) / 1e9
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(sorted(MODELS)), st.integers(0, 2), st.integers(1, 6)),
+        min_size=1,
+        max_size=8,
+    )
+)
+def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, int]]) -> None:
+    exchanges: list[Planned] = []
+    for address, (model, framing, count) in enumerate(wanted, 1):
+        family = MODELS[model]
+        drive = family(address, framing=family.framings[framing % len(family.framings)])
+        exchanges += planned(drive, [(it, None) for it in drive.readings()[:count]])
+    assert carried_out(exchanges) == pytest.approx(predict(exchanges).cycle, rel=1e-5)
+
+
+PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
+
+
+@pytest.mark.story
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
+def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | None]]) -> None:
+    """What is reached, each exchange with its own characters and delay alone, fits into a second."""
+    exchanges: list[Planned] = []
+    for address, (model, every) in enumerate(wanted, 1):
+        drive = MODELS[model](address)
+        exchanges += planned(drive, [(it, every) for it in drive.readings()[:4]])
+    found = predict(exchanges)
+    alone = {rate: predict([it for it in exchanges if it.drive is rate.drive]).cycle for rate in found.rates}
+    assert sum(rate.reached * cycle for rate, cycle in alone.items()) <= 1.01
+    for rate in found.rates:
+        assert rate.every is None or rate.reached * rate.every <= 1.01
+
+
+# ---- what would make it fit ----
+
+
+def with_remedy(drives: list[Drive], found: Remedies, every: float, which: str) -> list[Planned]:
+    if which == "every":
+        assert found.every is not None
+        ((old, new),) = found.every
+        assert old == every < new
+        return [it for drive in drives for it in asked(drive, new)]
+    if which == "baudrate":
+        assert found.baudrate is not None
+        baudrate, these = found.baudrate
+        assert list(these) == drives
+        faster = [type(it)(it.address, baudrate=baudrate) for it in drives]
+        return [it for drive in faster for it in asked(drive, every)]
+    assert found.registers is not None
+    kept = [it.name for it in drives[0].readings()[: found.registers]]
+    return [it for drive in drives for it in asked(drive, every, *kept)]
+
+
+@pytest.mark.parametrize("which", ["every", "baudrate", "registers"])
+def test_each_remedy_makes_it_fit(which: str) -> None:
+    drives: list[Drive] = [Simple(address, name=f"drive-{address}") for address in range(1, 5)]
+    exchanges = [it for drive in drives for it in asked(drive, 0.15)]
+    prediction = predict(exchanges)
+    assert not prediction.fits
+    found = remedies(exchanges, prediction)
+    assert predict(with_remedy(drives, found, 0.15, which)).fits
+
+
+def test_a_remedy_is_no_larger_than_needed() -> None:
+    drive = Simple(1)
+    exchanges = asked(drive, 0.045)  # two exchanges take 51 ms
+    found = remedies(exchanges, predict(exchanges))
+    assert found.every is not None
+    assert found.every[0][1] <= 0.056
+    assert found.baudrate is not None
+    assert found.baudrate[0] == 19200
+    assert found.registers == 2  # one request
+
+
+def test_where_nothing_helps_that_is_said() -> None:
+    drive = YD1000(1)
+    exchanges = asked(drive, 0.001, "output_frequency")
+    found = remedies(exchanges, predict(exchanges))
+    assert found.baudrate is None
+    assert found.registers is None
+    assert "baudrate" not in str(found)
+    assert "every" in str(found)
+    nothing = "no lower rate, higher baud rate or smaller number of registers makes it fit"
+    assert str(Remedies(None, None, None)) == nothing
+
+
+def test_a_duration_is_told_as_a_plant_file_has_it() -> None:
+    assert [duration_text(it) for it in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
+
+
+def test_framing_counts() -> None:
+    rtu, text = InnovertIBD(1), InnovertIBD(1, framing=Framing.ASCII)
+    ascii_own = (17 + 15 + 1.5) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n"
+    assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
+    assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
+
+
+def test_remedies_are_told_in_a_sentence() -> None:
+    every = 'every = "100 ms" instead of 50 ms'
+    found = Remedies(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
+    assert str(found) == (
+        f"it would fit with {every}, or baudrate = 19200 for fan-1, fan-2, "
+        "or at most 3 of these registers for each drive"
+    )

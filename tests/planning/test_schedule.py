@@ -1,0 +1,717 @@
+"""The schedule, with a clock that the tests hold in their hands."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from multidrop.planning.schedule import FIRST_REST_NS, LONGEST_REST_NS, TURN_SHARE, Job, Schedule
+
+MS = 1_000_000
+
+
+def job(drive: int = 1, period_ms: int | None = None, duration_ms: int = 5, kind: int = 0) -> Job:
+    period_ns = None if period_ms is None else period_ms * MS
+    return Job(drive=drive, period_ns=period_ns, duration_ns=duration_ms * MS, kind=kind)
+
+
+def schedule(*jobs: Job) -> Schedule[Job]:
+    made: Schedule[Job] = Schedule()
+    for it in jobs:
+        made.add(it, 0)
+    return made
+
+
+def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> list[tuple[Job, int]]:
+    """From an idle line: the jobs, each with the ms before which it is not to be sent."""
+    now = now_ms * MS
+    return [(it, not_before // MS) for it, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)]
+
+
+def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, int]]:
+    """On a line that takes what it is given, one job at a time: each with its slot and when it was sent."""
+    at, done = 0, []
+    while at < seconds * 1000 * MS:
+        ((it, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
+        sent = max(at, not_before)
+        done.append((it, due, sent))
+        at = sent + it.duration_ns
+    return done
+
+
+def fail(made: Schedule[Job], drive: int, failures: int, now_ms: int, late_until_ms: int = 0) -> None:
+    made.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
+
+
+def test_a_period_keeps_its_own_grid_whenever_it_is_planned() -> None:
+    made = schedule(poll := job(period_ms=20))
+    planned = [due for now in range(0, 1000, 37) for _, due in take(made, now, 100)]
+    assert planned == list(range(0, planned[-1] + 1, 20))
+    assert poll.skipped == 0
+
+
+def test_after_a_stall_slots_are_counted_and_not_made_up_for() -> None:
+    made = schedule(poll := job(period_ms=20))
+    assert take(made, 0, 1) == [(poll, 0)]
+    assert take(made, 110, 1) == [(poll, 100)]  # 20, 40, 60 and 80 are over
+    assert poll.skipped == 4
+    assert take(made, 111, 10) == [(poll, 120)]
+
+
+def test_what_the_line_will_be_too_late_for_is_not_queued() -> None:
+    """It is busy for so long already with what it was given."""
+    made = schedule(poll := job(period_ms=20))
+    assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
+    assert poll.skipped == 5
+
+
+def test_the_slot_that_ends_first_goes_first_and_the_others_fill_in_turn() -> None:
+    timed, late = job(1, 40), job(2, 60)
+    first, second, third = job(3), job(4), job(5)
+    made = schedule(first, late, second, timed, third)
+    planned = [it for it, _ in take(made, 0, 40)]
+    assert planned == [timed, late, first, second, third, first, second, third]
+    assert [it for it, _ in take(made, 40, 10)] == [timed, first]
+
+
+def test_slow_jobs_that_are_due_together_do_not_block_a_fast_one() -> None:
+    slow = [job(drive, 1000, duration_ms=20) for drive in range(2, 32)]
+    made = schedule(*slow, fast := job(1, 50, duration_ms=10))
+    done = carry_out(made, 10)
+    waited = [sent - due for it, due, sent in done if it is fast]
+    assert len(waited) == pytest.approx(200, abs=1)
+    assert max(waited) <= 20 * MS  # until the one that is on the line is over
+    assert [it.skipped for it in made.jobs] == [0] * 31
+
+
+def test_of_a_line_that_is_asked_for_too_much_everybody_gets_a_part() -> None:
+    fast = [job(drive, 20, duration_ms=10) for drive in (1, 2, 3)]
+    slow = [job(drive, 1000, duration_ms=10) for drive in (4, 5)]
+    turn = [job(drive, duration_ms=10) for drive in (6, 7)]
+    made = schedule(*turn, *fast, *slow)
+    done = carry_out(made, 100)
+    counts = {it: sum(1 for other, _, _ in done if other is it) for it in made.jobs}
+    assert [counts[it] for it in slow] == pytest.approx([100, 100], abs=1)  # those that are asked for little
+    assert max(counts[it] for it in fast) - min(counts[it] for it in fast) <= 2
+    assert sum(counts[it] for it in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
+    assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
+    for it in (*fast, *slow):  # every slot was asked for, or is counted
+        slots = 100_000 * MS // (it.period_ns or 1)
+        assert counts[it] + it.skipped == pytest.approx(slots, abs=1)
+
+
+def test_jobs_in_turn_have_their_share_from_the_start_of_an_overload() -> None:
+    made = schedule(turn := job(1, duration_ms=10))
+    take(made, 0, 10_000)  # it had the line for itself
+    for drive in (2, 3):
+        made.add(job(drive, 10, duration_ms=10), 10_000 * MS)
+    taken = [it for it, _ in take(made, 10_000, 3_000)]
+    assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
+
+
+def test_a_share_that_nobody_wanted_is_not_saved_up() -> None:
+    made = schedule(job(1, 10, duration_ms=10))
+    take(made, 0, 10_000)
+    made.add(turn := job(2, duration_ms=10), 10_000 * MS)
+    assert [it for it, _ in take(made, 10_000, 100)].count(turn) <= 1
+
+
+def test_where_deadlines_allow_it_jobs_of_one_kind_go_together() -> None:
+    jobs = [job(drive, 210, duration_ms=10, kind=drive % 2) for drive in range(1, 21)]
+    done = carry_out(schedule(*jobs), 20)
+    switches = sum(one.kind != other.kind for (one, _, _), (other, _, _) in pairwise(done))
+    assert switches < len(done) / 5  # about two in each round of twenty
+    assert [it.skipped for it in jobs] == [0] * 20
+
+
+def test_a_slot_that_is_about_to_end_goes_before_its_kind() -> None:
+    made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
+    made.take(0, 0, 1, 1)
+    waited = [sent - due for it, due, sent in carry_out(made, 1) if it is one]
+    assert max(waited) < 30 * MS
+    assert one.skipped == 0
+
+
+def test_a_job_in_turn_is_not_begun_twice_while_others_wait() -> None:
+    jobs = [job(drive) for drive in range(5)]
+    made = schedule(*jobs)
+    assert [it for it, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
+    assert [it for it, _ in take(made, 0, 10)] == jobs[2:4]
+
+
+def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
+    """Else those at its end would never be asked."""
+    jobs = [job(drive) for drive in range(5)]
+    made = schedule(*jobs)
+    assert made.cycle(0) == jobs
+    made.go_on(jobs[3])
+    fail(made, 0, 1, now_ms=0)
+    assert made.cycle(0) == []
+    assert [it for it, _ in take(made, 0, 15)] == [jobs[3], jobs[4], jobs[0]]
+    fail(made, 0, 0, now_ms=15)
+    assert made.cycle(15 * MS) == [*jobs[1:], jobs[0]]
+    made.remove(jobs[2])
+    made.go_on(jobs[2])  # it was its turn when it was removed
+    assert made.cycle(15 * MS)[0] in jobs
+
+
+def test_no_more_is_planned_than_there_is_room_for() -> None:
+    made = schedule(job(1), job(2, 10))
+    assert len(take(made, 0, 1000, most=7)) == 7
+
+
+def test_at_least_one_job_is_taken_however_long_it_lasts() -> None:
+    made = schedule(long := job(duration_ms=500))
+    assert take(made, 0, 1) == [(long, 0)]
+
+
+def test_what_is_queued_already_counts() -> None:
+    made = schedule(job(1))
+    assert made.take(0, 100 * MS, 100 * MS, 9) == []
+    assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
+
+
+def test_a_silent_drive_rests_longer_and_longer_and_the_others_go_on() -> None:
+    dead, alive = job(1), job(2)
+    made = schedule(dead, alive)
+    fail(made, 1, 2, now_ms=0)
+    assert {it for it, _ in take(made, 1, 100)} == {alive}
+    now, rests = 0, []
+    for failures in range(3, 11):
+        woken = next(
+            at for at in range(now + 1, now + 20_000, 50) if dead in (it for it, _ in take(made, at, 10))
+        )
+        rests.append(woken - now)
+        now = woken
+        fail(made, 1, failures, now)
+    assert FIRST_REST_NS // MS <= rests[0] <= FIRST_REST_NS // MS + 100
+    assert rests == sorted(rests)
+    assert LONGEST_REST_NS // MS <= rests[-1] <= LONGEST_REST_NS // MS + 100
+
+
+def test_a_rest_is_over_to_the_nanosecond() -> None:
+    made = schedule(dead := job(1))
+    at = 0
+    for failures, rest_ms in enumerate([500, 1000, 2000, 2000], 2):
+        fail(made, 1, failures, at // MS)
+        at += rest_ms * MS
+        assert made.take(at - 1, at - 1, at, 9) == []
+        assert [it for it, _, _ in made.take(at, at, at + 1, 9)] == [dead]
+
+
+def test_all_silent_drives_together_cost_their_share() -> None:
+    jobs = [job(drive, duration_ms=40) for drive in range(10)]
+    made = schedule(*jobs, job(99))
+    cost_ms, asked = 300, 0
+    failures = dict.fromkeys(range(10), 2)
+    for drive in range(10):
+        made.observe(drive, 2, 0, late_until_ns=0, cost_ns=cost_ms * MS)
+    for now in range(0, 3_600_000, 1000):
+        for it, _ in take(made, now, 5):
+            if it.drive < 10:
+                asked += 1
+                failures[it.drive] += 1
+                made.observe(it.drive, failures[it.drive], now * MS, late_until_ns=0, cost_ns=cost_ms * MS)
+    assert 0.01 < asked * cost_ms / 3_600_000 <= 0.02
+
+
+@pytest.mark.story
+@pytest.mark.parametrize("dead", [1, 5, 10])
+@pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
+def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int | None) -> None:
+    """Of 31, once it is known: the others keep 97 % of the rate that they have without them."""
+    answered: list[int] = []
+    for count in (31, 31 - dead):
+        made = schedule(*(job(drive, period_ms, duration_ms=12) for drive in range(count)))
+        failures = dict.fromkeys(range(31 - dead, 31), 0)
+        at, good = 0, 0
+        while at < 200_000 * MS:
+            ((it, not_before, _),) = made.take(at, at, at + 10_000 * MS, 1)
+            at = max(at, not_before) + it.duration_ns
+            if it.drive in failures:
+                at += 300 * MS
+                failures[it.drive] += 1
+                made.observe(it.drive, failures[it.drive], at, late_until_ns=at, cost_ns=300 * MS)
+            elif at > 20_000 * MS:
+                good += 1
+        answered.append(good)
+    assert answered[0] >= 0.97 * answered[1]
+
+
+def test_a_drive_that_wakes_is_asked_one_thing_and_is_back_with_its_first_answer() -> None:
+    made = schedule(job(1), job(1), other := job(2))
+    fail(made, 1, 2, now_ms=0)
+    woken = take(made, 501, 50)
+    assert len([it for it, _ in woken if it is not other]) == 1
+    fail(made, 1, 0, now_ms=520)
+    assert len({it for it, _ in take(made, 520, 50)}) == 3
+
+
+def test_a_silent_drive_is_asked_its_shortest_question_whatever_its_rate() -> None:
+    made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
+    fail(made, 1, 2, now_ms=0)
+    take(made, 1, 400)
+    assert take(made, 501, 50) == [(short, 0)]  # off its grid, which goes on
+    fail(made, 1, 0, now_ms=502)
+    assert (short, 60_000) in take(made, 502, 60_000, most=10_000)
+
+
+def test_a_silent_drive_is_asked_in_the_others_spare_time() -> None:
+    made = schedule(dead := job(1), timed := job(2, 10, 5))
+    fail(made, 1, 2, now_ms=0)
+    take(made, 0, 450)
+    taken = take(made, 500, 40)
+    assert [it for it, _ in taken[:3]] == [timed, dead, timed]
+
+
+def test_a_silent_drive_is_asked_also_when_there_is_no_spare_time() -> None:
+    made = schedule(dead := job(1), job(2, 10, 10), job(3, 10, 10))
+    fail(made, 1, 2, now_ms=0)
+    asked = sum(dead in (it for it, _ in take(made, now, 100)) for now in range(0, 5000, 100))
+    assert asked >= 3
+
+
+def test_nothing_is_asked_while_a_late_answer_may_still_come() -> None:
+    made = schedule(poll := job(1), other := job(2))
+    fail(made, 1, 1, now_ms=0, late_until_ms=300)
+    assert {it for it, _ in take(made, 0, 299)} == {other}
+    assert poll in {it for it, _ in take(made, 300, 20)}
+
+
+def test_a_late_answer_that_has_come_ends_the_waiting() -> None:
+    made = schedule(poll := job(1), job(2))
+    fail(made, 1, 1, now_ms=0, late_until_ms=900)
+    assert poll not in [it for it, _ in take(made, 0, 100)]
+    fail(made, 1, 1, now_ms=100, late_until_ms=0)
+    assert poll in [it for it, _ in take(made, 100, 20)]
+
+
+def test_a_late_answer_of_a_silent_drive_gives_it_another_chance() -> None:
+    made = schedule(poll := job(1), job(2))
+    fail(made, 1, 2, now_ms=0, late_until_ms=900)
+    fail(made, 1, 2, now_ms=100, late_until_ms=0)
+    assert [it for it, _ in take(made, 100, 60)].count(poll) == 1
+
+
+def test_all_that_is_due_fits_to_the_nanosecond() -> None:
+    """So those of the kind that was last go first; with a nanosecond less the one that ends first."""
+    for less, order in ((0, [2, 1]), (1, [1, 2])):
+        made = schedule(job(3, 1000, 10, kind=2))
+        take(made, 0, 1)
+        for drive, period_ms in ((1, 20), (2, 1000)):
+            made.add(job(drive, period_ms, 10, kind=drive), 10 * MS - less)
+        assert [it.drive for it, _ in take(made, 10, 1 + 19)] == order
+
+
+def test_a_line_that_has_caught_up_is_late_no_more() -> None:
+    made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
+    take(made, 0, 1, most=3)
+    taken = take(made, 1000, 1010)  # slots of the quick one are over
+    assert [it for it, due in taken if due >= 2000] == [quick, middling, slow]
+
+
+def test_a_slot_passes_whose_drive_falls_silent_before_its_turn() -> None:
+    made = schedule(one := job(1, 100), two := job(2, 100))
+    assert take(made, 0, 100, most=1) == [(one, 0)]
+    fail(made, 2, 1, now_ms=5, late_until_ms=60)
+    assert take(made, 10, 50) == []
+    assert made.unasked == [(two, 0)]
+    assert {it for it, _ in take(made, 100, 20)} == {one, two}
+
+
+def test_who_is_asleep_keeps_its_place_in_the_round() -> None:
+    made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
+    fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
+    assert [it for it, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
+
+
+def test_a_question_to_a_silent_drive_may_take_its_whole_time_out() -> None:
+    made = schedule(dead := job(1), job(2))
+    made.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
+    take(made, 1, 400)
+    made.observe(1, 3, 0, late_until_ns=0, cost_ns=300 * MS)
+    assert take(made, 60_000, 300) == [(dead, 0)]
+
+
+def test_the_same_outcome_told_again_ends_no_rest() -> None:
+    made = schedule(poll := job(1), job(2))
+    for now in (0, 100):
+        fail(made, 1, 2, now_ms=now)
+    assert poll not in [it for it, _ in take(made, 100, 300)]
+
+
+def test_one_failure_is_no_rest_that_would_be_told() -> None:
+    made = schedule(job(1))
+    fail(made, 1, 1, now_ms=7)
+    assert made.unasked == []
+
+
+def test_damage_alone_costs_no_rest() -> None:
+    made = schedule(poll := job(1))
+    fail(made, 1, 1, now_ms=0)
+    assert take(made, 0, 5) == [(poll, 0)]
+
+
+def test_slots_of_a_resting_drive_are_reported_with_the_time_they_were_due() -> None:
+    made = schedule(poll := job(1, period_ms=100))
+    fail(made, 1, 2, now_ms=0)
+    assert take(made, 0, 350) == []
+    assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
+
+
+def test_each_rest_is_told_once_for_jobs_in_turn() -> None:
+    made = schedule(poll := job(1), job(2))
+    fail(made, 1, 2, now_ms=7)
+    take(made, 8, 300)
+    assert made.unasked == [(poll, 7 * MS)]
+
+
+def test_while_the_port_is_gone_every_slot_passes() -> None:
+    made = schedule(poll := job(1, period_ms=100), fast := job(2))
+    assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
+
+
+def test_what_was_not_asked_when_it_ends_is_told() -> None:
+    made = schedule(poll := job(1, period_ms=100), job(2))
+    take(made, 0, 50)
+    assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
+
+
+def test_slots_that_have_begun_pass_too_and_so_do_those_that_begin_just_now() -> None:
+    made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
+    assert [it for it, _ in take(made, 0, 100, most=2)] == [one, two]
+    assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
+
+
+def test_a_job_that_is_removed_leaves_the_others_their_turns() -> None:
+    jobs = [job(drive) for drive in range(4)]
+    made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
+    assert [it for it, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
+    for it in (jobs[0], timed):
+        made.remove(it)
+    assert [it for it, _ in take(made, 20, 15)] == [jobs[2], jobs[3], jobs[1]]
+    assert [it for it, _ in take(made, 1000, 5)] == [other]
+    assert made.jobs == [*jobs[1:], other]
+
+
+def test_a_job_that_is_removed_within_its_slot_is_not_taken() -> None:
+    made = schedule(first := job(1, 1000), second := job(2, 1000))
+    assert take(made, 0, 100, most=1) == [(first, 0)]
+    made.remove(second)
+    assert take(made, 5, 100) == []
+
+
+def test_who_replaces_others_has_their_place_in_the_round_and_their_next_slot() -> None:
+    jobs = [job(drive) for drive in range(4)]
+    made = schedule(*jobs)
+    assert [it for it, _ in take(made, 0, 10)] == jobs[:2]
+    made.replace([jobs[0], jobs[2]], [both := job(8)], 0)
+    made.replace([jobs[3]], [one := job(5), other := job(6)], 0)
+    assert [it for it, _ in take(made, 10, 25)] == [both, one, other, jobs[1], both]
+    made.add(timed := job(9, 100), 40 * MS)
+    assert take(made, 40, 1) == [(timed, 40)]
+    made.replace([timed], [slower := job(7, 100)], timed.due_ns)
+    assert [(it, due) for it, due in take(made, 140, 1)] == [(slower, 140)]
+    assert set(made.jobs) == {jobs[1], both, one, other, slower}
+
+
+def test_a_cycle_repeats_where_all_answer_and_nobody_has_slots() -> None:
+    made = schedule(one := job(1), two := job(2))
+    assert made.cycle(0) == [one, two]
+    fail(made, 1, 0, now_ms=0)
+    assert made.cycle(0) == [one, two]
+    fail(made, 2, 1, now_ms=0)
+    assert made.cycle(0) == []
+    fail(made, 2, 0, now_ms=0, late_until_ms=100)
+    assert made.cycle(100 * MS - 1) == []
+    assert made.cycle(100 * MS) == [one, two]
+    made.add(timed := job(3, 1000), 100 * MS)
+    assert made.cycle(100 * MS) == []
+    made.remove(timed)
+    assert made.cycle(100 * MS) == [one, two]
+
+
+KINDS = st.lists(
+    st.tuples(st.integers(1, 4), st.none() | st.integers(5, 80), st.integers(1, 10), st.integers(0, 2)),
+    min_size=1,
+    max_size=8,
+)
+
+
+@given(KINDS, st.lists(st.integers(0, 60) | st.just(700), min_size=30, max_size=60))
+def test_no_drift_no_burst_whatever_stalls(
+    kinds: list[tuple[int, int | None, int, int]], stalls: list[int]
+) -> None:
+    """Of the line or of Python, for longer than is planned ahead."""
+    made = schedule(*(job(*kind) for kind in kinds))
+    busy_until = now = 0
+    slots: dict[Job, list[int]] = {it: [] for it in made.jobs}
+    for stall in stalls:
+        for it, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
+            busy_until = max(busy_until, now, not_before)
+            if due is not None and it.period_ns:
+                assert busy_until < due + it.period_ns  # it is not over
+                slots[it].append(due)
+            busy_until += it.duration_ns
+        now += stall * MS
+    for it, taken in slots.items():
+        if it.period_ns:
+            assert all(due % it.period_ns == 0 for due in taken)  # on its grid
+            assert taken == sorted(set(taken))  # each slot once
+            assert it.due_ns // it.period_ns == len(taken) + it.skipped  # and none unaccounted for
+
+
+@settings(max_examples=50)
+@given(KINDS)
+def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None, int, int]]) -> None:
+    made = schedule(*(job(*kind) for kind in kinds))
+    done = carry_out(made, 3)
+    # Each of the others once, a few rounds of its class, and the share of those in turn.
+    longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
+    for it in made.jobs:
+        sent = [0, *(at for other, _, at in done if other is it), 3000 * MS]
+        assert max(after - before for before, after in pairwise(sent)) <= longest
+    turns = [sum(1 for other, _, _ in done if other is it) for it in made.jobs if it.period_ns is None]
+    assert not turns or max(turns) - min(turns) <= 1
+
+
+@settings(max_examples=50)
+@given(KINDS)
+def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> None:
+    """All jobs fit into the shortest period together: none is ever left out."""
+    least = sum(duration for _, _, duration, _ in kinds)
+    made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))
+    done = carry_out(made, 3)
+    assert [it.skipped for it in made.jobs] == [0] * len(kinds)
+    for it in made.jobs:
+        if it.period_ns:
+            assert sum(1 for other, _, _ in done if other is it) >= 2900 * MS // it.period_ns
+
+
+def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come() -> None:
+    """Two questions between two looks, the first unanswered: else it is asked in vain without end."""
+    made = schedule(quick := job(1), timed := job(2, period_ms=10))
+    fail(made, 1, 0, now_ms=0, late_until_ms=100)
+    fail(made, 2, 0, now_ms=0, late_until_ms=60)
+    assert take(made, 10, 40) == []
+    assert {it.drive for it, _ in take(made, 70, 20)} == {timed.drive}
+    assert {it.drive for it, _ in take(made, 101, 50)} == {quick.drive, timed.drive}
+
+
+class Operation(RuleBasedStateMachine):
+    """A line's days: jobs come and go, the host stalls, drives fall silent and wake, the port vanishes."""
+
+    AHEAD = 100 * MS
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.made: Schedule[Job] = Schedule()
+        self.now = self.busy_until = 1000 * MS
+        self.added: dict[Job, int] = {}
+        self.slots: dict[Job, list[int]] = {}  # those that were asked
+        self.passed: Counter[Job] = Counter()  # those that were told as not asked
+        self.failures = dict.fromkeys(range(4), 0)
+        self.silent_until = dict.fromkeys(range(4), 0)  # a late answer may come so long
+
+    @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
+    def add(self, drive: int, period: int | None, duration: int) -> None:
+        if len(self.made.jobs) < 8:
+            it = job(drive, period, duration)
+            self.made.add(it, self.now)
+            self.made.observe(
+                drive, self.failures[drive], self.now, late_until_ns=self.silent_until[drive], cost_ns=0
+            )
+            self.added[it], self.slots[it] = self.now, []
+
+    @precondition(lambda self: self.made.jobs)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        it = data.draw(st.sampled_from(self.made.jobs))
+        self.made.remove(it)
+
+    @rule(drive=st.integers(0, 3), late=st.integers(0, 400))
+    def fall_silent(self, drive: int, late: int) -> None:
+        self._observe(drive, self.failures[drive] + 1, self.now + late * MS)
+
+    @rule(drive=st.integers(0, 3))
+    def wake(self, drive: int) -> None:
+        self._observe(drive, 0, 0)
+
+    def _observe(self, drive: int, failures: int, until: int) -> None:
+        if any(it.drive == drive for it in self.made.jobs):
+            self.failures[drive], self.silent_until[drive] = failures, until
+            self.made.observe(drive, failures, self.now, late_until_ns=until, cost_ns=30 * MS)
+
+    @rule()
+    def lose_the_port(self) -> None:
+        told = self.made.pass_all(self.now)
+        self.passed.update(it for it, _ in told if it.period_ns)
+        assert all(due <= self.now for _, due in told)
+
+    @rule(stall=st.integers(0, 300))
+    def go_on(self, stall: int) -> None:
+        self.now += stall * MS
+        taken = self.made.take(self.now, self.busy_until, self.now + self.AHEAD, 64)
+        at = max(self.now, self.busy_until)
+        for it, not_before, due in taken:
+            at = max(at, not_before)
+            assert it in self.made.jobs
+            # Nothing is asked while an answer may still come, not even when the line is ready too soon.
+            assert max(self.now, not_before) >= self.silent_until[it.drive]
+            if it.period_ns and due is None:  # asked to see whether its drive answers, in no slot
+                assert self.failures[it.drive] >= 2
+            elif it.period_ns:
+                assert (due - self.added[it]) % it.period_ns == 0  # on its grid
+                assert due > max(self.slots[it], default=-1)  # each slot once, in their order
+                assert due > at - it.period_ns  # what was missed is not made up for
+                self.slots[it].append(due)
+            else:
+                self.slots[it].append(at)
+            at += it.duration_ns
+        self.busy_until = at if taken else self.busy_until
+
+    @invariant()
+    def every_slot_is_accounted_for(self) -> None:
+        self.passed.update(it for it, _ in self.made.unasked if it.period_ns)
+        self.made.unasked.clear()
+        for it in self.made.jobs:
+            if it.period_ns:
+                slots = (it.due_ns - self.added[it]) // it.period_ns
+                assert slots == len(self.slots[it]) + it.skipped + self.passed[it]
+
+    def teardown(self) -> None:
+        """When all is well again, everything is asked, in its turn or at its rate."""
+        for drive in range(4):
+            self.wake(drive)
+        load = sum(it.duration_ns / it.period_ns for it in self.made.jobs if it.period_ns)
+        before = {it: len(self.slots[it]) for it in self.made.jobs}
+        for _ in range(100):
+            self.go_on(20)
+        counts = {it: len(self.slots[it]) - before[it] for it in self.made.jobs}
+        in_turn = [count for it, count in counts.items() if it.period_ns is None]
+        if load < 0.5:
+            assert all(counts.values())
+            assert max(in_turn, default=0) - min(in_turn, default=0) <= 1
+
+
+TestOperation = Operation.TestCase
+TestOperation.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
+
+
+# ---- jobs that leave ----
+
+
+def test_what_is_due_next_is_known_when_a_job_has_left() -> None:
+    made: Schedule[Job] = Schedule()
+    jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
+    for at, it in jobs.items():
+        made.add(it, at * MS)
+    made.remove(jobs[1])
+    assert take(made, 0, 14) == [(jobs[13], 13)]
+
+
+def test_one_of_several_is_due_before_the_horizon() -> None:
+    made: Schedule[Job] = Schedule()
+    soon, later = job(1, 1000), job(2, 1000)
+    made.add(soon, 10 * MS)
+    made.add(later, 500 * MS)
+    assert take(made, 0, 100) == [(soon, 10)]
+
+
+def test_the_turn_goes_on_where_a_job_has_left() -> None:
+    first, second, third = job(1), job(2), job(3)
+    made = schedule(first, second, third)
+    assert take(made, 0, 1, 1) == [(first, 0)]
+    made.remove(second)  # whose turn it would be
+    assert [it for it, _ in take(made, 5, 1, 1)] == [third]
+
+
+def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
+    made = schedule(silent := job(1), job(2))
+    fail(made, 1, 9, 0)
+    made.remove(silent)
+    made.forget(1)
+    made.add(again := job(1), 0)
+    assert again in [it for it, _ in take(made, 1, 20)]
+
+
+# ---- drives that have never answered ----
+
+
+def meet(*jobs: Job) -> Schedule[Job]:
+    made = schedule(*jobs)
+    for drive in {it.drive for it in jobs}:
+        made.meet(drive)
+    return made
+
+
+def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
+    made.conclude(asked)
+    made.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
+
+
+def test_a_new_drive_is_asked_one_question_until_its_outcome_is_known() -> None:
+    made = meet(one := job(1), two := job(1), job(2, period_ms=50), job(2))
+    assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
+    assert take(made, 10, 1000) == []
+    assert made.cycle(10 * MS) == []
+    made.conclude(one)  # its answer was damaged, perhaps: it has not answered yet
+    assert [asked for asked, _ in take(made, 20, 1000)] == [two]
+    answer(made, two, 30)
+    assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
+
+
+def test_no_slot_of_a_new_drive_is_lost_doubled_or_asked_early() -> None:
+    made = meet(fast := job(1, period_ms=20), slow := job(1, period_ms=50), job(2, period_ms=1000))
+    assert {asked.drive for asked, _ in take(made, 0, 300, most=2)} == {1, 2}
+    assert take(made, 1, 300) == []
+    answer(made, fast, 2)
+    slots = [(slow, 0), (fast, 20), (fast, 40), (slow, 50), (fast, 60), (fast, 80)]
+    assert take(made, 2, 90) == slots
+    assert (fast.skipped, slow.skipped) == (0, 0)
+
+
+def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
+    made = meet(dead := job(1), living := job(2))
+    assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
+    answer(made, living, 1)
+    made.conclude(dead)
+    made.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
+    rest_ms = 30_000  # in which that is the share of the silent
+    assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
+    assert made.unasked == [(dead, 60 * MS)]
+    assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
+    assert made.cycle((60 + rest_ms) * MS) == []
+    answer(made, dead, 60 + rest_ms)
+    assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
+
+
+def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
+    """A reply may have been lost."""
+    lost, living = job(1), job(2)
+    for cost_ms, again in {300: {lost}, 500: set()}.items():
+        made = meet(lost, living)
+        take(made, 0, 100)
+        made.conclude(lost)
+        made.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
+        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # nobody knows of the other one yet
+        answer(made, living, 90)
+        assert lost not in {asked for asked, _ in take(made, 100, 90)}
+        assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
+        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # before the outcome is known
+
+
+def test_when_a_silent_drive_is_back_another_one_is_asked_and_no_more() -> None:
+    made = schedule(*(jobs := [job(drive) for drive in range(4)]))
+    for drive in (0, 1, 2):
+        made.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1000, 50)} == {jobs[3]}
+    made.observe(2, 0, 1100 * MS, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1100, 400)} == {jobs[0], jobs[2], jobs[3]}
+    made.observe(0, 3, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
+    assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}

@@ -1,0 +1,473 @@
+"""Plant files: what is read from them, and that every mistake is a sentence of its own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from multidrop.core import Echo
+from multidrop.drive import Framing
+from multidrop.drive.timing import Settings
+from multidrop.plant.loader import PlantError, load_plant, parse_duration
+from multidrop.plant.model import Plant
+
+FAMILY = """\
+from multidrop.drive.family import Drive, Framing, Option
+from multidrop.drive.register import command, reading, setting
+
+class Toy(Drive):
+    model = "toy"
+    title = "TOY T1"
+    framings = (Framing.RTU, Framing.ASCII)
+    formats = {Framing.RTU: ("8N1", "8E1"), Framing.ASCII: ("7E1",)}
+    baudrates = (9600, 19200)
+    addresses = range(1, 32)
+    options = {"rated_frequency": Option("Hz", (10, 400), "rated frequency of the motor")}
+
+    output_frequency = reading(1, "Hz", step=0.1)
+    output_current = reading(2, "A", step=0.1)
+    acceleration_time = setting(10, "s", step=0.1)
+    control = command(20)
+
+class Fixed(Drive):
+    model = "fixed"
+    title = "FIXED F1"
+    baudrates = (38400,)
+    formats = {Framing.RTU: ("8N1",)}
+    output_voltage = reading(5, "V")
+
+class Mute(Drive):
+    model = "mute"
+    title = "MUTE M1"
+    control = command(1)
+"""
+
+GOOD = """\
+[[line]]
+name = "hall-1"
+port = "/dev/ttyUSB0"
+baudrate = 19200
+format = "8E1"
+
+[[line.drive]]
+name = "pump-1"
+model = "family.py:Toy"
+address = 1
+every = "50 ms"
+poll = ["output_current", { register = "output_frequency", every = "20 ms" }, "acceleration_time"]
+
+[[line.drive]]
+name = "fan-1"
+model = "family.py:Fixed"
+address = 2
+baudrate = 38400
+format = "8N1"
+
+[[line]]
+name = "hall-2"
+port = "socket://10.0.0.9:4001"
+
+[[line.drive]]
+name = "pump-2"
+model = "family.py:Toy"
+address = 1
+framing = "ascii"
+rated_frequency = 60
+"""
+
+HEAD = '[[line]]\nname = "L"\nport = "/dev/a"\n'
+TOY = '[[line.drive]]\nname = "D"\nmodel = "family.py:Toy"\naddress = 1\n'
+FIXED = '[[line.drive]]\nname = "F"\nmodel = "family.py:Fixed"\naddress = 2\n'
+
+Load = Callable[[str], Plant]
+Mistakes = Callable[[str], list[str]]
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Load:
+    (tmp_path / "family.py").write_text(FAMILY)
+
+    def load(text: str) -> Plant:
+        path = tmp_path / "plant.toml"
+        path.write_text(text)
+        return load_plant(path)
+
+    return load
+
+
+@pytest.fixture
+def mistakes(load: Load, tmp_path: Path) -> Mistakes:
+    """The sentences without the file's path, which each must begin with."""
+
+    def mistakes(text: str) -> list[str]:
+        with pytest.raises(PlantError) as refusal:
+            load(text)
+        start = f"{tmp_path}/plant.toml: "
+        assert all(sentence.startswith(start) for sentence in refusal.value.mistakes)
+        assert str(refusal.value) == "\n".join(refusal.value.mistakes)
+        return [sentence.removeprefix(start) for sentence in refusal.value.mistakes]
+
+    return mistakes
+
+
+def test_lines_drives_and_polls_are_read(load: Load) -> None:
+    plant = load(GOOD)
+    hall_1, hall_2 = plant.lines
+    assert (hall_1.name, hall_1.port, hall_1.baudrate, hall_1.format) == (
+        "hall-1",
+        "/dev/ttyUSB0",
+        19200,
+        "8E1",
+    )
+    assert (hall_2.name, hall_2.baudrate, hall_2.format) == ("hall-2", None, None)
+    pump_1, fan_1 = hall_1.drives
+    assert (pump_1.drive.name, pump_1.drive.address) == ("pump-1", 1)
+    assert pump_1.drive.settings == Settings(19200, "8E1")
+    assert [(poll.register.name, poll.every) for poll in pump_1.polls] == [
+        ("output_current", 0.05),
+        ("output_frequency", 0.02),
+        ("acceleration_time", 0.05),
+    ]
+    assert fan_1.drive.settings == Settings(38400, "8N1")
+
+
+SILENT = """\
+[[line]]
+name = "hall-1"
+port = "/dev/ttyUSB0"
+baudrate = 38400
+format = "8N1"
+silence = "500 us"
+
+[[line.drive]]
+name = "quick"
+model = "erman-er-g-220"
+address = 1
+
+[[line.drive]]
+name = "slow"
+model = "innovert-ibd"
+address = 2
+
+[[line.drive]]
+name = "text"
+model = "delixi-modbus"
+framing = "ascii"
+format = "7N2"
+address = 3
+"""
+
+
+def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(load: Load) -> None:
+    (line,) = load(SILENT).lines
+    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([500e-6, 10e-3, 0])
+    assert line.switching == 0
+    (line,) = load(SILENT.replace('silence = "500 us"\n', 'switching = "2 ms"\n')).lines
+    assert line.switching == 2e-3
+    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
+
+
+def test_a_line_s_echo_is_learnt_unless_it_is_told(load: Load) -> None:
+    assert load(SILENT).lines[0].echo is Echo.AUTO
+    assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
+
+
+def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: Load) -> None:
+    (pump,) = load(GOOD).lines[1].drives
+    assert [(poll.register.name, poll.every) for poll in pump.polls] == [
+        ("output_frequency", None),
+        ("output_current", None),
+    ]
+
+
+def test_a_byte_order_mark_is_no_part_of_the_file(load: Load) -> None:
+    assert load("\ufeff" + SILENT).metadata() == load(SILENT).metadata()
+
+
+def test_framing_and_options_reach_the_drive(load: Load) -> None:
+    (pump,) = load(GOOD).lines[1].drives
+    assert pump.drive.framing is Framing.ASCII
+    assert pump.drive.settings == Settings(9600, "7E1")
+    assert pump.drive.option == {"rated_frequency": 60}
+
+
+def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) -> None:
+    text = (
+        GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
+        .replace('"output_current",', '"output_curent",')
+        .replace('every = "50 ms"', 'every = "50"')
+        .replace("address = 2", "address = 1")
+        .replace("rated_frequency = 60", "rated_frequency = 600")
+    )
+    assert mistakes(text) == [
+        "line \"hall-1\": unknown key 'prot'; did you mean 'port'?",
+        'line "hall-1", drive "pump-1": every = \'50\' is not a duration from 100 us to 24 h, '
+        'such as "50 ms", "2 s" or "1 min"',
+        'line "hall-1", drive "pump-1", poll number 1: '
+        "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
+        'line "hall-1", drive "fan-1": '
+        'address 1 is that of line "hall-1", drive "pump-1" already; give every drive its own',
+        'line "hall-2", drive "pump-2": rated_frequency = 600 is outside 10 to 400 Hz',
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "'line' is missing; add [[line]], in two brackets, with its name, port and drives"),
+        ("[line]", "line = {} is not right; write [[line]], in two brackets, with its name, port and drives"),
+        (
+            "line = [3]",
+            "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
+            "drive",
+        ),
+        (
+            HEAD,
+            "line \"L\": 'drive' is missing; add [[line.drive]], in two brackets, "
+            "with its name, model and address",
+        ),
+        (
+            HEAD + 'silence = "0 us"\n' + TOY,
+            "line \"L\": silence = '0 us' is not a duration from 100 us to 24 h, "
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + "silence = 0.0005\n" + TOY,
+            'line "L": silence = 0.0005 is not right; write silence = "500 us"',
+        ),
+        (
+            HEAD + 'silence = "500 us"\n' + TOY,
+            'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, which may pass '
+            "within a frame: it is to be 1563 us or more",
+        ),
+        (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
+        (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),
+        (HEAD + "baudrate = 7\n" + TOY, 'line "L": baud rate 7 is outside 50 to 4000000'),
+        (
+            HEAD + 'format = "8X1"\n' + TOY,
+            "line \"L\": format '8X1' is not data bits, parity and stop bits, such as 8N1, 8E1 or 7N2",
+        ),
+        (
+            HEAD + 'baudrate = "9600"\n' + TOY,
+            "line \"L\": baudrate = '9600' is not right; write baudrate = 9600",
+        ),
+        (
+            (HEAD + TOY).replace("= 1", "= true"),
+            'line "L", drive "D": address = True is not right; write address = 1',
+        ),
+        (
+            (HEAD + TOY).replace('"D"', '""'),
+            'line "L", drive number 1: name = \'\' is not right; write name = "pump-1"',
+        ),
+        (
+            (HEAD + TOY).replace("= 1", "= 32"),
+            'line "L", drive "D": address 32 is not one of TOY T1: 1 to 31',
+        ),
+        (
+            HEAD + TOY + "baudrate = 38400",
+            'line "L", drive "D": baud rate 38400 is not one of TOY T1: 9600, 19200',
+        ),
+        (HEAD + TOY + "baudrate = 0", 'line "L", drive "D": baud rate 0 is not one of TOY T1: 9600, 19200'),
+        (HEAD + TOY + 'format = "8O1"', 'line "L", drive "D": format \'8O1\' is not one of TOY T1: 8N1, 8E1'),
+        (
+            HEAD + TOY + 'framing = "tcp"',
+            'line "L", drive "D": framing \'tcp\' is not one of TOY T1: rtu, ascii',
+        ),
+        (
+            HEAD + "baudrate = 9600\n" + FIXED,
+            'line "L", drive "F": baud rate 9600 is not one of FIXED F1: 38400 '
+            "(the line's); add baudrate = 38400 to this drive",
+        ),
+        (
+            HEAD + 'format = "8N1"\n' + TOY + 'framing = "ascii"',
+            'line "L", drive "D": format \'8N1\' is not one of TOY T1: 7E1 '
+            '(the line\'s); add format = "7E1" to this drive',
+        ),
+        (
+            (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
+            'line "L", drive "D": there is no model \'innovert-ibt\'; '
+            "did you mean innovert-ibd? (or write path/to/file.py:Class)",
+        ),
+        (
+            HEAD + TOY + 'poll = ["control"]',
+            'line "L", drive "D", poll number 1: '
+            "control can only be written, not polled; see `multidrop models toy`",
+        ),
+        (
+            HEAD + TOY + "poll = []",
+            'line "L", drive "D": poll = [] is not right; '
+            'write poll = ["output_current"], or leave it out to poll all readings',
+        ),
+        (
+            HEAD + TOY + "poll = [7]",
+            'line "L", drive "D", poll number 1: 7 is not right; '
+            'write "output_current" or { register = "output_current" }',
+        ),
+        (
+            HEAD + TOY + 'poll = ["output_current", { register = "output_current" }]',
+            'line "L", drive "D", poll number 2: output_current is polled twice; keep it once',
+        ),
+        (
+            HEAD + TOY + 'poll = [{ register = "output_current", evry = "1 s" }]',
+            "line \"L\", drive \"D\", poll number 1: unknown key 'evry'; did you mean 'every'?",
+        ),
+        (
+            HEAD + TOY + "every = 5",
+            'line "L", drive "D": every = 5 is not right; write every = "50 ms"',
+        ),
+        (
+            HEAD + TOY + 'every = "0 ms"',
+            'line "L", drive "D": every = \'0 ms\' is not a duration from 100 us to 24 h, '
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + 'switching = "now"\n' + TOY,
+            "line \"L\": switching = 'now' is not a duration from 100 us to 24 h, "
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + TOY + 'poll = [{ register = "output_current", every = "often" }]',
+            'line "L", drive "D", poll number 1: every = \'often\' is not a duration from 100 us to 24 h, '
+            'such as "50 ms", "2 s" or "1 min"',
+        ),
+        (
+            HEAD + '[[line.drive]]\nname = "I"\nmodel = "innovert-ibd"\naddress = 1\nforward_bit = 2.5',
+            'line "L", drive "I": forward_bit = 2.5 is no whole number from 2 to 3',
+        ),
+        (
+            HEAD + TOY + "rated_frequency = true",
+            'line "L", drive "D": rated_frequency = True is not right; write rated_frequency = 400',
+        ),
+        (
+            HEAD + FIXED + "rated_frequency = 50",
+            'line "L", drive "F": unknown key \'rated_frequency\'; '
+            "the keys here are name, model, address, framing, baudrate, format, ram, every, poll",
+        ),
+        (
+            HEAD + '[[line.drive]]\nname = "M"\nmodel = "family.py:Mute"\naddress = 1',
+            'line "L", drive "M": MUTE M1 has no readings; say what to poll',
+        ),
+        (
+            HEAD + TOY + HEAD.replace("/dev/a", "/dev/b") + FIXED,
+            'line "L": another line has this name too; every line needs its own',
+        ),
+        (
+            HEAD + TOY + HEAD.replace('"L"', '"M"') + FIXED,
+            'line "M": port /dev/a is that of line "L" already; make them one line',
+        ),
+        (
+            HEAD + TOY + '[[line]]\nname = "M"\nport = "/dev/b"\n' + TOY,
+            'line "M", drive "D": line "L", drive "D" has this name too; every drive needs its own',
+        ),
+        (
+            '[[line]]\nname = "L"\n' + TOY,
+            'line "L": \'port\' is missing; add port = "/dev/ttyUSB0"',
+        ),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_place_and_remedy(
+    mistakes: Mistakes, text: str, sentence: str
+) -> None:
+    assert mistakes(text) == [sentence]
+
+
+@pytest.mark.parametrize(("text", "line"), [("[[line]\n", 1), (HEAD + "address = 1\naddress = 2\n", 5)])
+def test_what_is_not_toml_is_a_sentence_with_its_line(mistakes: Mistakes, text: str, line: int) -> None:
+    (sentence,) = mistakes(text)
+    assert re.fullmatch(rf"is not TOML: .* \(at line {line}, column \d+\)", sentence)
+
+
+def test_arguments_that_the_family_refuses_are_each_reported(mistakes: Mistakes) -> None:
+    text = (
+        HEAD + TOY.replace("= 1", "= 99") + 'baudrate = 1\nformat = "8N2"\nframing = "x"\nrated_frequency = 1'
+    )
+    assert [sentence.split(": ")[1].split(" is ")[0] for sentence in mistakes(text)] == [
+        "framing 'x'",
+        "address 99",
+        "baud rate 1",
+        "format '8N2'",
+        "rated_frequency = 1",
+    ]
+
+
+def test_a_file_that_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(
+        PlantError, match=r"none.toml: the plant file cannot be read: No such file or directory"
+    ):
+        load_plant(tmp_path / "none.toml")
+    (tmp_path / "latin.toml").write_bytes(b'name = "S\xfcd"')
+    with pytest.raises(PlantError, match=r"latin.toml: is not text in UTF-8, from byte 9 on"):
+        load_plant(tmp_path / "latin.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("a = " + "[" * 5000 + "]" * 5000, "is not TOML of ours: it is nested too deeply"),
+        ("address = " + "9" * 5000, "is not TOML: Exceeds the limit"),
+        ("address = 0x" + "f" * 5000, "is not TOML: a number does not fit into 64 bits"),
+    ],
+    ids=["nested", "decimal", "hexadecimal"],
+)
+def test_a_file_that_tomllib_chokes_on_is_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(PlantError, match=sentence) as found:
+        load_plant(tmp_path / "a.toml")
+    assert len(found.value.mistakes) == 1
+
+
+def test_a_sentence_stays_one_line_whatever_the_names(mistakes: Mistakes) -> None:
+    name, address = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
+    assert name.startswith(r'line "L", drive "D\n\x1b[2J": name = ')
+    assert name.endswith("has characters that do not print; leave them out")
+    assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
+
+
+def test_a_model_s_file_whose_name_is_too_long_is_a_sentence(mistakes: Mistakes) -> None:
+    (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
+    assert sentence.endswith(".py: File name too long")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)],
+)
+def test_a_duration_is_in_seconds(text: str, expected: float) -> None:
+    assert parse_duration(text) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "50", "ms", "-5 ms", "0 s", "5 sec", "1e3 s", "nan s", "5 ms 3", "1 us", "25 h", "9" * 400 + " h"],
+)
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is not a duration from 100 us to 24 h, such as"):
+        parse_duration(text)
+
+
+def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        """
+        [[line]]
+        name = "hall-1"
+        port = "/dev/ttyUSB0"
+        [[line.drive]]
+        name = "pump-1"
+        model = "innovert-ibd"
+        address = 1
+        confirmed = 1
+        ram = ["acceleration_time"]
+        """
+    )
+    (drive,) = (it.drive for it in load_plant(path).lines[0].drives)
+    assert (drive.ram, drive.option) == ({"acceleration_time"}, {"confirmed": 1})
+    path.write_text(path.read_text().replace("acceleration_time", "acceleration"))
+    with pytest.raises(PlantError, match="did you mean acceleration_time"):
+        load_plant(path)
+    path.write_text(path.read_text().replace('["acceleration"]', "[3]"))
+    with pytest.raises(PlantError, match="ram takes names of registers, not 3"):
+        load_plant(path)

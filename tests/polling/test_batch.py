@@ -1,0 +1,150 @@
+"""Batches: row by row, and taken by Arrow's users as they are."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import nanoarrow
+import pyarrow as pa
+import pytest
+from batches import EXAMPLE, SECOND, UTC_0, block, completion, counting, example
+
+from multidrop.core import Columns, Names, Result
+from multidrop.polling.batch import Batch, Row
+
+SCHEMA = pa.schema(
+    [
+        pa.field("time", pa.timestamp("ns", "UTC"), nullable=False),
+        pa.field("monotonic_ns", pa.int64(), nullable=False),
+        pa.field("uncertainty_ns", pa.int64()),
+        pa.field("drive", pa.string(), nullable=False),
+        pa.field("register", pa.string(), nullable=False),
+        pa.field("value", pa.float64()),
+        pa.field("status", pa.string(), nullable=False),
+    ]
+)
+
+
+def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
+    """What pyarrow sees, with the time as a number."""
+    numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
+    return [Row(**row) for row in numbers.to_pylist()]
+
+
+def test_rows_for_people() -> None:
+    batch = example()
+    assert len(batch) == 5
+    assert list(batch) == EXAMPLE
+    assert list(batch) == EXAMPLE  # and again
+
+
+def test_empty_batch() -> None:
+    batch = Batch(Columns(4), Names(["pump-1"]), Names())
+    assert (len(batch), list(batch)) == (0, [])
+    assert pa.record_batch(batch).num_rows == 0
+
+
+def test_pyarrow_takes_it() -> None:
+    found = pa.record_batch(example())
+    found.validate(full=True)
+    assert found.schema.equals(SCHEMA)
+    assert rows_of(found) == EXAMPLE
+
+
+def test_pyarrow_takes_it_as_a_stream_and_its_schema_alone() -> None:
+    table = pa.table(example())
+    assert table.schema.equals(SCHEMA)
+    assert rows_of(table) == EXAMPLE
+    assert pa.schema(example()).equals(SCHEMA)
+
+
+def test_capsules_stay_valid_when_the_batch_is_gone() -> None:
+    kept = [pa.record_batch(counting(100, start)) for start in range(0, 2000, 100)]
+    values = [row.value for part in kept for row in rows_of(part)]
+    assert values == [None if at % 10 == 9 else at for at in range(2000)]
+
+
+def test_numbers_are_not_copied() -> None:
+    columns = Columns(1)
+    assert columns.add(block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
+    taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
+    columns.c.value[0] = 7.5
+    assert taken.column("value")[0].as_py() == 7.5
+
+
+def test_polars_takes_it() -> None:
+    polars = pytest.importorskip("polars", reason="needs polars")
+    frame = polars.DataFrame(example())
+    assert frame.schema["time"] == polars.Datetime("ns", "UTC")
+    times = frame["time"].to_physical()
+    assert [Row(*row) for row in frame.with_columns(time=times).iter_rows()] == EXAMPLE
+
+
+def test_pandas_takes_it() -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    frame = pandas.DataFrame.from_arrow(example())
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+    assert list(frame["drive"]) == [row.drive for row in EXAMPLE]
+    assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
+    assert list(frame["value"].dropna()) == [49.99, 0.3]
+
+
+def test_pandas_by_pyarrow_has_the_same_times() -> None:
+    """As before pandas 3.0."""
+    pytest.importorskip("pandas", reason="needs pandas")
+    frame = pa.table(example()).to_pandas()
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+
+
+@pytest.mark.parametrize("library", ["pandas", "numpy"])
+def test_what_would_take_times_for_numbers_is_told_what_to_take(library: str) -> None:
+    """pandas' constructor does not know Arrow's interface, and goes through rows one by one."""
+    taker = pytest.importorskip(library, reason=f"needs {library}")
+    take = taker.DataFrame if library == "pandas" else taker.asarray
+    with pytest.raises(TypeError, match=r"take them with pandas\.DataFrame\.from_arrow\(batch\)"):
+        take(example())
+    assert list(example()) == EXAMPLE
+
+
+def test_duckdb_takes_it() -> None:
+    duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+    batch = example()
+    with duckdb.connect() as database:
+        database.register("batch", batch)
+        found = database.execute(
+            "select epoch_ns(time), monotonic_ns, uncertainty_ns, drive, register, value, status from batch"
+        ).fetchall()
+    assert [Row(*row) for row in found] == EXAMPLE
+
+
+def test_numpy_takes_it_with_nan_for_misses() -> None:
+    numpy = pytest.importorskip("numpy", reason="needs NumPy")
+    taken = nanoarrow.Array(example())
+    values = taken.child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())
+    numpy.testing.assert_array_equal(values, [49.99, 0.3, numpy.nan, numpy.nan, numpy.nan])
+    monotonic = numpy.asarray(taken.child(1).to_pysequence())
+    assert monotonic.dtype == numpy.int64
+    assert list(monotonic) == [row.monotonic_ns for row in EXAMPLE]
+
+
+def test_every_status_can_be_spelt() -> None:
+    columns = Columns(300)
+    for reason in Result:
+        if reason is not Result.INCOMPLETE:
+            assert columns.add_miss(block(0, 0), reason, SECOND, UTC_0)
+    for code in range(1, 256):
+        assert columns.add(block(0, 0), completion(SECOND, exception=code), UTC_0)
+    batch = Batch(columns, Names("a"), Names("b"))
+    statuses = pa.record_batch(batch).column("status").to_pylist()
+    reasons = [str(reason) for reason in Result if reason is not Result.INCOMPLETE]
+    assert statuses == reasons + [f"exception {code:02X}" for code in range(1, 256)]
+    assert [row.status for row in batch] == statuses
+    assert all(statuses)
+
+
+def test_importing_the_library_does_not_import_nanoarrow() -> None:
+    code = "import sys, multidrop.polling.batch, multidrop.recording; sys.exit('nanoarrow' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

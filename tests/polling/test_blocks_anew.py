@@ -1,0 +1,99 @@
+"""Blocks are chosen anew for a drive that answers sooner or later than its document says."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from lines import polled
+from toy import Toy
+from worlds import S, World, WorldWire
+
+from multidrop.drive.register import HOLDING, reading
+from multidrop.polling.batch import Row
+from multidrop.polling.polled_line import PolledLine
+from multidrop.sim import Faults, SimulatedDrive
+
+SOON, LATE = 0.005, 0.06  # s
+
+
+class Wide(Toy):
+    """Two registers so far from each other that only much waiting makes one request cheaper than two."""
+
+    most_registers = {HOLDING: 100}
+    readable_gaps = {HOLDING: range(100)}
+
+    near = reading(0x20)
+    far = reading(0x38)
+
+
+NAMES = (Wide.near.name, Wide.far.name)
+
+
+def asked_together(rows: list[Row]) -> set[bool]:
+    """Of all exchanges, whether both registers were read by one."""
+    assert {row.status for row in rows} == {"ok"}
+    return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
+
+
+@pytest.mark.parametrize(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
+@pytest.mark.parametrize("every", [None, 0.75], ids=["in turn", "at a rate"])
+def test_blocks_are_those_of_the_response_delay_that_was_measured(
+    document: float, truth: float, every: float | None
+) -> None:
+    drive = Wide(1, name="pump-1")
+    drive.response_delay = document
+    sim = SimulatedDrive(Wide(1), response_delay=truth)
+    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far], every)]) as world:
+        first = world.run(0.7)
+        assert asked_together(first) == {document == LATE}
+        between = world.run(3.0)
+        after = world.run(9.0)
+        assert asked_together(after) == {truth == LATE}
+        summary = world.poller.summary()["lines"]["line"]
+    assert summary["misses"] == {}
+    if every:
+        assert summary["overrun_slots"] == 0
+        for name in NAMES:
+            slots = [row.monotonic_ns for row in first + between + after if row.register == name]
+            dues = {round((at - slots[0]) / (every * S)) for at in slots}
+            assert dues == set(range(len(dues)))  # of each slot there is one
+
+
+def test_other_drives_keep_their_place_in_the_round() -> None:
+    drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
+    drives[1].response_delay = LATE
+    sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
+    with World(WorldWire(sims, Faults()), [polled(it, [Wide.near, Wide.far]) for it in drives]) as world:
+        world.run(5.0)
+        rows = [(row.drive, row.register) for row in world.run(2.0)]
+    at = rows.index(("pump-1", "near"))
+    assert rows[at : at + 6] == [(drive.name, name) for drive in drives for name in NAMES]
+
+
+def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
+    drive = Wide(1, name="pump-1")
+    sim = SimulatedDrive(Wide(1), response_delay=SOON)
+    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
+        (line,) = world.poller._lines
+        seen = set()
+        for _ in range(6):
+            for sim.response_delay in (SOON, LATE):
+                world.run(6.0)
+                seen.add(len(line._jobs))
+    assert seen == {2, 3}
+
+
+def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where delays are those of the host alone, and never the same."""
+    drive = Wide(1, name="pump-1")
+    sim = SimulatedDrive(Wide(1), response_delay=SOON)
+    choose, chosen = PolledLine._choose, []
+    monkeypatch.setattr(PolledLine, "_choose", lambda *given: chosen.append(given) or choose(*given))
+    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
+        for sim.response_delay in (SOON / 20, 2 * SOON, SOON / 5, SOON):
+            assert asked_together(world.run(6.0)) == {False}
+        assert len(chosen) == 1
+        sim.response_delay = LATE
+        world.run(6.0)
+        assert len(chosen) == 2

@@ -1,0 +1,200 @@
+"""Drives that are added to and removed from a poll that is under way, and from a bus."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from lines import line, plant, polled, rows_of, until
+from toy import Toy
+
+from multidrop.bus import Bus
+from multidrop.drives import InvtCHE
+from multidrop.errors import NoReply
+from multidrop.plant.model import PolledDrive
+from multidrop.poller import Poller
+from multidrop.sim import EncodedDrive, Simulator, Wire, proof
+
+ROOT = Path(__file__).parents[2]
+CURRENT = Toy.registers["output_current"]
+
+
+def pump(address: int, name: str = "", every: float | None = None) -> PolledDrive:
+    return polled(Toy(address, name=name or f"pump-{address}"), [CURRENT], every)
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    """A line on which the addresses 1 and 2 answer."""
+    with Simulator([Wire([EncodedDrive(Toy(1)), EncodedDrive(Toy(2))], unpaced=True)]) as sim:
+        yield sim.wires[0].path
+
+
+class Seen:
+    """What a poller's rows said so far, by drive."""
+
+    def __init__(self, poller: Poller) -> None:
+        self._poller = poller
+        self.values: dict[str, list[float]] = {}
+        self.statuses: set[str] = set()
+
+    def of(self, name: str) -> list[float]:
+        for row in rows_of(self._poller):
+            self.statuses.add(row.status)
+            if row.value is not None:
+                self.values.setdefault(row.drive, []).append(row.value)
+        return self.values.get(name, [])
+
+
+@pytest.mark.parametrize("every", [None, 0.02])
+def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, every: float | None) -> None:
+    second = pump(2, every=every)
+    with Poller(plant(line(port, pump(1, every=every)))) as poller:
+        seen = Seen(poller)
+        until(lambda: seen.of("pump-1"))
+        for _ in range(3):
+            before = len(seen.of("pump-2"))
+            poller.add("line", second)
+            until(lambda before=before: len(seen.of("pump-2")) > before)
+            poller.remove("line", "pump-2")
+            assert "pump-2" not in poller.summary()["lines"]["line"]["drives"]
+            first = len(seen.of("pump-1"))
+            until(lambda first=first: len(seen.of("pump-1")) > first + 20)
+            after = len(seen.of("pump-2"))
+            until(lambda first=first: len(seen.of("pump-1")) > first + 40)
+            assert len(seen.of("pump-2")) == after
+    assert {*seen.of("pump-1")} == {proof(Toy(1), CURRENT)}
+    assert {*seen.of("pump-2")} == {proof(Toy(2), CURRENT)}
+
+
+def test_a_line_may_be_left_by_all_and_joined_again(port: str) -> None:
+    first = pump(1)
+    with Poller(plant(line(port, first))) as poller:
+        seen = Seen(poller)
+        until(lambda: seen.of("pump-1"))
+        poller.remove("line", "pump-1")
+        before = len(seen.of("pump-1"))
+        poller.add("line", first)
+        until(lambda: len(seen.of("pump-1")) > before + 20)
+        assert poller.summary()["samples"] > before
+
+
+def test_a_silent_drive_that_leaves_takes_its_rest_along(port: str) -> None:
+    with Poller(plant(line(port, pump(1), pump(3, "dead")))) as poller:
+        seen = Seen(poller)
+        until(lambda: "not asked: drive is silent" in (seen.of("dead") and ()) or len(seen.statuses) > 1)
+        poller.remove("line", "dead")
+        before = len(seen.of("pump-1"))
+        until(lambda: len(seen.of("pump-1")) > before + 50)
+
+
+def test_what_cannot_come_or_go(port: str) -> None:
+    with Poller(plant(line(port, pump(1)))) as poller:
+        for polled_drive, sentence in (
+            (pump(1, "other"), "address 1 is taken by pump-1"),
+            (pump(2, "pump-1"), "another drive is called pump-1; give every one its own name"),
+            (polled(InvtCHE(3), [CURRENT]), "this output_current is no register of invt-che@3"),
+        ):
+            with pytest.raises(ValueError, match=sentence):
+                poller.add("line", polled_drive)
+        with pytest.raises(ValueError, match="there is no line 'hall'; there are line"):
+            poller.add("hall", pump(2))
+        with pytest.raises(ValueError, match="there is no drive 'pump-2' on line 'line'"):
+            poller.remove("line", "pump-2")
+        assert list(poller.summary()["lines"]["line"]["drives"]) == ["pump-1"]
+
+
+def test_a_drive_of_which_nothing_is_polled_disturbs_nobody(port: str) -> None:
+    with Poller(plant(line(port, pump(1), polled(Toy(3, name="pump-3"), [])))) as poller:
+        seen = Seen(poller)
+        until(lambda: len(seen.of("pump-1")) > 50)
+        assert seen.of("pump-3") == []
+
+
+def test_nothing_is_asked_of_a_drive_that_was_detached(port: str) -> None:
+    with Bus(port) as bus:
+        ours = bus.attach(Toy, address=1, name="pump-1")
+        assert bus.read(ours, CURRENT) == proof(Toy(1), CURRENT)
+        peer = bus.peer(ours)
+        proofs = peer.proofs
+        bus.detach(ours)
+        assert bus.drives == []
+        for do in (lambda: bus.read(ours, CURRENT), ours.stop, lambda: bus.detach(ours)):
+            with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
+                do()
+        again = bus.attach(Toy, address=1, name="pump-1")
+        assert bus.peer(again) is peer  # which knows of answers that may come late
+        assert peer.proofs is proofs  # at one of which the core may look just now
+
+
+def test_a_drive_of_another_family_gets_no_late_answer_of_the_one_before(port: str) -> None:
+    with Bus(port) as bus:
+        gone = bus.attach(Toy, address=9)
+        with pytest.raises(NoReply):
+            bus.read(gone, CURRENT)
+        due_ns = bus.peer(gone).late_until_ns
+        assert due_ns > 0
+        bus.detach(gone)
+        new = bus.attach(InvtCHE, address=9)
+        assert bus.peer(new).late_until_ns == due_ns
+
+
+def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Bus(port) as bus:
+        ours = bus.attach(Toy, address=1, name="pump-1")
+        begun, go_on = threading.Event(), threading.Event()
+        step = bus._performer._do_stop
+
+        def slow(*arguments: object) -> object:
+            begun.set()
+            assert go_on.wait(30)
+            return step(*arguments)
+
+        monkeypatch.setattr(bus._performer, "_do_stop", slow)
+        stopping = threading.Thread(target=bus.stop_all)
+        stopping.start()
+        assert begun.wait(30)
+        leaving = threading.Thread(target=bus.detach, args=(ours,))
+        leaving.start()
+        leaving.join(0.05)
+        assert leaving.is_alive()
+        assert bus.drives == [ours]
+        go_on.set()
+        stopping.join(30)
+        leaving.join(30)
+        assert bus.drives == []
+
+
+def test_many_threads_do_all_of_it_at_once() -> None:
+    """The program that does so with 64 lines for ten minutes, for a short while."""
+    program = [
+        sys.executable,
+        "bench/many_at_once.py",
+        "--lines=6",
+        "--drives=5",
+        "--minutes=0.08",
+        "--rounds=3",
+    ]
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.endswith("\nnothing misattributed, nothing lost, nothing grows\n")
+
+
+def test_statistics_may_be_looked_at_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive that has left in the middle of a look is no mistake of whoever looks."""
+    with Bus(port) as bus:
+        ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
+        counters = bus.peer(ours[0]).counters
+
+        def leave_and_tell() -> object:
+            bus.detach(ours[1])
+            return counters()
+
+        monkeypatch.setattr(bus.peer(ours[0]), "counters", leave_and_tell)
+        assert list(bus.statistics().drives) == ["pump-1", "pump-2"]
+        monkeypatch.undo()
+        assert list(bus.statistics().drives) == ["pump-1"]

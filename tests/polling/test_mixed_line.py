@@ -1,0 +1,132 @@
+"""All families on one line, each at its own baud rate and format: no value is taken for another's."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from typing import Any
+
+from lines import LateWire, line, plant, polled, proofs, rows_of, served
+
+from multidrop.core import Framing, Result
+from multidrop.drive import Drive
+from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.plant.model import PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import EncodedDrive, Wire
+
+VARIANTS = (  # family, framing, baud rate of the fast line
+    (ErmanERG220, Framing.RTU, 1_000_000),
+    (InvtCHE, Framing.RTU, 500_000),
+    (InnovertIBD, Framing.RTU, 500_000),
+    (InnovertIBD, Framing.ASCII, 1_000_000),
+    (DelixiModbus, Framing.RTU, 500_000),
+    (DelixiModbus, Framing.ASCII, 1_000_000),
+    (DelixiNative, Framing.DELIXI, 500_000),
+    (YD1000, Framing.RTU, 1_000_000),
+)
+REASONS = {str(it) for it in Result} - {str(Result.INCOMPLETE)}
+
+REAL_SECONDS = 6.0
+EVERY = 1.0  # s, of what is polled at a rate
+
+FAST_SECONDS = 3.0
+TIMEOUT = 0.02  # s: the shortest there is, which drives that mostly answer at once come to have
+LATEST = 3 * TIMEOUT
+
+
+def real_drives() -> list[Drive]:
+    return [
+        family(address, name=f"{family.model} {framing}", framing=framing)
+        for address, (family, framing, _) in enumerate(VARIANTS, 1)
+    ]
+
+
+def fast_drives() -> list[Drive]:
+    """The same, on a line where characters and silences take next to no time."""
+    return [
+        type(family.__name__, (family,), {"baudrates": (baudrate,), "needed_silence": lambda drive: 0.0})(
+            address, name=f"{family.model} {framing}", framing=framing
+        )
+        for address, (family, framing, baudrate) in enumerate(VARIANTS, 1)
+    ]
+
+
+def real_wires() -> list[Wire]:
+    return [Wire([EncodedDrive(drive) for drive in real_drives()])]
+
+
+class UnreliableWire(LateWire):
+    """Replies are lost, come late or twice."""
+
+    def __init__(self, drives: list[EncodedDrive]) -> None:
+        super().__init__(drives, unpaced=True)
+        self._random = random.Random(8)
+
+    def distort(self, reply: bytes) -> bytes:
+        times = self._random.choices([1, 2, 0], [85, 10, 5])[0]
+        if times and self._random.random() < 0.1:
+            return self.hold_up(times * reply, self._random.uniform(0, LATEST))
+        return times * reply
+
+
+def fast_wires() -> list[Wire]:
+    return [UnreliableWire([EncodedDrive(drive) for drive in fast_drives()])]
+
+
+def poll(path: str, drives: list[PolledDrive], seconds: float) -> tuple[list[Row], dict[str, Any]]:
+    """All rows, and the summary of the line."""
+    with Poller(plant(line(path, *drives))) as poller:
+        rows = [row for batch in poller.batches(seconds) for row in batch]
+    return rows + rows_of(poller), poller.summary()["lines"]["line"]
+
+
+def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -> None:
+    """Every value is its register's, every missing one has its reason, and none is unaccounted for."""
+    truth = proofs(*drives)
+    assert len(set(truth.values())) > len(drives)
+    samples = [row for row in rows if row.value is not None]
+    assert [row for row in samples if row.value != truth[row.drive, row.register]] == []
+    misses = Counter(row.status for row in rows if row.value is None)
+    assert misses.keys() <= REASONS
+    assert {row.status for row in samples} == {"ok"}
+    assert (len(samples), misses) == (summary["samples"], summary["misses"])
+
+
+def test_values_tell_all_registers_apart() -> None:
+    """Raw counts that any two of these drives could be asked for differ: else they would prove nothing."""
+    for drives in (real_drives(), fast_drives()):
+        asked = [polled(drive, drive.readings()) for drive in drives]
+        truth = proofs(*asked)
+        steps = {
+            (it.drive.name, poll.register.name): poll.register.scale for it in asked for poll in it.polls
+        }
+        raws = Counter(round(value / steps[key]) for key, value in truth.items())
+        assert max(raws.values()) == 1
+
+
+def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
+    drives = []
+    for drive in real_drives():
+        at_a_rate, *others = drive.readings()
+        polls = polled(drive, others[:5]).polls + polled(drive, [at_a_rate], EVERY).polls
+        drives.append(PolledDrive(drive, polls))
+    with served(real_wires) as (path,):
+        rows, summary = poll(path, drives, REAL_SECONDS)
+    check(rows, drives, summary)
+    assert {row.drive for row in rows if row.value is not None} == {it.drive.name for it in drives}
+    # Each slot of each grid is a row, or counted as left out; the last ones are cut off by the end.
+    on_a_grid = {(it.drive.name, it.polls[-1].register.name) for it in drives}
+    kept = sum(1 for row in rows if (row.drive, row.register) in on_a_grid)
+    assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
+
+
+def test_late_lost_and_doubled_replies_are_never_taken_for_others() -> None:
+    drives = [polled(drive, drive.readings()) for drive in fast_drives()]
+    with served(fast_wires) as (path,):
+        rows, summary = poll(path, drives, FAST_SECONDS)
+    check(rows, drives, summary)
+    assert summary["samples"] > 0
+    assert summary["misses"]["no reply"] > 0
+    assert summary["stray_bytes"] > 0

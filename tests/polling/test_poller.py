@@ -1,0 +1,602 @@
+"""The poller, on simulated lines: rates, rows, faults, and that nothing is left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import os
+import select
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import checksums
+import pytest
+from lines import PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
+from serial import Serial
+from toy import Toy
+from worlds import World, WorldWire
+
+from multidrop import poller as poller_module
+from multidrop.core import Result, RowQueue
+from multidrop.errors import LineError, Unconfirmed
+from multidrop.plant.model import PlantLine, PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
+
+# What a machine that has much else to do may add to what a test is about.
+HOST_LATE = {
+    str(it)
+    for it in (
+        Result.NO_REPLY,
+        Result.CUT_SHORT,
+        Result.LATE_ANSWER_DUE,
+        Result.NOT_ASKED,
+        Result.EXPIRED,
+        Result.POLL_ENDED,
+    )
+}
+
+
+class Quick(Toy):
+    """Answers at once, if at all."""
+
+    baudrates = (115_200,)
+    response_delay = 0.001
+    response_timeout = 0.05
+
+
+class Slow(Toy):
+    """At the pace of a real line."""
+
+    baudrates = (9600,)
+
+
+class Brisk(Toy):
+    """On a line on which the standard's silence is longer than 3.5 characters."""
+
+    baudrates = (38_400,)
+
+
+READINGS = Quick.readings()
+NAMES = {it.name for it in READINGS}
+ONE = [Quick.output_current]
+
+
+class Polling:
+    """A poller, and all the rows that came from it so far."""
+
+    def __init__(self, *lines: PlantLine) -> None:
+        self.poller = Poller(plant(*lines))
+        self.rows: list[Row] = []
+        self.began_ns = time.monotonic_ns()
+
+    def __enter__(self) -> Polling:
+        self.poller.__enter__()
+        return self
+
+    def __exit__(self, *failure: Any) -> None:
+        self.poller.__exit__(*failure)
+        self.look()
+
+    def look(self) -> list[Row]:
+        self.rows += rows_of(self.poller)
+        return self.rows
+
+    def statuses(self, drive: str | None = None) -> Counter[str]:
+        return Counter(row.status for row in self.look() if drive in (None, row.drive))
+
+    def until(self, status: str, count: int = 1, drive: str | None = None) -> None:
+        """Wait for so many more rows of a status."""
+        before = self.statuses(drive)[status]
+        until(lambda: self.statuses(drive)[status] >= before + count)
+
+    def check_summary(self) -> None:
+        """What the summary counts is what the rows say, line by line and drive by drive."""
+        summary = self.poller.summary()
+        misses = Counter(row.status for row in self.rows if row.value is None)
+        assert summary["samples"] == sum(1 for row in self.rows if row.value is not None)
+        assert summary["misses"] == misses.total()
+        assert summary["dropped"] == 0
+        told: Counter[str] = Counter()
+        for it in summary["lines"].values():
+            told.update(it["misses"])
+            assert it["samples"] == sum(drive["samples"] for drive in it["drives"].values())
+            for name, drive in it["drives"].items():
+                rows = [row for row in self.rows if row.drive == name]
+                assert drive["samples"] == sum(1 for row in rows if row.value is not None)
+                seen = Counter(row.status for row in rows if row.value is None)
+                assert drive["misses"] == seen
+        assert told == misses
+        assert self.began_ns <= min(row.monotonic_ns for row in self.rows)
+        assert max(row.monotonic_ns for row in self.rows) <= time.monotonic_ns()
+
+
+def drive(address: int = 1, name: str = "pump-1") -> Quick:
+    return Quick(address, name=name)
+
+
+def descriptors() -> int:
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+@pytest.fixture
+def pump() -> SimulatedDrive:
+    """The drive at address 1."""
+    found = simulated(drive())
+    found["output_current"] = 3.25
+    return found
+
+
+@pytest.fixture
+def port(pump: SimulatedDrive) -> Iterator[str]:
+    """A line with that one drive."""
+    with Simulator([Wire([pump], unpaced=True)]) as sim:
+        yield sim.wires[0].path
+
+
+# ---- rates ----
+
+
+def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
+    periods = {"output_current": 0.02, "output_frequency": 0.05}
+    polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
+    before_ns = poller_module.now_ns()
+    with Polling(line(port, PolledDrive(drive(), (*polls[0], *polls[1])))) as polling:
+        polling.until("ok", 100)
+    for name, every in periods.items():
+        sent = [row.monotonic_ns for row in polling.rows if row.register == name]
+        assert sent == sorted(sent)
+        # The n-th is not sent before its slot: none is made up for, and none is early.
+        assert all(at >= before_ns + number * every * 1e9 for number, at in enumerate(sent))
+    summary = polling.poller.summary()["lines"]["line"]
+    # Each slot is a row, or counted as left out; but for those that the end of the polling cut off.
+    slots = sum((summary["seconds"] - 0.5) // every for every in periods.values())
+    assert len(polling.rows) + summary["overrun_slots"] >= slots
+
+
+def test_without_a_rate_the_line_is_kept_busy(port: str) -> None:
+    with Polling(line(port, polled(drive(), READINGS))) as polling:
+        polling.until("ok", 100 * len(READINGS))
+    assert len({row.register for row in polling.rows}) == len(READINGS)
+    assert polling.poller.summary()["lines"]["line"]["overrun_slots"] == 0
+
+
+def test_neither_starves_the_other(port: str) -> None:
+    polls = polled(drive(), READINGS).polls[1:] + polled(drive(), READINGS[:1], 0.01).polls
+    with Polling(line(port, PolledDrive(drive(), polls))) as polling:
+        until(lambda: {row.register for row in polling.look() if row.value is not None} == NAMES)
+        polling.until("ok", 100)
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [[{"baudrate": 9600}, {"baudrate": 19_200}], [{"silence": None}, {"silence": 0.01}]],
+    ids=["two baud rates", "two silences"],
+)
+def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) -> None:
+    drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
+    wire = WorldWire([simulated(it) for it in drives], Faults())
+    with World(wire, [polled(it, [Toy.fault]) for it in drives]) as world:
+        rows = world.run(1)[: len(drives)]
+    asked = [int(row.drive.removeprefix("drive-")) for row in rows]
+    assert sorted(asked) == [1, 2, 3, 4, 5, 6]
+    assert len(list(itertools.groupby(asked, lambda at: at % 2))) == 2
+
+
+# ---- rows ----
+
+
+def test_batches_for_a_while(port: str) -> None:
+    with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
+        rows = [row for batch in poller.batches(0.3, every=0.05) for row in batch]
+        samples = [row for row in rows if row.value is not None]
+        assert {row.value for row in samples if row.register == "output_current"} == {3.25}
+        assert all(row.time > row.monotonic_ns > 0 for row in rows)
+        assert all(row.uncertainty_ns is not None and row.uncertainty_ns > 0 for row in samples)
+
+
+def test_batches_until_the_caller_leaves_off(port: str) -> None:
+    with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
+        assert len(next(poller.batches())) > 0
+
+
+@pytest.mark.parametrize("taker", ["pyarrow", "polars"])
+def test_a_batch_is_taken_as_it_is(port: str, taker: str) -> None:
+    module = pytest.importorskip(taker, reason=f"needs {taker}")
+    take = {"pyarrow": "record_batch", "polars": "DataFrame"}[taker]
+    with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
+        batch = next(poller.batches())
+    columns = getattr(module, take)(batch)
+    assert [str(name) for name in columns["register"]] == [row.register for row in batch]
+    assert len(columns["value"]) == len(batch)
+
+
+def test_an_asyncio_program_needs_no_second_api(port: str) -> None:
+    async def three() -> list[Row]:
+        loop = asyncio.get_running_loop()
+        batches: asyncio.Queue[Any] = asyncio.Queue()
+        with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
+            loop.add_reader(poller.fileno(), lambda: batches.put_nowait(poller.take()))
+            found = [await batches.get() for _ in range(3)]
+            loop.remove_reader(poller.fileno())
+        return [row for batch in found if batch for row in batch]
+
+    rows = asyncio.run(three())
+    assert {row.value for row in rows if row.register == "output_current"} - {None} == {3.25}
+
+
+def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poller_module, "RowQueue", lambda: RowQueue(chunk_rows=200, most_chunks=2))
+    with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
+        until(lambda: poller.summary()["dropped"] > 0)
+    rows = rows_of(poller)
+    summary = poller.summary()
+    assert len(rows) <= 400
+    assert len(rows) + summary["dropped"] == summary["samples"] + summary["misses"]
+
+
+# ---- several lines; commands ----
+
+
+def test_many_lines_at_once() -> None:
+    with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
+        drives = [polled(Quick(at, name=f"drive-{at}"), READINGS) for at in range(1, 17)]
+        lines = [line(wire.path, it, name=it.drive.name) for wire, it in zip(sim.wires, drives, strict=True)]
+        threads = threading.active_count()
+        with Polling(*lines) as polling:
+            assert threading.active_count() == threads + 1
+            for it in drives:
+                polling.until("ok", 3 * len(READINGS), it.drive.name)
+    truth = proofs(*drives)
+    assert {(row.drive, row.register): row.value for row in polling.rows if row.value is not None} == truth
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+    assert list(polling.poller.summary()["lines"]) == [f"drive-{at}" for at in range(1, 17)]
+
+
+def test_commands_go_ahead_while_the_line_is_polled(port: str, pump: SimulatedDrive) -> None:
+    with Polling(line(port, polled(drive(), READINGS), name="hall-1")) as polling:
+        bus = polling.poller.bus("hall-1")
+        (ours,) = bus.drives
+        for hz in (10.0, 20.0, 30.0):
+            polling.until("ok")
+            with suppress(Unconfirmed):  # where this machine looked too late at the answer
+                bus.write(ours, Quick.frequency, hz)
+            assert pump["frequency"] == hz
+        assert bus.read(ours, Quick.output_current) == 3.25
+        with pytest.raises(ValueError, match=r"^there is no line 'hall-2'; there are hall-1$"):
+            polling.poller.bus("hall-2")
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+# ---- what the poll reports of faults ----
+
+
+def reply_of(address: int, reply: bytes) -> bytes:
+    """The same reply, by another drive."""
+    return checksums.rtu(f"{address:02X} {reply[1:-2].hex()}")
+
+
+OTHER = checksums.rtu("02 03 02 12 34")
+NOISE = bytes(at * 151 % 256 for at in range(4096))
+
+FAULTS = {  # what becomes of a reply, and what the poll then says: of all, or of some and of the others
+    "cut off": (lambda reply: reply[:-1], {"reply cut short"}),
+    "damaged": (lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), {"bad checksum"}),
+    "twice": (lambda reply: 2 * reply, {"ok"}),
+    "of another drive": (lambda reply: OTHER, {"reply from another address"}),
+    "of another drive, then its own": (lambda reply: OTHER + reply, {"ok"}),
+    "for the wrong address": (lambda reply: reply_of(2, reply), {"reply from another address"}),
+    "to another function": (lambda reply: checksums.rtu("01 04 02 12 34"), {"reply to another function"}),
+    "of another length": (lambda reply: checksums.rtu("01 03 04 12 34 56 78"), {"reply of another length"}),
+    "a stray byte before": (lambda reply: b"\0" + reply, {"ok"}),
+    "noise before": (lambda reply: NOISE + reply, {"ok"}),
+    "lost": (lambda reply: b"", {"no reply"}),
+    "an exception": (lambda reply: checksums.rtu("01 83 02"), {"exception 02"}),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_the_poll_says_of_a_reply(fault: str, pump: SimulatedDrive) -> None:
+    fate, said = FAULTS[fault]
+    # A pty would have no room for so much noise.
+    wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
+    with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
+        for status in said:
+            polling.until(status, 2)
+    assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
+    assert polling.statuses().keys() <= said | HOST_LATE
+    polling.check_summary()
+
+
+def test_a_drive_that_answers_every_second_time(pump: SimulatedDrive) -> None:
+    turns = itertools.cycle([True, False])
+    wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
+    with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
+        for _ in range(3):
+            polling.until("ok")
+            polling.until("not asked: late reply due")
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+def test_a_silence_that_is_too_short_for_the_drive() -> None:
+    """It takes a request that comes before its own silence is over for the rest of the frame before."""
+    strict = simulated(Brisk(1, name="pump-1"))
+    strict.needs_silence = True
+    hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)
+    with Simulator([Wire([strict])]) as sim, Polling(line(sim.wires[0].path, hasty)) as polling:
+        polling.until("ok")
+        polling.until("not asked: late reply due", 2)
+        polling.until("ok")
+    assert strict.counters.early > 0
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+def test_replies_that_come_byte_by_byte(pump: SimulatedDrive) -> None:
+    """From a line at 9600 baud, on which silence is kept: the drive sees no request that is early."""
+    slow = simulated(Slow(1, name="pump-1"))
+    asked = polled(Slow(1, name="pump-1"), Slow.readings())
+    with Simulator([Wire([slow])]) as sim, Polling(line(sim.wires[0].path, asked)) as polling:
+        polling.until("ok", 10 * len(Slow.readings()))
+    misses = polling.statuses().total() - polling.statuses()["ok"]
+    assert slow.counters.damaged == 0
+    assert slow.counters.early <= misses  # none, but for a request that follows a reply given up too soon
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+def test_a_port_that_is_gone_in_the_middle_of_a_reply() -> None:
+    master, slave = os.openpty()
+    with Polling(line(os.ttyname(slave), polled(drive(), READINGS))) as polling:
+        os.read(master, 1024)
+        os.write(master, b"\x01\x03\x0a\0")
+        os.close(slave)
+        os.close(master)
+        polling.until("port lost", 2 * len(READINGS))
+    assert polling.statuses().keys() == {"port lost"}
+    polling.check_summary()
+
+
+def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> None:
+    link = tmp_path / "by-id"
+    asked = [polled(drive(), ONE), polled(drive(2, "pump-2"), ONE, 0.05)]
+    targets: set[Path] = set()
+    with ExitStack() as stack:
+        for number in range(2):
+            wires = [Wire([simulated(it.drive) for it in asked], port=str(link), unpaced=True)]
+            with Simulator(wires):
+                targets.add(link.readlink())
+                # A pty's number is not given again while anybody holds it.
+                stack.callback(os.close, os.open(link, os.O_RDONLY | os.O_NOCTTY))
+                if number == 0:
+                    polling = stack.enter_context(Polling(line(str(link), *asked)))
+                for it in asked:
+                    polling.until("ok", 3, it.drive.name)
+            for it in asked:
+                polling.until("port lost", 2, it.drive.name)
+    assert len(targets) == 2
+    assert polling.statuses().keys() <= {"ok", "port lost"} | HOST_LATE
+    polling.check_summary()
+
+
+def test_a_line_that_is_lost_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
+    link = tmp_path / "hall-2"
+    lines = [
+        line(port, polled(drive(), ONE), name="hall-1"),
+        line(str(link), polled(drive(1, "fan-1"), ONE), name="hall-2"),
+    ]
+    with ExitStack() as stack:
+        with Simulator([Wire([simulated(drive())], port=str(link), unpaced=True)]):
+            polling = stack.enter_context(Polling(*lines))
+            polling.until("ok", 1, "fan-1")
+        polling.until("port lost", 1, "fan-1")
+        polling.until("ok", 100, "pump-1")
+    assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+@pytest.mark.parametrize("slow", ["close", "open"])
+def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
+    port: str, slow: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, is_held_up, may_go_on = tmp_path / "hall-2", threading.Event(), threading.Event()
+    act = getattr(Serial, slow)
+
+    def hold_up(it: Serial) -> None:
+        if it.port == str(link):
+            is_held_up.set()
+            assert may_go_on.wait(PATIENCE)
+        act(it)
+
+    with ExitStack() as stack:
+        lines = [
+            line(port, polled(drive(), ONE, 0.02), name="hall-1"),
+            line(str(link), polled(drive(1, "fan-1"), ONE), name="hall-2"),
+        ]
+        with Simulator([Wire([simulated(drive())], port=str(link), unpaced=True)]):
+            polling = stack.enter_context(Polling(*lines))
+            polling.until("ok", 1, "fan-1")
+            monkeypatch.setattr(Serial, slow, hold_up)
+        stack.callback(may_go_on.set)
+        assert is_held_up.wait(PATIENCE)
+        late = threading.Thread(target=polling.poller.add, args=("hall-2", polled(drive(2, "fan-2"), ONE)))
+        late.start()
+        polling.until("ok", 50, "pump-1")  # more than was queued ahead
+        may_go_on.set()
+        late.join(PATIENCE)
+        polling.until("port lost", 1, "fan-2")
+    assert polling.statuses("pump-1").keys() <= {"ok"} | HOST_LATE
+
+
+def test_a_drive_that_dies_and_comes_back(pump: SimulatedDrive) -> None:
+    other = simulated(drive(2, "pump-2"))
+    asked = [polled(drive(), ONE), polled(drive(), READINGS[:1], 0.05), polled(drive(2, "pump-2"), ONE)]
+    with Simulator([Wire([pump, other], unpaced=True)]) as sim:
+        both = PolledDrive(asked[0].drive, asked[0].polls + asked[1].polls)
+        with Polling(line(sim.wires[0].path, both, asked[2])) as polling:
+            polling.until("ok", 3, "pump-1")
+            pump.deaf_until = float("inf")
+            polling.until("no reply", 2, "pump-1")
+            polling.until("not asked: drive is silent", 3, "pump-1")
+            polling.until("ok", 50, "pump-2")
+            pump.deaf_until = 0.0
+            polling.until("ok", 50, "pump-1")
+    assert polling.statuses().keys() <= {"ok"} | HOST_LATE
+    polling.check_summary()
+
+
+# ---- the end ----
+
+
+def test_a_plant_without_lines_is_polled_in_peace() -> None:
+    with Poller(plant()) as poller:
+        assert poller.fileno() >= 0
+        assert poller.take() is None
+    assert poller.summary()["lines"] == {}
+
+
+@pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
+def test_nothing_is_left_behind(port: str, end: str) -> None:
+    Poller(plant(line(port, polled(drive(), ONE)))).close()  # what the process has once is there now
+    before = descriptors(), threading.active_count()
+    if end == "never entered":
+        Poller(plant(line(port, polled(drive(), ONE)))).close()
+    elif end == "polled":
+        with Polling(line(port, polled(drive(), ONE))) as polling:
+            polling.until("ok")
+    else:
+        master, slave = os.openpty()
+        with Polling(line(os.ttyname(slave), polled(drive(), ONE))) as polling:
+            os.close(slave)
+            os.close(master)
+            polling.until("port lost")
+    assert (descriptors(), threading.active_count()) == before
+
+
+class Patient(Toy):
+    """Answers within a minute."""
+
+    response_timeout = 60.0
+    response_delay = 15.0
+
+
+def patient(every: float | None) -> PolledDrive:
+    """Two requests, to two drives."""
+    polls = polled(Patient(1, name="pump-1"), [Patient.fault]).polls
+    return PolledDrive(Patient(1, name="pump-1"), tuple(replace(it, every=every) for it in polls))
+
+
+@pytest.fixture
+def far_end() -> Iterator[tuple[int, str]]:
+    """A line whose other end is the test's: its descriptor, and the path of the port."""
+    master, slave = os.openpty()
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
+def test_what_is_under_way_at_the_end_is_waited_for(
+    far_end: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, path = far_end
+    answers = [checksums.rtu("01 03 02 00 01")]
+
+    def answer(seconds: float) -> None:
+        while answers:
+            os.write(master, answers.pop())
+        time.sleep(seconds)
+
+    monkeypatch.setattr(poller_module, "PARTING_NS", round(PATIENCE * 1e9))
+    with Polling(line(path, patient(every))) as polling:
+        assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
+        monkeypatch.setattr(poller_module, "sleep", answer)  # when it waits for what is under way
+    assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
+    polling.check_summary()
+
+
+def test_what_is_not_answered_by_the_end_has_a_row(
+    far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
+    monkeypatch.setattr(poller_module, "PARTING_NS", 10_000_000)
+    master, path = far_end
+    short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
+    waiting = polled(Patient(3, name="pump-3"), [Patient.fault], 60.0)
+    with Polling(line(path, patient(0.0001), short, waiting)) as polling:
+        assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
+    told = {(row.drive, row.value, row.status) for row in polling.rows}
+    assert told == {("pump-1", None, "poll ended"), ("pump-2", None, "poll ended")}
+    assert all(row.monotonic_ns > 0 for row in polling.rows)
+    polling.check_summary()
+
+
+@pytest.mark.parametrize("leaves", ["the poll", "the drive"])
+def test_a_slot_that_is_not_over_at_the_end_was_not_missed(far_end: tuple[int, str], leaves: str) -> None:
+    """As at the end of every healthy run: the next value is due already, or about to be."""
+    master, path = far_end
+    first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
+    second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
+    with Polling(line(path, first, second)) as polling:
+        assert os.read(master, 1024)  # the one; the other waits
+        if leaves == "the drive":
+            polling.poller.remove("line", "pump-2")
+        os.write(master, checksums.rtu("01 03 02 00 01"))
+    is_asked, _, _ = select.select([master], [], [], 0)  # the other, just before the end
+    missed = [("pump-2", "poll ended")] if is_asked else []
+    assert [(row.drive, row.status) for row in polling.rows] == [("pump-1", "ok"), *missed]
+    polling.check_summary()
+    assert polling.poller.summary()["misses"] == len(missed)
+
+
+def test_motors_are_stopped_before_the_port_is_closed(port: str, pump: SimulatedDrive) -> None:
+    with Polling(line(port, polled(drive(), ONE))) as polling:
+        bus = polling.poller.bus("line")
+        bus.stop_on_exit()
+        bus.drives[0].start()
+        assert pump["control"] == 1
+        polling.until("ok")
+    assert pump["control"] == 0
+
+
+def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) -> None:
+    Poller(plant(line(port, polled(drive(), ONE)))).close()
+    before = descriptors(), threading.active_count()
+    good, bad = (
+        line(port, polled(drive(), ONE)),
+        line("/dev/null", polled(drive(1, "fan-1"), ONE), name="hall-2"),
+    )
+    for _ in range(2):
+        with pytest.raises(LineError, match=r"^/dev/null: it is not a serial port$"):
+            Poller(plant(good, bad))
+    assert (descriptors(), threading.active_count()) == before
+
+
+def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
+    with Poller(plant(line(port, polled(drive(), ONE)))) as poller:
+        until(lambda: poller.summary()["samples"])
+    poller.close()  # twice is no mistake
+    assert len(rows_of(poller)) == poller.summary()["samples"]
+    assert poller.take() is None
+
+
+def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
+    """Nothing was queued on it yet, whatever was carried out on the one before."""
+    sim = simulated(drive())
+    with World(WorldWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as world:
+        world.run(1.0)
+        (tended,) = world.poller._lines
+        assert tended._done
+        assert world.port
+        tended._lose(world.port, world.now)
+        tended.bus.line.reopen()

@@ -1,0 +1,318 @@
+"""Stories of a path that holds everything up and keeps the order: a modem, a gateway, a stalled network.
+
+No value is another register's, and values keep coming; on a world's clock.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from random import Random
+from typing import Any, cast
+
+import pytest
+from lines import proof
+from motors import MAKE, Heard
+from test_hostile_line import LINES, Story, of_all_variants, of_one_variant
+from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
+
+from multidrop import bus
+from multidrop.bus import Bus
+from multidrop.control import call, performer
+from multidrop.control import identity as identity_check
+from multidrop.control import writer as writing
+from multidrop.control.outcome import Effect
+from multidrop.core import Completion, Exchange, Message
+from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import BusError
+from multidrop.sim import EncodedDrive, Faults, PoweredDrive, SimulatedDrive, simulated
+from multidrop.transport import exchange as exchanges
+
+pytestmark = pytest.mark.story
+
+Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
+
+SECONDS = 150.0  # of a story: what is outstanding is remembered for 120 s
+TAIL = 20.0  # s at its end, and TURNS times the delay, in which every drive must have answered
+TURNS = 20
+S = 1_000_000_000
+
+
+class PathWire(WorldWire):
+    """A hostile wire at the far end of a path that delays what the drives say."""
+
+    delay: Delay
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._path: deque[tuple[float, bytes]] = deque()
+
+    def advance(self, now: float) -> bytes:
+        said = super().advance(now)
+        if said:
+            before = self._path[-1][0] if self._path else 0.0
+            self._path.append((max(before, now + self.delay(now)), said))
+        heard = b""
+        while self._path and self._path[0][0] <= now:
+            heard += self._path.popleft()[1]
+        return heard
+
+    @property
+    def wake(self) -> float | None:
+        arrival = self._path[0][0] if self._path else None
+        return min((time for time in (super().wake, arrival) if time is not None), default=None)
+
+
+def constant(seconds: float) -> Delay:
+    return lambda now: seconds
+
+
+def jittering(seconds: float) -> Delay:
+    random = Random(1)
+    return lambda now: seconds * random.uniform(0.8, 1.2)
+
+
+def stalling(longest: float) -> Delay:
+    """Twelve stalls of up to so many seconds, in which everything waits for the end."""
+    random = Random(2)
+    begins = [random.uniform(2.0, SECONDS) for _ in range(12)]
+    stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
+
+    def delay(now: float) -> float:
+        now -= 1000.0  # when a world begins
+        return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
+
+    return delay
+
+
+class Path(Story):
+    """A line behind such a path."""
+
+    wires = PathWire
+
+    def tell_of(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
+        """Judge every row; the drives of which values came in the end."""
+        self.wire.delay = delay
+        with self.world:
+            self.run(SECONDS)
+            tail = self.run(tail_s)
+        self.judge_values()
+        return {row.drive for row in tail if row.value is not None}
+
+
+def usually(tried: object, *others: object) -> list[Any]:
+    """The one that is always tried, and those that take long."""
+    return [tried, *(pytest.param(other, marks=pytest.mark.long) for other in others)]
+
+
+PATHS = [
+    pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
+    for path, delays in (
+        (constant, (0.0, 0.1, 0.3, 0.45, 0.6, 1.5, 4.0, 10.0)),
+        (jittering, (0.3, 0.6, 10.0)),
+    )
+    for seconds in delays
+]
+FEW = [
+    pytest.param(name, marks=() if name in ("innovert-ibd rtu", "yd1000 rtu") else pytest.mark.long)
+    for name in LINES
+]
+STALLS = usually(0.9, 0.1, 0.3, 3.0, 15.0, 60.0)
+
+
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
+@pytest.mark.parametrize("name", LINES)
+def test_a_slow_path_costs_time_and_no_truth(
+    name: str, seconds: float, path: Callable[[float], Delay]
+) -> None:
+    story = Path(of_one_variant(LINES[name]))
+    answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
+    assert answering == {drive.name for drive in story.drives}
+
+
+@pytest.mark.parametrize("longest", STALLS)
+@pytest.mark.parametrize("name", FEW)
+def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
+    Path(of_one_variant(LINES[name])).tell_of(stalling(longest))
+
+
+class PathLine:
+    """What a bus sees of a line behind such a path; time passes only while it waits."""
+
+    def __init__(self, wire: PathWire) -> None:
+        self.port = self.identity = "world"
+        self.now = BEGIN_NS
+        self.wire = wire
+        self.is_called = self.has_echo = self.is_lost = False
+        self.queue = WorldPort(cast(World, self))
+
+    def require(self, settings: tuple[int, str]) -> None:
+        pass
+
+    def overruns(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def send(self, request: bytes, baudrate: int) -> None:
+        self.wire.receive(request, self.now / S, baudrate)
+
+    def sleep(self, seconds: float) -> None:
+        self._pass_until(self.now + round(seconds * S))
+
+    def carry_out(self, exchange: Exchange, *, expires_ns: int = 0) -> Completion:
+        self.queue.granted = None
+        self.queue.urgent.append(exchange)
+        self._pass_until(self.now + 1000 * S)
+        assert self.queue.granted
+        return self.queue.granted
+
+    def _pass_until(self, end_ns: int) -> None:
+        is_awaited = self.queue.granted is None
+        while self.now < end_ns and not (is_awaited and self.queue.granted):
+            wake = self.queue.advance(self.wire.advance(self.now / S))
+            at = self.wire.wake
+            arrival = NEVER if at is None else -int(-at * S // 1)
+            if not (is_awaited and self.queue.granted):
+                self.now = min(max(min(wake, arrival), self.now + 1), end_ns)
+
+
+@pytest.fixture
+def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLine]]:
+    def made(sims: list[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
+        wire = PathWire(sims, Faults())
+        wire.delay = delay
+        wire.open()
+        line = PathLine(wire)
+        monkeypatch.setattr(bus, "Line", lambda port, echo: line)
+        for module in (bus, exchanges, writing, identity_check, performer, call):
+            monkeypatch.setattr(module, "now_ns", lambda: line.now, raising=False)
+            monkeypatch.setattr(module, "sleep", line.sleep, raising=False)
+        opened = Bus("world")
+        for sim in sims:
+            opened.attach(sim.drive)
+        return opened, line
+
+    return made
+
+
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
+@pytest.mark.parametrize("name", LINES)
+def test_what_a_bus_reads_over_a_slow_path_is_true(
+    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    """Four registers of each of two drives, read one after another by a client that only tries again."""
+    drives = of_one_variant(LINES[name])
+    opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
+    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
+    read: Counter[str] = Counter()
+    with opened:
+        for _ in range(24):
+            for drive, register in asked:
+                try:
+                    value = opened.read(drive, register)
+                except BusError:
+                    line.sleep(0.05)
+                else:
+                    assert value == proof(drive, register)
+                    read[drive.name] += 1
+    assert set(read) == {drive.name for drive in drives}
+
+
+WRITTEN = {
+    "setpoint": InvtCHE(1),
+    "frequency": YD1000(1),
+    "acceleration_time": InnovertIBD(1, ram=["acceleration_time"]),
+    "deceleration_time": ErmanERG220(1, ram=["deceleration_time"]),
+}
+
+
+@pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_became_of_a_write_over_a_slow_path_is_true(
+    name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = WRITTEN[name]
+    sim = simulated(drive)
+    opened, line = path_of([sim], constant(seconds))
+    register = drive.register(name)
+    done = 0
+    with opened:
+        for turn in range(30):
+            asked = float(10 + turn % 3)
+            try:
+                outcome = opened.try_write(drive, register, asked)
+            except BusError:
+                line.sleep(0.05)
+                continue
+            if outcome.effect is Effect.UNCONFIRMED:
+                continue
+            assert outcome.effect is Effect.DONE
+            assert (outcome.held, sim[name]) == (asked, asked)
+            done += 1
+    assert done > 10
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_write_has_the_time_that_reads_did_not_need(
+    name: str, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = WRITTEN[name]
+    opened, line = path_of([simulated(drive)], constant(0.0))
+    register = drive.register(name)
+    with opened:
+        for _ in range(12):
+            opened.read(drive, register)
+        assert opened.peer(drive).timeout < 0.15
+        line.wire.delay = constant(0.25)
+        assert opened.try_write(drive, register, 11.0).effect is Effect.DONE
+
+
+def test_reads_of_a_delixi_have_the_80_ms_of_its_document(
+    path_of: Callable[..., tuple[Bus, PathLine]],
+) -> None:
+    for drive in (DelixiModbus(1), DelixiNative(1)):
+        opened, _ = path_of([simulated(drive)], constant(0.0))
+        with opened:
+            for _ in range(30):
+                opened.read(drive, drive.register("fault"))
+            assert opened.peer(drive).timeout == 0.08
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("model", MAKE)
+def test_a_stop_over_a_slow_path_is_seen_to_be_done(
+    model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    """Its first frame leaves at once; what it asks then waits for as long as answers are known to take."""
+    drive = MAKE[model](1)
+    sim = simulated(drive)
+    assert isinstance(sim, PoweredDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    opened, line = path_of([sim], constant(seconds))
+    heard = Heard(sim)
+    sent_after: list[float] = []
+    begun = line.now
+
+    def note(request: Message) -> bool:
+        if request in heard.writes:
+            sent_after.append((line.now - begun) / S)
+        return False
+
+    heard.loses = note
+    with opened:
+        line.wire.advance(line.now / S)  # its clock begins
+        sim.motor.run(1)
+        opened.drives[0].stop()
+    assert not sim.motor.energised
+    assert sent_after[0] < 1  # after the looks that are answered, and one that is not
+    assert len(sent_after) <= 6
+    assert (line.now - begun) / S < 8 * seconds + 3
+
+
+@pytest.mark.parametrize("kind", usually("drop", "flip", "split", "noise"))
+def test_all_families_on_a_slow_path_that_is_rough_too(kind: str) -> None:
+    story = Path(of_all_variants())
+    story.wire.faults = Faults(**{kind: 0.1})
+    story.tell_of(stalling(3.0))

@@ -1,0 +1,179 @@
+"""Clients that are killed at random while they poll, record and write: what they told of is there, once.
+
+Acknowledged is what a client said after the call had returned: rows that `Writer.write` took, and
+numbers that `Bus.write` confirmed. 20 are killed here, and as many as one likes by
+`pytest tests/recording/test_crash.py --kills 200`.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+from time import sleep
+
+import pytest
+from lines import until
+from mortal import METADATA, NAME, Counted, audit, ledger
+
+from multidrop.control.audit_log import read_audit
+from multidrop.polling.batch import Row
+from multidrop.recording import open_reader
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.sim.memory import MemoryCell
+
+SEED = 6
+MOST_TOLD = 9  # lines that a client tells before it is killed
+LONGEST_WAIT = 0.03  # s, from then until it is
+
+
+class Counting(SimulatedDrive):
+    """Its count is how often it was read, and it remembers every number that was written to it."""
+
+    def __init__(self) -> None:
+        super().__init__(Counted(1, name=NAME))
+        self.reads = 0
+        self.numbers: list[int] = []
+
+    def refresh(self, cell: MemoryCell) -> None:
+        if cell.register is Counted.count and cell.address == Counted.count.address:
+            self.reads += 1
+            self.memory.set_raw(Counted.count, self.reads)
+
+    def accept(self, cell: MemoryCell, raw: int) -> int:
+        self.numbers.append(raw)
+        return raw
+
+
+class Nursery:
+    """A process whose children live until they are killed."""
+
+    def __init__(self, port: str, directory: Path) -> None:
+        self._port = port
+        self._directory = directory
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).parents[1] / "support" / "mortal.py")],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+        )
+
+    def live(self, life: str, number: int, lines: int, seconds: float) -> int:
+        """Let one live until it has told so much, and a little longer; kill it, and say what it died of."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{self._port} {self._directory} {life} {number}\n")
+        child = int(self._process.stdout.readline())
+        try:
+            until(lambda: len(told(self._directory, life)) >= lines)
+            sleep(seconds)
+        finally:
+            os.kill(child, signal.SIGKILL)
+        return int(self._process.stdout.readline())
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+@pytest.fixture
+def counting() -> Counting:
+    return Counting()
+
+
+@pytest.fixture
+def nursery(counting: Counting, tmp_path: Path) -> Iterator[Nursery]:
+    with Simulator([Wire([counting], unpaced=True)]) as simulator:
+        nursery = Nursery(simulator.wires[0].path, tmp_path)
+        yield nursery
+        nursery.close()
+
+
+def told(directory: Path, life: str) -> list[str]:
+    """What it said; a line that was torn was not said."""
+    path = directory / f"{life}.told"
+    return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
+
+
+def check_rows(rows: Sequence[Row]) -> None:
+    """The count grew by one from sample to sample, but for exchanges that are rows without a value.
+
+    On a busy machine a drive is thought silent: that it was not asked is told when it would have been.
+    """
+    samples = [row for row in rows if row.value is not None]
+    assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
+    last, missed = None, 0
+    for row in rows:
+        if row.value is None:
+            missed += 1
+            continue
+        assert last is None or last < row.value <= last + missed + 1
+        last, missed = row.value, 0
+
+
+def check_recordings(directory: Path, life: str, acknowledged: int | None) -> int:
+    """Both open, and hold at least the rows that were told of; how many that were."""
+    for suffix in (".arrows", ".csv"):
+        path = directory / f"{life}{suffix}"
+        if acknowledged is None and (not path.exists() or not path.stat().st_size):
+            continue  # killed before it had begun the recording
+        reader = open_reader(path)
+        assert reader.metadata == METADATA
+        rows = [row for batch in reader for row in batch]
+        assert len(rows) >= (acknowledged or 0)
+        check_rows(rows)
+    return acknowledged or 0
+
+
+def check_ledger(directory: Path, sent: int, lives: int) -> None:
+    """Every write that was sent is counted; one more for each client that was killed in between."""
+    book = ledger(directory)
+    if not book.path.exists():
+        assert sent == 0
+        return
+    with closing(sqlite3.connect(book.path)) as opened:
+        assert opened.execute("pragma integrity_check").fetchall() == [("ok",)]
+    counted = sum(wear.writes for wear in book.wear(0.0))
+    assert sent <= counted <= sent + lives
+
+
+def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[int], lives: int) -> None:
+    """Every acknowledged write is there as done, none is there twice, and none that was not sent."""
+    path = audit(directory)
+    records = list(read_audit(path)) if path.exists() else []
+    noted = [int(str(it["write"]).removeprefix("number = ")) for it in records]
+    assert all(it["outcome"] == "done" for it in records)
+    assert all(before < after for before, after in pairwise(noted))
+    assert set(acknowledged) <= set(noted) <= set(numbers)
+    assert len(numbers) - lives <= len(noted)
+
+
+def test_what_a_killed_client_told_of_is_there_once(
+    request: pytest.FixtureRequest, nursery: Nursery, counting: Counting, tmp_path: Path
+) -> None:
+    chance = random.Random(SEED)
+    kills = request.config.getoption("--kills")
+    rows = 0
+    acknowledged: list[int] = []
+    for life in range(kills):
+        next_number = counting.numbers[-1] + 1 if counting.numbers else 1
+        lines, seconds = chance.randint(0, MOST_TOLD), chance.uniform(0.0, LONGEST_WAIT)
+        died_of = nursery.live(str(life), next_number, lines, seconds)
+        assert died_of == signal.SIGKILL, f"life {life} ended by itself"
+        said = {word: int(number) for word, number in map(str.split, told(tmp_path, str(life)))}
+        rows += check_recordings(tmp_path, str(life), said.get("rows"))
+        acknowledged += range(next_number, said.get("wrote", 0) + 1)
+        numbers = list(counting.numbers)
+        assert all(before < after for before, after in pairwise(numbers)), "a write was sent twice"
+        check_ledger(tmp_path, len(numbers), life + 1)
+        check_audit(tmp_path, numbers, acknowledged, life + 1)
+    assert rows > kills
+    assert len(acknowledged) > kills
+    print(f"{kills} clients killed; they told of {rows} rows and {len(acknowledged)} writes")

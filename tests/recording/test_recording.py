@@ -1,0 +1,422 @@
+"""Recordings: what is written is read, by us and by others, and stays the same when converted."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import struct
+import sys
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from batches import EXAMPLE, METADATA, counting, example
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_batch import SCHEMA, rows_of
+
+from multidrop.polling.batch import Row, Rows
+from multidrop.recording import (
+    FORMATS,
+    Metadata,
+    RecordingError,
+    RecordingReader,
+    RecordingWriter,
+    convert,
+    open_reader,
+    open_writer,
+    repair,
+)
+from multidrop.recording.parquet import GROUP_ROWS
+from multidrop.recording.rows import from_rows
+
+every_format = pytest.mark.parametrize("suffix", FORMATS)
+
+
+def record(path: Path, metadata: Metadata = METADATA) -> Path:
+    """The example and 2500 rows more, in three batches."""
+    with open_writer(path, metadata) as writer:
+        for batch in (example(), counting(2000), counting(500, 2000)):
+            writer.write(batch)
+        assert writer.rows == 2505
+    return path
+
+
+RECORDED = [*EXAMPLE, *counting(2000), *counting(500, 2000)]
+
+
+def rows(reader: RecordingReader) -> list[Row]:
+    return [row for batch in reader for row in batch]
+
+
+@every_format
+def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
+    reader = open_reader(record(tmp_path / f"a{suffix}"))
+    assert reader.metadata == METADATA
+    assert reader.torn == 0
+    assert rows(reader) == RECORDED
+    assert rows(reader) == RECORDED  # and again
+
+
+@every_format
+def test_empty_recording(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    open_writer(path, {}).close()
+    assert rows(open_reader(path)) == []
+    path = tmp_path / f"b{suffix}"
+    with open_writer(path, {}) as writer:
+        writer.write(counting(0))
+    assert rows(open_reader(path)) == []
+
+
+@every_format
+def test_batches_that_are_read_are_arrow_too(tmp_path: Path, suffix: str) -> None:
+    found = [pa.record_batch(batch) for batch in open_reader(record(tmp_path / f"a{suffix}"))]
+    for batch in found:
+        batch.validate(full=True)
+        assert batch.schema.equals(SCHEMA)
+    assert [row for batch in found for row in rows_of(batch)] == RECORDED
+
+
+@every_format
+def test_a_recording_never_takes_the_place_of_another(tmp_path: Path, suffix: str) -> None:
+    path = record(tmp_path / f"a{suffix}")
+    sentence = rf"a{suffix} is there already: name another file, or remove it first$"
+    with pytest.raises(ValueError, match=sentence):
+        open_writer(path, {"second": True})
+    other = record(tmp_path / "b.csv")
+    with pytest.raises(ValueError, match=sentence):
+        convert(other, path)
+    reader = open_reader(path)
+    assert (rows(reader), reader.metadata) == (RECORDED, METADATA)
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_every_batch_can_be_read_before_the_recording_is_closed(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        assert rows(open_reader(path)) == []
+        for at in range(3):
+            writer.write(counting(10, 10 * at))
+            assert rows(open_reader(path)) == list(counting(10 * at + 10))
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_reader_keeps_to_what_was_there_when_it_was_opened(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(10))
+        reader = open_reader(path)
+        writer.write(counting(10, 10))
+        assert rows(reader) == list(counting(10))
+
+
+# ---- opened by others ----
+
+
+def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
+    with pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()) as stream:
+        table = stream.read_all()
+    table.validate(full=True)
+    assert table.schema.equals(SCHEMA)
+    assert json.loads(table.schema.metadata[b"multidrop"]) == METADATA
+    assert rows_of(table) == RECORDED
+
+
+def test_polars_opens_all(tmp_path: Path) -> None:
+    polars = pytest.importorskip("polars", reason="needs polars")
+    physical = polars.col("time").to_physical()
+    arrows = polars.read_ipc_stream(record(tmp_path / "a.arrows")).with_columns(physical)
+    parquet = polars.read_parquet(record(tmp_path / "a.parquet")).with_columns(physical)
+    text = polars.read_csv(record(tmp_path / "a.csv"))
+    assert [Row(*row) for row in arrows.iter_rows()] == RECORDED
+    assert [Row(*row) for row in parquet.iter_rows()] == RECORDED
+    assert text.drop("time").rows() == [row[1:] for row in RECORDED]
+    times = text["time"].str.to_datetime("%Y-%m-%dT%H:%M:%S%.9fZ", time_unit="ns").to_physical()
+    assert times.to_list() == [row.time for row in RECORDED]
+
+
+def test_pandas_opens_parquet_and_csv(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    for frame in (
+        pandas.read_parquet(record(tmp_path / "a.parquet")),
+        pandas.read_csv(record(tmp_path / "a.csv"), parse_dates=["time"]),
+    ):
+        assert [time.value for time in frame["time"]] == [row.time for row in RECORDED]
+        assert list(frame["value"].isna()) == [row.value is None for row in RECORDED]
+        assert list(frame["value"].dropna()) == [row.value for row in RECORDED if row.value is not None]
+        assert list(frame["status"]) == [row.status for row in RECORDED]
+
+
+def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+    columns = "epoch_ns(time), monotonic_ns, uncertainty_ns, drive, register, value, status"
+    parquet = duckdb.sql(f"select {columns} from '{record(tmp_path / 'a.parquet')}'").fetchall()
+    assert [Row(*row) for row in parquet] == RECORDED
+    text = duckdb.sql(f"select * exclude (time) from '{record(tmp_path / 'a.csv')}'").fetchall()
+    assert text == [row[1:] for row in RECORDED]
+
+
+def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(from_rows([Row(0, 0, None, "h\u00e9", "r", None, "no reply")] * 2))
+    content, whole, cut = path.read_bytes(), struct.pack("<3i", 0, 3, 6), struct.pack("<3i", 0, 2, 6)
+    assert content.count(whole) == 1
+    path.write_bytes(content.replace(whole, cut))
+    with pytest.raises(ValueError, match="is damaged after row 0: its text is not UTF-8"):
+        list(open_reader(path))
+
+
+def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path) -> None:
+    batch, times = counting(1024), GROUP_ROWS // 1024 + 1
+    with open_writer(tmp_path / "a.parquet", METADATA) as writer:
+        for _ in range(times):
+            writer.write(batch)
+    about = pa.parquet.read_metadata(tmp_path / "a.parquet")
+    assert [about.row_group(at).num_rows for at in range(about.num_row_groups)] == [GROUP_ROWS, 1024]
+    assert [row for rows in open_reader(tmp_path / "a.parquet") for row in rows] == [*batch] * times
+
+
+def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:
+    group = pa.parquet.read_metadata(record(tmp_path / "a.parquet")).row_group(0)
+    encodings = {group.column(at).path_in_schema: group.column(at).encodings for at in range(7)}
+    assert all("RLE_DICTIONARY" in encodings[name] for name in ("drive", "register", "status"))
+
+
+def test_csv_as_it_stands(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "a.csv", METADATA) as writer:
+        writer.write(example())
+    assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines() == [
+        "time,monotonic_ns,uncertainty_ns,drive,register,value,status",
+        "2026-11-21T09:30:00.123456789Z,1000000000,7,pump-1,output_frequency,49.99,ok",
+        "2026-11-21T09:30:00.123456789Z,1000000000,7,pump-1,motor_speed,0.3,ok",
+        '2026-11-21T09:30:01.123456789Z,2000000000,,"fan, the ""old"" one",output_frequency,,exception 12',
+        "2026-11-21T09:30:02.123456789Z,3000000000,,насос,motor_speed,,no reply",
+        '2026-11-21T09:30:03.123456789Z,4000000000,,"fan, the ""old"" one",motor_speed,,'
+        "not asked: drive is silent",
+    ]
+    assert json.loads((tmp_path / "a.csv.json").read_text(encoding="utf-8")) == METADATA
+
+
+def test_csv_without_its_metadata_is_read_all_the_same(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.csv")
+    (tmp_path / "a.csv.json").unlink()
+    reader = open_reader(path)
+    assert (reader.metadata, rows(reader)) == ({}, RECORDED)
+
+
+# ---- any rows at all ----
+
+INT64 = st.integers(-(2**63), 2**63 - 1)
+ANY = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+NAME = ANY | st.text("'=+-@\t\r\nx", max_size=4)  # what a spreadsheet may take for a formula
+SAMPLE = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.floats(allow_nan=False), st.just("ok"))
+NO_NUMBER = st.builds(Row, INT64, INT64, INT64, NAME, NAME, st.just(math.nan), st.just("ok"))
+MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
+
+
+@every_format
+@settings(max_examples=60, deadline=None)
+@given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
+def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: list[Row]) -> None:
+    assert rows_of(pa.record_batch(from_rows(some))) == some
+    path = tmp_path_factory.mktemp("any") / f"a{suffix}"
+    with open_writer(path, {}) as writer:
+        writer.write(from_rows(some))
+    assert rows(open_reader(path)) == some
+
+
+@every_format
+@pytest.mark.parametrize("target", FORMATS)
+@settings(max_examples=20, deadline=None)
+@given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
+def test_any_batches_converted(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
+) -> None:
+    """A drive may send floating-point numbers that are none; nothing equals them but their name."""
+    folder = tmp_path_factory.mktemp("any")
+    with open_writer(folder / f"a{suffix}", {}) as writer:
+        for some in filter(None, batches):
+            writer.write(from_rows(some))
+    written = [row for some in batches for row in some]
+    assert convert(folder / f"a{suffix}", folder / f"b{target}") == len(written)
+    assert repr(rows(open_reader(folder / f"b{target}"))) == repr(written)
+
+
+def as_text(name: str) -> str:
+    """As it stands in a cell: no spreadsheet takes it for a formula."""
+    return f"'{name}" if name.lstrip("'")[:1] in tuple("=+-@\t\r\n") else name
+
+
+@settings(max_examples=60, deadline=None)
+@given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
+def test_any_csv_means_the_same_to_another_reader(
+    tmp_path_factory: pytest.TempPathFactory, some: list[Row]
+) -> None:
+    path = tmp_path_factory.mktemp("any") / "a.csv"
+    with open_writer(path, {}) as writer:
+        writer.write(from_rows(some))
+    with path.open(encoding="utf-8", newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [(row["drive"], row["register"], row["status"]) for row in found] == [
+        tuple(map(as_text, (row.drive, row.register, row.status))) for row in some
+    ]
+    for row, expected in zip(found, some, strict=True):
+        second = datetime.fromisoformat(row["time"][:19] + "+00:00")
+        assert int(second.timestamp()) * 10**9 + int(row["time"][20:29]) == expected.time
+        assert (float(row["value"]) if row["value"] else None) == expected.value
+
+
+FORMULAS = ("=1+1", "+cmd|' /C calc'!A0", "-2", "@SUM(A1)", "\t=1", "\r=1", "'=1", "''-", "'old'", "a=b", "")
+
+
+def test_no_text_of_a_csv_is_a_formula_and_all_come_back(tmp_path: Path) -> None:
+    some = [Row(1, 1, None, name, name, None, name) for name in FORMULAS]
+    with open_writer(tmp_path / "a.csv", {}) as writer:
+        writer.write(from_rows(some))
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        found = [tuple(row[name] for name in ("drive", "register", "status")) for row in csv.DictReader(file)]
+    cells = [drive for drive, _, _ in found]
+    assert found == [(cell, cell, cell) for cell in cells]
+    assert not [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert cells[6:] == ["''=1", "'" + "''-", "'old'", "a=b", ""]
+    assert rows(open_reader(tmp_path / "a.csv")) == some
+
+
+# ---- converting ----
+
+
+@every_format
+@pytest.mark.parametrize("target", FORMATS)
+def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -> None:
+    assert convert(record(tmp_path / f"a{suffix}"), tmp_path / f"b{target}") == 2505
+    reader = open_reader(tmp_path / f"b{target}")
+    assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
+
+
+def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
+    """Peak memory of a conversion of 40 MB stays far below them."""
+    tracemalloc = pytest.importorskip("tracemalloc")
+    with open_writer(tmp_path / "a.arrows", {}) as writer:
+        batch = counting(16384)
+        for _ in range(40):
+            writer.write(batch)
+    size = (tmp_path / "a.arrows").stat().st_size
+    tracemalloc.start()
+    convert(tmp_path / "a.arrows", tmp_path / "b.arrows")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert size > 35e6
+    assert peak < size / 5
+
+
+def test_nothing_is_converted_into_itself(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.arrows")
+    (tmp_path / "link.arrows").symlink_to(path)
+    for target in (path, tmp_path / "link.arrows"):
+        with pytest.raises(ValueError, match=r"a\.arrows cannot be converted into itself"):
+            convert(path, target)
+    assert rows(open_reader(path)) == RECORDED
+
+
+def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) -> None:
+    target = record(tmp_path / "b.arrows")
+    (tmp_path / "a.csv").write_text("time,value\n")
+    with pytest.raises(ValueError, match=r"a\.csv is not a recording"):
+        convert(tmp_path / "a.csv", target)
+    with pytest.raises(FileNotFoundError):
+        convert(tmp_path / "c.csv", target)
+    assert rows(open_reader(target)) == RECORDED
+
+
+DAMAGED_AT = {".arrows": b"okok", ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
+
+
+@every_format
+@pytest.mark.parametrize("target", FORMATS)
+def test_half_a_conversion_is_left_nowhere(tmp_path: Path, suffix: str, target: str) -> None:
+    """The error is about the recording, in words of ours."""
+    path = record(tmp_path / f"a{suffix}")
+    content = path.read_bytes()
+    at = content.index(DAMAGED_AT[suffix], 0 if suffix == ".parquet" else len(content) // 2) + 4
+    path.write_bytes(content[:at] + b"\xff" * 64 + content[at + 64 :])
+    before = set(tmp_path.iterdir())
+    damage = rf"a{suffix}(, line \d+: not a row of a recording| is damaged after row \d+)"
+    with pytest.raises(ValueError, match=damage) as failure:
+        convert(path, tmp_path / f"b{target}")
+    assert set(tmp_path.iterdir()) == before
+    for foreign in ("codec", "Arrow", "thrift", "ZSTD", "isoformat", "literal", "\n"):
+        assert foreign not in str(failure.value)
+
+
+@every_format
+def test_a_conversion_that_is_broken_off_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    path = record(tmp_path / "a.csv")
+    before = set(tmp_path.iterdir())
+
+    def interrupted(reader: object) -> Iterator[Rows]:
+        yield counting(10)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("multidrop.recording.csv.CsvReader.__iter__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        convert(path, tmp_path / f"b{suffix}")
+    assert set(tmp_path.iterdir()) == before
+
+
+# ---- mistakes ----
+
+
+@pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_reader, repair])
+@pytest.mark.parametrize("name", ["a.xlsx", "a", "arrows", "a.arrow"])
+def test_unknown_suffix(tmp_path: Path, act: object, name: str) -> None:
+    assert callable(act)
+    with pytest.raises(ValueError, match=rf"{name}: a recording's name ends in \.arrows, \.csv, \.parquet"):
+        act(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@every_format
+def test_metadata_that_json_cannot_hold(tmp_path: Path, suffix: str) -> None:
+    path = record(tmp_path / f"a{suffix}")
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        open_writer(path, {"drives": object()})
+    assert rows(open_reader(path)) == RECORDED
+
+
+@every_format
+def test_closing_twice_is_harmless_and_nothing_is_written_afterwards(tmp_path: Path, suffix: str) -> None:
+    writer: RecordingWriter = open_writer(tmp_path / f"a{suffix}", {})
+    writer.write(example())
+    writer.close()
+    writer.close()
+    with pytest.raises(ValueError, match=r"closed|released"):
+        writer.write(example())
+    assert rows(open_reader(tmp_path / f"a{suffix}")) == EXAMPLE
+
+
+@pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_reader])
+def test_parquet_without_pyarrow_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: object
+) -> None:
+    assert callable(act)
+    path = record(tmp_path / "a.parquet")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(RecordingError, match=r"Parquet needs pyarrow: pip install 'multidrop\[parquet\]'"):
+        act(path)
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_neither_arrows_nor_csv_need_pyarrow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    for name in ("pyarrow", "numpy", "pandas", "polars"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert rows(open_reader(record(tmp_path / f"a{suffix}"))) == RECORDED

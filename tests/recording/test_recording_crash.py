@@ -1,0 +1,462 @@
+"""Recordings whose writer was killed, whose disk was full, or which are none: what is whole is kept."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
+from disks import full_at, read_only_directory
+from test_batch import rows_of
+from toy import Toy
+
+from multidrop.core import Columns
+from multidrop.polling.batch import Batch, Row
+from multidrop.recording import FORMATS, RecordingError, RecordingReader, open_reader, open_writer, repair
+from multidrop.recording.append_file import WholeFile
+
+growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+ROWS = 20  # of a batch
+
+
+def rows(reader: RecordingReader) -> list[Row]:
+    return [row for batch in reader for row in batch]
+
+
+def record(path: Path, batches: int) -> list[int]:
+    """Count up; the length of the file after its head and after each batch."""
+    lengths = []
+    with open_writer(path, METADATA) as writer:
+        lengths.append(path.stat().st_size)
+        for at in range(batches):
+            writer.write(counting(ROWS, at * ROWS))
+            lengths.append(path.stat().st_size)
+    return lengths
+
+
+# ---- torn ends ----
+
+
+def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    lengths = record(path, 12)
+    whole = path.read_bytes()
+    expected = list(counting(12 * ROWS))
+    cuts = random.Random(1).sample(range(lengths[0], len(whole) + 1), 200)
+    for cut in {*cuts, *lengths}:
+        path.write_bytes(whole[:cut])
+        batches = sum(length <= cut for length in lengths) - 1
+        reader = open_reader(path)
+        assert reader.torn == cut - lengths[batches]
+        assert reader.metadata == METADATA
+        assert rows(reader) == expected[: batches * ROWS]
+
+
+def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    lengths = record(path, 3)
+    whole = path.read_bytes()
+    expected = list(counting(3 * ROWS))
+    for cut in random.Random(2).sample(range(lengths[0], len(whole) + 1), 200):
+        path.write_bytes(whole[:cut])
+        kept = whole[:cut].rpartition(b"\n")[0] + b"\n"
+        reader = open_reader(path)
+        assert reader.torn == cut - len(kept)
+        assert rows(reader) == expected[: kept.count(b"\n") - 1]
+
+
+def test_no_drive_has_a_name_of_two_lines() -> None:
+    """A line of text that is torn within a name would look whole."""
+    with pytest.raises(ValueError, match=r"the name 'pump\\n1' is not one line"):
+        Toy(1, name="pump\n1")
+
+
+def test_long_torn_line_of_csv(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    record(path, 1)
+    with path.open("ab") as file:
+        file.write(bytes(200_000))
+    reader = open_reader(path)
+    assert (reader.torn, rows(reader)) == (200_000, list(counting(ROWS)))
+
+
+def test_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    lengths = record(path, 3)
+    os.truncate(path, lengths[3] - 9)
+    with pytest.raises((OSError, pa.ArrowInvalid)), pa.ipc.open_stream(path.read_bytes()) as stream:
+        stream.read_all()
+    assert repair(path) == lengths[3] - 9 - lengths[2]
+    assert path.stat().st_size == lengths[2]
+    with pa.ipc.open_stream(path.read_bytes()) as stream:
+        assert rows_of(stream.read_all()) == list(counting(2 * ROWS))
+    polars = pytest.importorskip("polars", reason="needs polars")
+    assert len(polars.read_ipc_stream(path)) == 2 * ROWS
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_whole_recording_is_left_alone_by_repair(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    record(path, 2)
+    before = path.read_bytes()
+    assert repair(path) == 0
+    assert path.read_bytes() == before
+
+
+def test_end_marker_of_other_writers_is_not_torn(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    table = pa.table(example())
+    with pa.ipc.new_stream(path, table.schema) as stream:
+        stream.write_table(table)
+    reader = open_reader(path)
+    assert (reader.torn, reader.metadata, rows(reader)) == (0, {}, list(example()))
+
+
+# ---- killed ----
+
+RECORD_FOR_EVER = """
+import sys
+sys.path[:0] = sys.argv[2:]
+from itertools import count
+from batches import METADATA, counting
+from multidrop.recording import open_writer
+batches = [counting(500, 500 * at) for at in range(100)]
+writer = open_writer(sys.argv[1], METADATA)
+for at in count():
+    writer.write(batches[at % 100])
+    print(at, flush=True)
+"""
+
+
+@growing
+def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
+    """SIGKILL at full speed: every batch whose write had returned is there."""
+    for until in (1, 40, 150):
+        path = tmp_path / f"{until}{suffix}"
+        command = [
+            sys.executable,
+            "-c",
+            RECORD_FOR_EVER,
+            str(path),
+            str(Path(__file__).parents[1] / "support"),
+        ]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writing:
+            assert writing.stdout is not None
+            while int(writing.stdout.readline()) < until:
+                pass
+            writing.kill()
+            told = [until, *map(int, writing.stdout.read().split())]
+            assert writing.wait() == -signal.SIGKILL
+        reader = open_reader(path)
+        found = rows(reader)
+        assert reader.metadata == METADATA
+        assert len(found) >= (told[-1] + 1) * 500
+        values = (at % 50_000 for at in count())
+        expected = (None if value % 10 == 9 else float(value) for value in values)
+        assert [row.value for row in found] == [next(expected) for _ in found]
+
+
+def test_parquet_that_was_not_closed_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    with open_writer(path, METADATA) as writer:
+        writer.write(example())
+        with pytest.raises(ValueError, match=r"not a recording: .* readable only once it is closed"):
+            open_reader(path)
+
+
+# ---- disks ----
+
+FILL_THE_DISK = """
+import resource, sys
+sys.path[:0] = sys.argv[2:]
+from batches import METADATA, counting
+from multidrop.recording import RecordingError, open_writer
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))  # as good as a full disk
+batch = counting(500)
+try:
+    with open_writer(sys.argv[1], METADATA) as writer:
+        while writer.rows < 5_000_000:
+            writer.write(batch)
+except RecordingError as failure:
+    print(failure)
+    print(failure.rows)
+"""
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    command = [
+        sys.executable,
+        "-W",
+        "error",
+        "-c",
+        FILL_THE_DISK,
+        str(path),
+        str(Path(__file__).parents[1] / "support"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    sentence, saved = done.stdout.splitlines()
+    assert sentence.startswith(f"{path}: cannot be written: File too large")
+    if suffix == ".parquet":
+        assert int(saved) == 0
+        assert sentence.endswith("a Parquet file is readable only once it is closed")
+        return
+    assert int(saved) >= 500
+    assert sentence.endswith(f"the {saved} rows before that can be read")
+    reader = open_reader(path)
+    assert (len(rows(reader)), reader.torn) == (int(saved), 0)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_disk_that_is_full_from_the_beginning(tmp_path: Path, suffix: str) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full")
+    path = tmp_path / f"a{suffix}"
+    path.symlink_to("/dev/full")
+    full = pytest.raises(RecordingError, match="cannot be written: No space left on device")
+    with full as failure, open_writer(path, METADATA) as writer:
+        writer.write(example())
+    assert (failure.value.path, failure.value.rows) == (path, 0)
+
+
+@growing
+def test_recording_goes_on_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
+    """A batch that did not fit leaves no half of itself between the others."""
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(ROWS))
+        with (
+            full_at(path.stat().st_size + 100),
+            pytest.raises(RecordingError, match=f"the {ROWS} rows before"),
+        ):
+            writer.write(counting(ROWS, 40000))
+        writer.write(counting(ROWS, ROWS))
+        assert writer.rows == 2 * ROWS
+    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_read_only_directory(tmp_path: Path, suffix: str) -> None:
+    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # loads what nobody may be unable to read below
+    with read_only_directory() as directory:
+        path = directory / f"a{suffix}"
+        with pytest.raises(RecordingError) as failure:
+            open_writer(path, METADATA)
+    assert str(failure.value) == f"{path}: cannot be written: Permission denied"
+    assert failure.value.strerror is None  # the sentence is ours
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_directory_that_is_not_there(tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(RecordingError, match="No such file or directory"):
+        open_writer(tmp_path / "none" / f"a{suffix}", METADATA)
+    with pytest.raises(FileNotFoundError):
+        open_reader(tmp_path / f"a{suffix}")
+
+
+def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails for a while, for cutting too."""
+    path = tmp_path / "a.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(ROWS))
+        cut = WholeFile._cut
+        monkeypatch.setattr(WholeFile, "_cut", _fail)
+        for _ in range(2):
+            with full_at(path.stat().st_size + 100), pytest.raises(RecordingError):
+                writer.write(counting(ROWS, 40000))
+        monkeypatch.setattr(WholeFile, "_cut", cut)
+        assert open_reader(path).torn == 100
+        writer.write(counting(ROWS, ROWS))
+    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+
+
+def _fail(file: WholeFile) -> None:
+    raise OSError(5, "Input/output error")
+
+
+@growing
+def test_a_write_that_a_signal_breaks_off_leaves_nothing(tmp_path: Path, suffix: str) -> None:
+    """Ctrl-C between the two halves of a piece that the system takes in two."""
+    path = tmp_path / f"a{suffix}"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(ROWS))
+        growing_file = vars(writer)["_file"]
+        raw = growing_file._file
+        growing_file._file = Halving(raw)
+        with pytest.raises(KeyboardInterrupt):
+            writer.write(counting(ROWS, 40000))
+        growing_file._file = raw
+        writer.write(counting(ROWS, ROWS))
+    assert rows(open_reader(path)) == list(counting(2 * ROWS))
+
+
+class Halving:
+    """A file that takes half of what it is given, and is interrupted then."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self._writes = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def write(self, piece: memoryview) -> int:
+        self._writes += 1
+        if self._writes == 2:
+            raise KeyboardInterrupt
+        return int(self._file.write(piece[: len(piece) // 2]))
+
+
+@pytest.mark.parametrize("room", range(0, 120, 10))
+def test_csv_that_is_a_recording_has_its_metadata(tmp_path: Path, room: int) -> None:
+    """Wherever the disk becomes full at the beginning: never half of a .csv.json."""
+    path = tmp_path / "a.csv"
+    whole = {"plant": "p" * 60}
+    try:
+        with full_at(room), open_writer(path, whole):
+            pass
+    except RecordingError:
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert open_reader(path).metadata == whole
+    assert not list(tmp_path.glob("*.part"))
+
+
+# ---- clocks ----
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
+    """Rows stay in the order in which they were taken, by monotonic_ns; time says what the clock said."""
+    path = tmp_path / f"a{suffix}"
+    offsets = (UTC_0, UTC_0 - 3600 * SECOND)
+    with open_writer(path, METADATA) as writer:
+        for at, offset in enumerate(offsets):
+            columns = Columns(1)
+            assert columns.add(block(0, 0), completion(at + 1, first_ns=at + 2, words=(at,)), offset)
+            writer.write(Batch(columns, DRIVES, REGISTERS))
+    found = rows(open_reader(path))
+    assert [row.monotonic_ns for row in found] == [1, 2]
+    assert [row.time for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
+
+
+# ---- not a recording ----
+
+GARBAGE = {
+    "empty": b"",
+    "text": b"good morning\n" * 1000,
+    "random": random.Random(3).randbytes(100_000),
+    "zeros": bytes(1000),
+    "marker": b"\xff\xff\xff\xff" + b"\x10\x00\x00\x00" + bytes(16),
+    "length": b"\xff\xff\xff\xff" + b"\xff\xff\xff\x7f" + bytes(100),
+    "end": b"\xff\xff\xff\xff\x00\x00\x00\x00",
+}
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE)
+def test_garbage(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    for act in (open_reader, repair):
+        with pytest.raises(ValueError, match=r"is not a recording: [^\n]+$"):
+            act(path)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".parquet"])
+def test_other_columns(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    other = pa.table({"time": [1], "value": [0.5]})
+    if suffix == ".arrows":
+        with pa.ipc.new_stream(path, other.schema) as stream:
+            stream.write_table(other)
+    else:
+        pa.parquet.write_table(other, path)
+    with pytest.raises(ValueError, match=r"is not a recording: it is .* with other columns"):
+        open_reader(path)
+
+
+def test_compressed_batches_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    table = pa.table(counting(2000))
+    with pa.ipc.new_stream(path, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
+        stream.write_table(table)
+    with pytest.raises(ValueError, match="compressed, which only pyarrow and polars read"):
+        rows(open_reader(path))
+
+
+def test_damaged_line_of_csv_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    record(path, 1)
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    for damage in ("half a line\n", lines[3].replace("Z", "+", 1), lines[3].replace("Z,", "Z,x", 1)):
+        path.write_text("".join([*lines[:3], damage, *lines[4:]]), encoding="utf-8")
+        with pytest.raises(ValueError, match=r"a\.csv, line 4: not a row of a recording: [^\n]+$"):
+            rows(open_reader(path))
+
+
+def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    record(path, 1)
+    for damage in ("", "{", "[]"):
+        (tmp_path / "a.csv.json").write_text(damage)
+        with pytest.raises(ValueError, match=r"a\.csv\.json is not a recording: its metadata"):
+            open_reader(path)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None:
+    """Some bytes are overwritten: it is read with other values, cut short, or refused; never a crash."""
+    path = tmp_path / f"a{suffix}"
+    record(path, 2)
+    whole = path.read_bytes()
+    chance = random.Random(4)
+    for _ in range(1500):
+        damaged = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 4))):
+            damaged[chance.randrange(len(damaged))] = chance.choice((0, 1, 0x7F, 0xFF, chance.randrange(256)))
+        path.write_bytes(damaged)
+        with suppress_mistake_that_names(path):
+            for batch in open_reader(path):
+                pa.record_batch(batch).validate(full=True)
+                list(batch)
+
+
+@contextmanager
+def suppress_mistake_that_names(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as mistake:
+        sentence = str(mistake)
+    else:
+        return
+    assert str(path) in sentence
+    assert "\n" not in sentence
+
+
+@pytest.mark.parametrize("rows", [-77, -(1 << 59), 1 << 59])
+def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
+    """What is reckoned with their number, in bytes, would wrap around."""
+    path = tmp_path / "run.arrows"
+    with open_writer(path, METADATA) as writer:
+        writer.write(counting(77))
+    damaged = path.read_bytes().replace(struct.pack("<q", 77), struct.pack("<q", rows))
+    path.write_bytes(damaged)
+    with pytest.raises(ValueError, match=f"is damaged after row 0: there is a batch of {rows} rows"):
+        list(open_reader(path))

@@ -1,0 +1,694 @@
+"""Pictures and pages of a recording: what is in them, by their numbers; how they look, people must see."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from batches import METADATA, SECOND, UTC_0, example
+from test_cli import Run, run
+
+import multidrop.cli.support.extra
+from multidrop.plant.loader import load_plant
+from multidrop.polling.batch import Row
+from multidrop.recording import open_writer
+from multidrop.recording.rows import from_rows
+from multidrop.report import Selection, load, plot, plot_page, png, report_page
+from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
+from multidrop.report.html import _about, _drives
+from multidrop.report.lanes import MOST_LANES
+from multidrop.report.utilisation import used
+from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
+
+__all__ = ["run"]  # a fixture
+
+PNG = b"\x89PNG\r\n\x1a\n"
+FAULTS = {"NONE": 0, "OVERHEAT": 8, "OVERLOAD": 9}
+ABOUT: dict[str, Any] = {
+    "plant": "hall.toml",
+    "drives": {
+        "pump": {
+            "line": "hall-1",
+            "model": "invt-che",
+            "address": 1,
+            "settings": "9600 8N1",
+            "framing": "rtu",
+            "registers": {
+                "output_frequency": {"unit": "Hz", "step": 0.01, "function": 3, "address": 7, "words": 1},
+                "fault": {"unit": "", "step": 1, "values": FAULTS, "function": 3, "address": 8, "words": 1},
+            },
+        },
+        "fan": {
+            "framing": "rtu",
+            "registers": {
+                "output_current": {"unit": "A", "step": None, "function": 3, "address": 4, "words": 1}
+            },
+        },
+    },
+}
+REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
+
+
+def row(
+    second: float, drive: str, register: str, value: float | None, status: str = "ok", ms: float = 20.0
+) -> Row:
+    at = round(second * SECOND)
+    uncertainty = None if value is None else round(ms * 1e6)
+    return Row(UTC_0 + at, at, uncertainty, drive, register, value, status)
+
+
+def noisy_ramp() -> list[Row]:
+    """A pump that runs up for 100 s; from 30 Hz on every second value of its fault register is damaged."""
+    rows = []
+    for tick in range(1000):
+        second, hz = tick / 10, tick / 20
+        damaged = hz >= 30 and tick % 2
+        fault = 8 if 400 <= tick < 500 else 0
+        rows.append(row(second, "pump", "output_frequency", hz))
+        rows.append(
+            row(second, "pump", "fault", None, "bad checksum")
+            if damaged
+            else row(second, "pump", "fault", fault)
+        )
+        rows.append(row(second, "fan", "output_current", 5.0, ms=12.0 + tick % 10))
+    rows.append(row(100, "fan", "output_current", None, "no reply"))
+    return rows
+
+
+def record(path: Path, rows: list[Row], about: dict[str, Any] = ABOUT, pieces: int = 7) -> Path:
+    with open_writer(path, about) as writer:
+        for at in range(0, len(rows), len(rows) // pieces + 1):
+            writer.write(from_rows(rows[at : at + len(rows) // pieces + 1]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("ramp") / "ramp.arrows", noisy_ramp())
+
+
+@pytest.fixture(scope="module")
+def look(ramp: Path) -> Selection:
+    return load(ramp)
+
+
+# ---- what is read ----
+
+
+def test_series_have_every_value_and_every_miss(look: Selection) -> None:
+    assert [(it.drive, it.register, it.unit, len(it.time)) for it in look.series] == [
+        ("pump", "output_frequency", "Hz", 1000),
+        ("pump", "fault", "", 1000),
+        ("fan", "output_current", "raw count", 1001),
+    ]
+    frequency, fault, current = look.series
+    assert frequency.value.tolist() == [tick / 20 for tick in range(1000)]
+    assert not frequency.missed.any()
+    assert fault.missed.sum() == 200
+    assert fault.reasons() == {"bad checksum": 200}
+    assert current.reasons() == {"no reply": 1}
+    assert look.drives == ("pump", "fan")
+    assert look.seconds == 100
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
+def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
+    with open_writer(tmp_path / f"it{suffix}", METADATA) as writer:
+        writer.write(example())
+    it = load(tmp_path / f"it{suffix}")
+    assert [(series.drive, series.register) for series in it.series] == [
+        ("pump-1", "output_frequency"),
+        ("pump-1", "motor_speed"),
+        ('fan, the "old" one', "output_frequency"),
+        ("насос", "motor_speed"),
+        ('fan, the "old" one', "motor_speed"),
+    ]
+    assert it.series[0].value.tolist() == [49.99]
+    assert [dict(series.reasons()) for series in it.series[2:]] == [
+        {"exception 12": 1},
+        {"no reply": 1},
+        {"not asked: drive is silent": 1},
+    ]
+
+
+def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "it.arrows", METADATA) as writer:
+        writer.write(example())
+    it = load(tmp_path / "it.arrows")
+    assert png(plot(it)[0]).startswith(PNG)
+    assert "насос" in report_page(it)
+
+
+def test_a_fault_is_a_span_that_misses_do_not_end(look: Selection) -> None:
+    (span,) = look.of("pump", "fault")[0].faults()
+    assert span.what == "OVERHEAT"
+    assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
+
+
+def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> None:
+    flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
+    about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
+    rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
+    (series,) = load(record(tmp_path / "it.arrows", rows, about)).series
+    assert [(it.what, it.end - it.begin) for it in series.faults()] == [
+        ("HIGH HOT", 2 * SECOND),
+        ("bit 7", SECOND),
+    ]
+
+
+# ---- what is worked out ----
+
+
+def test_the_response_delay_is_without_the_request(look: Selection) -> None:
+    pump, fan = delays(look)
+    assert pump.exact
+    assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
+    assert not fan.exact  # nothing tells its settings
+    assert fan.quantile(0.5) == pytest.approx(0.0165)
+    assert fan.quantile(1.0) == pytest.approx(0.021)
+
+
+def test_noise_that_comes_with_speed_is_seen(look: Selection) -> None:
+    shares = miss_shares(look, "pump")
+    assert shares is not None
+    slow = shares[1][shares[0] < 28]
+    fast = shares[1][shares[0] > 32]
+    assert slow.max() == 0
+    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of one register of two
+    assert miss_shares(look, "fan") is None
+
+
+# At 1 ms a character: a read of one register is 8 and 7 characters, of two 8 and 9.
+PLANNED: dict[str, Any] = {
+    "hall-1": {
+        "utilisation": 1.0,
+        "cycle_ms": 70.0,
+        "drives": {
+            "pump": {
+                "exchanges_per_second": 20.0,
+                "silence_ms": 4.0,
+                "character_ms": 1.0,
+                "response_delay_ms": 5.0,
+                "blocks": [
+                    {
+                        "registers": ["output_frequency", "fault"],
+                        "every_ms": None,
+                        "request_characters": 8,
+                        "reply_characters": 9,
+                    },
+                ],
+            },
+            "fan": {
+                "exchanges_per_second": 20.0,
+                "silence_ms": 10.0,
+                "character_ms": 1.0,
+                "response_delay_ms": 5.0,
+                "blocks": [
+                    {
+                        "registers": ["output_current"],
+                        "every_ms": None,
+                        "request_characters": 8,
+                        "reply_characters": 7,
+                    },
+                ],
+            },
+        },
+    }
+}
+
+
+def turns() -> list[Row]:
+    """The pump's two registers and the fan's one, in turns of 100 ms; the fan is lost half-way."""
+    rows = []
+    for tick in range(100):
+        second = tick / 10
+        rows += [row(second, "pump", name, 1.0, ms=14.0) for name in ("output_frequency", "fault")]
+        lost = tick >= 50
+        rows.append(
+            row(second + 0.05, "fan", "output_current", *((None, "no reply") if lost else (1.0,)), ms=13.0)
+        )
+    return rows
+
+
+def test_what_was_used_of_a_line(tmp_path: Path) -> None:
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
+    (line,) = used(look)
+    # pump: 14 ms to the reply's first character, 8 more; fan: 13 and 6; the silence is the longer of two.
+    assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
+    assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
+    assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
+    assert line.rate("pump") == pytest.approx(10, rel=0.01)
+    assert line.rate("fan") == pytest.approx(5, rel=0.01)
+    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # three registers, 250 values
+    page = report_page(look)
+    assert "fan, exchanges/s" in page
+    assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
+
+
+def test_no_more_is_used_of_a_port_without_a_wire_than_there_is(tmp_path: Path) -> None:
+    """Requests follow each other by 2 ms, where a wire would take 32."""
+    rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
+    planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
+    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    assert 0.9 < line.utilisation <= 1.0 + 1e-9
+
+
+def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
+    """In the first half the pump's two registers are read singly, each with a reply of 7 characters."""
+    rows = [
+        row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)
+        for tick in range(100)
+        for name in ("output_frequency", "fault")
+    ]
+    planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"pump": PLANNED["hall-1"]["drives"]["pump"]}}}
+    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    assert line.asked == {"pump": 150}
+    assert line.needed == pytest.approx(np.array([0.024] * 100 + [0.026] * 50))
+    assert line.cycle == pytest.approx(0.1, rel=0.01)
+
+
+@pytest.mark.parametrize("planned", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
+def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> None:
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    assert used(look) == []
+
+
+def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
+    assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
+
+
+def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(
+        '[[line]]\nname = "hall-1"\nport = "x"\n[[line.drive]]\nname = "pump"\naddress = 1\nevery = "1 s"\n'
+        'model = "invt-che"\npoll = ["output_frequency", "output_current"]\n'
+    )
+    told = json.loads(json.dumps(load_plant(path).metadata()))["planned"]
+    (block,) = told["hall-1"]["drives"]["pump"]["blocks"]
+    assert set(block["registers"]) == {"output_frequency", "output_current"}
+    assert (block["every_ms"], block["request_characters"]) == (1000, 8)
+    assert told["hall-1"]["drives"]["pump"]["exchanges_per_second"] == 1
+    assert told["hall-1"]["drives"]["pump"]["character_ms"] == pytest.approx(10 / 9.6, abs=1e-6)
+
+
+def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
+    planned = json.loads(json.dumps(PLANNED))
+    planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"] = 100
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    (line,) = used(look)
+    assert line.cycle is None
+    assert line.utilisation > 0.4
+    assert "bus cycle" not in report_page(look)
+
+
+def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
+    planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
+    look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
+    (line,) = used(look)
+    assert (line.utilisation, line.cycle) == (0, None)
+    assert "hall-2" in report_page(look)
+
+
+def test_a_motor_that_keeps_its_speed_tells_nothing_of_noise_that_comes_with_it(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
+    rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
+    assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
+
+
+def test_misses_are_told_by_reason(look: Selection) -> None:
+    assert reasons_of(look, "pump") == {"bad checksum": 200}
+    assert reasons_of(look, "fan") == {"no reply": 1}
+
+
+def test_thinning_keeps_every_extreme() -> None:
+    time = np.arange(1_000_000)
+    value = np.sin(time / 1e5)
+    value[123_456], value[777_777] = 9.0, -9.0
+    value[500_000:510_000] = np.nan
+    few, kept = thinned(time, value)
+    assert len(few) <= MOST_POINTS + 500
+    assert (np.nanmax(kept), np.nanmin(kept)) == (9.0, -9.0)
+    assert np.isnan(kept[(few >= 501_000) & (few < 509_000)]).all()
+    assert np.all(np.diff(few) > 0)
+
+
+# ---- pictures and pages ----
+
+
+def test_there_is_a_panel_for_every_quantity_and_unit(look: Selection) -> None:
+    figure, left = plot(look)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == ["faults", "output_frequency, Hz", "output_current, raw count"]
+    assert left == []
+    assert png(figure).startswith(PNG)
+
+
+def test_drives_and_registers_can_be_chosen(look: Selection) -> None:
+    figure, _ = plot(look, ["fan"])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["output_current, raw count"]
+    figure, _ = plot(look, [], ["output_frequency"])
+    assert "output_frequency, Hz" in [axes.get_title(loc="left") for axes in figure.axes]
+
+
+def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
+    rows = [row(at, "pump", name, 0) for at in range(3) for name in ("fault", "output_frequency")]
+    look = load(record(tmp_path / "it.arrows", rows))
+
+    def titles(registers: list[str]) -> list[str]:
+        return [axes.get_title(loc="left") for axes in plot(look, [], registers)[0].axes]
+
+    assert titles([]) == ["output_frequency, Hz"]
+    assert titles(["fault"]) == ["faults: none"]
+
+
+def test_a_value_that_never_changes_is_no_tiny_span(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
+    (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
+    low, high = axes.get_ylim()
+    assert low <= 0 < 50 < high
+
+
+def test_zero_is_there_if_it_is_near(tmp_path: Path) -> None:
+    for least, bottom in ((10.0, 0.0), (45.0, None)):
+        rows = [row(at, "pump", "output_frequency", value) for at, value in enumerate((least, 50.0))]
+        (axes,) = plot(load(record(tmp_path / f"{least:g}.arrows", rows)))[0].axes
+        low, _ = axes.get_ylim()
+        assert low == bottom if bottom is not None else 0 < low < least
+
+
+STATUS = {  # the families' own, as their documents have them
+    "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
+    "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
+}
+
+
+def states(path: Path, rows: list[Row]) -> Selection:
+    """A recording of two enumerations and one register of bits, all called status."""
+    meanings: dict[str, Any] = {
+        name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
+    }
+    meanings["yd"] = {"unit": "", "values": {"JOG": 4, "REVERSE": 2, "RUN": 16}, "bits": True}
+    about = {"drives": {name: {"registers": {"status": meaning}} for name, meaning in meanings.items()}}
+    return load(record(path / "it.arrows", rows, about))
+
+
+def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
+    """What stands in each lane, by its label: texts with their bars, in s since the first row."""
+    lanes = {text.get_text(): [] for text in axes.get_yticklabels()}
+    names = list(lanes)
+    bars: dict[int, list[tuple[float, float]]] = {}
+    for collection in axes.collections:
+        for path in collection.get_paths():
+            left, right = path.vertices[:, 0].min(), path.vertices[:, 0].max()
+            bars.setdefault(round(path.vertices[:, 1].mean()), []).append((left, right))
+    texts = {(round(at.xy[1]), at.xy[0]): at.get_text() for at in axes.texts}
+    epoch = min(left for found in bars.values() for left, _ in found)
+    for lane, found in bars.items():
+        for left, right in sorted(found):
+            span = ((left - epoch) * 86400, (right - epoch) * 86400)
+            lanes[names[lane]].append((texts.get((lane, left), ""), *(round(at, 2) for at in span)))
+    return lanes
+
+
+def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> None:
+    """3 is decelerating on one of them and standby on the other."""
+    rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
+    rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert drawn(axes) == {
+        "erman": [("stopped", 0, 1), ("accelerating", 1, 2), ("running", 2, 3), ("decelerating", 3, 5)],
+        "che": [("standby", 0, 2), ("forward", 2, 3), ("standby", 4, 5), ("", 5, 5)],
+    }
+    (ticks,) = axes.lines  # the miss, in its drive's lane
+    assert ticks.get_ydata()[0] == pytest.approx(1.4)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
+
+
+def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
+    rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert drawn(axes) == {  # from 1 s on, when the first one is set
+        "yd reverse": [("", 1, 4)],
+        "yd jog": [],
+        "yd run": [("", 0, 2)],
+        "yd bit 6": [("", 3, 4)],
+    }
+    assert axes.get_legend() is None
+
+
+def test_a_number_without_a_name_is_no_sum_of_others(tmp_path: Path) -> None:
+    """A fault that is not in the enumeration is not several others at once."""
+    series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
+    assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
+        "OVERHEAT",
+        "OVERLOAD",
+        "code 24",
+        "code 1e+308",
+        "code -1",
+        "code 0.5",
+    ]
+
+
+def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
+    bits = {f"B{bit}": 1 << bit for bit in range(16)}
+    drives = [f"yd{number}" for number in range(80)]
+    meaning = {"unit": "", "values": bits, "bits": True}
+    about = {"drives": {name: {"registers": {"status": meaning}} for name in drives}}
+    rows = [row(at, name, "status", at) for at in range(2) for name in drives]
+    (axes,) = plot(load(record(tmp_path / "it.arrows", rows, about)))[0].axes
+    assert len(axes.get_yticklabels()) == MOST_LANES
+    assert axes.get_yticklabels()[0].get_text() == "yd0 b0"
+    assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
+
+
+def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
+    rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(100_000)]
+    rows[50_001] = row(500.01, "che", "status", 4)
+    (axes,) = plot(states(tmp_path, rows))[0].axes
+    assert len(drawn(axes)["che"]) == 3
+    order = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert order == ["fault"]
+
+
+def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
+    rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
+    (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
+    names = [it.get_text() for it in misses.get_legend().get_texts()]
+    assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
+
+
+def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
+    rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    figure, left = plot(look)
+    assert len(figure.axes) == MOST_PANELS
+    assert left == [f"r{MOST_PANELS}", f"r{MOST_PANELS + 1}"]
+    assert plot(look, [], left)[1] == []
+    assert f"<p>Not shown: r{MOST_PANELS}; r{MOST_PANELS + 1}. <code>multidrop plot" in report_page(look)
+    assert run("plot", tmp_path / "it.arrows") == (
+        0,
+        f"{tmp_path}/it.png\nnot shown: r{MOST_PANELS}; r{MOST_PANELS + 1} (choose with --register)\n",
+        "",
+    )
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(look: Selection) -> None:
+    page = report_page(look)
+    assert page.startswith("<!DOCTYPE html>")
+    images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(images) == 4
+    assert all(base64.b64decode(image).startswith(PNG) for image in images)
+    assert "http" not in re.sub(r'src="data:[^"]+"', "", page)
+    for text in ("OVERHEAT", "bad checksum", "no reply", "invt-che", "9600 8N1 rtu", "Response delays"):
+        assert text in page
+    assert re.search(r"<td[^>]*>pump</td><td[^>]*>1000</td><td[^>]*>10\.6</td>", page)  # least delay, ms
+
+
+def test_names_cannot_break_the_page(tmp_path: Path) -> None:
+    rows = [row(at, "<script>&", "output_frequency", at) for at in range(3)]
+    look = load(record(tmp_path / "<b>.arrows", rows))
+    for page in (report_page(look), plot_page(look, plot(look)[0])):
+        assert "<script>" not in page
+        assert "<b>" not in page
+
+
+def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    page = report_page(look)
+    assert "No drive ever answered." in page
+    assert "100.00%" in page
+
+
+@pytest.mark.parametrize(("value", "status"), [(0.0, "ok"), (None, "no reply")])
+def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, status: str) -> None:
+    rows = [row(at, "pump", "fault", value, status) for at in range(3)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    assert look.series[0].faults() == []
+    assert "<p>None was seen.</p>" in report_page(look)
+
+
+def test_a_long_recording_is_told_in_hours(tmp_path: Path) -> None:
+    rows = [row(second, "pump", "output_frequency", 50.0) for second in (0, 7384)]
+    assert "UTC, 2 h 03 min; 1 drive; 2 values" in report_page(load(record(tmp_path / "it.arrows", rows)))
+
+
+def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
+    rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
+    rows += [row(at, "fan", "output_frequency", 5.0) for at in range(3)]
+    path = record(tmp_path / "it.arrows", rows)
+    assert run("plot", path, "--drive", "pump") == (
+        2,
+        "",
+        "multidrop: there is no value to draw, only misses: no reply 3; `multidrop report` tells more\n",
+    )
+    assert run("plot", path)[0] == 0
+
+
+def test_a_single_row_has_a_report(tmp_path: Path) -> None:
+    look = load(record(tmp_path / "it.arrows", [row(1, "pump", "output_frequency", 50.0)], pieces=1))
+    assert "Report on it.arrows" in report_page(look)
+
+
+# ---- what makes no sense ----
+
+ODD: list[Any] = [None, True, -1, 1e308, 10**400, "", "x", [], [1], {}, {"a": {}}, {"FORWARD": 10**400}]
+
+
+def with_odd(about: Any, odd: Any) -> Iterator[Any]:
+    """The same metadata, with this in the place of each part of it in turn."""
+    yield odd
+    for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
+        if isinstance(part, dict | list):
+            for changed in with_odd(part, odd):
+                whole = about.copy()
+                whole[key] = changed
+                yield whole
+        else:
+            whole = about.copy()
+            whole[key] = odd
+            yield whole
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:12])
+def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
+    """All parts of it are read before a picture is drawn."""
+    about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
+    for number, metadata in enumerate(with_odd(about, odd)):
+        if not isinstance(metadata, dict):
+            continue  # is no recording
+        look = load(record(tmp_path / f"{number}.arrows", turns()[:30], metadata))
+        assert all(np.isfinite([it.utilisation, it.rate("pump"), it.cycle or 0]).all() for it in used(look))
+        assert {it.drive for it in delays(look)} == {"pump", "fan"}
+        assert len(_about(look) + "".join(_drives(look))) > 100
+        if metadata.get("planned") is odd or metadata.get("drives") is odd:
+            assert report_page(look)
+
+
+LARGEST_VALUES = [1e308, float("-inf"), 1e149]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", LARGEST_VALUES)
+@pytest.mark.parametrize("register", ["output_frequency", "fault", "output_current"])
+def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: float) -> None:
+    drive = "fan" if register == "output_current" else "pump"
+    rows = [row(at, drive, register, 1.0 if at % 2 else value) for at in range(40)]
+    rows += [row(at + 0.5, drive, register, None, "no reply") for at in range(40)]
+    rows += [row(40, drive, register, value), row(40.5, drive, register, -value)]
+    look = load(record(tmp_path / "it.arrows", rows))
+    figure, _ = plot(look)
+    assert png(figure).startswith(PNG)
+    assert report_page(look)
+    title = figure.axes[-1].get_title(loc="left")
+    assert ("are not drawn" in title) == (abs(value) >= 1e150 and register != "fault")
+
+
+@pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
+def test_times_that_no_calendar_has_are_a_sentence(run: Run, tmp_path: Path, time: int) -> None:
+    rows = [
+        row(0, "pump", "output_frequency", 1.0),
+        row(1, "pump", "output_frequency", 1.0)._replace(time=time),
+    ]
+    path = record(tmp_path / "it.arrows", rows)
+    for command in ("plot", "report"):
+        assert run(command, path) == (
+            2,
+            "",
+            f"multidrop: {path} cannot be drawn: there are rows from before 1970 or after 2200\n",
+        )
+
+
+def test_metadata_that_is_nested_too_deeply_is_a_sentence(run: Run, tmp_path: Path) -> None:
+    path = record(tmp_path / "it.csv", turns())
+    (tmp_path / "it.csv.json").write_text("[" * 100_000)
+    for command in ("plot", "report"):
+        status, out, err = run(command, path)
+        assert (status, out) == (2, "")
+        assert "is not a recording: its metadata is nested too deeply" in err
+
+
+# ---- the commands ----
+
+
+def test_plot_and_report_need_nothing_but_the_file(run: Run, ramp: Path, tmp_path: Path) -> None:
+    here = tmp_path / "ramp.arrows"
+    here.write_bytes(ramp.read_bytes())
+    assert run("plot", here) == (0, f"{tmp_path}/ramp.png\n", "")
+    assert (tmp_path / "ramp.png").read_bytes().startswith(PNG)
+    assert run("report", here) == (0, f"{tmp_path}/ramp.html\n", "")
+    assert "Report on ramp.arrows" in (tmp_path / "ramp.html").read_text()
+    status, _, err = run("plot", here)
+    assert status == 2
+    assert "is there already" in err
+    assert run("plot", here, "--drive", "fan", "--out", tmp_path / "fan.html")[0] == 0
+    assert "data:image/png" in (tmp_path / "fan.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--drive", "punp"), "the recording has no drive 'punp'; it has pump, fan"),
+        (("--register", "speed"), "the recording has no register 'speed'; it has output_frequency, "),
+        (("--drive", "fan", "--register", "fault"), "has no register 'fault'; it has output_current"),
+        (("--out", "picture.jpg"), "picture.jpg: a plot's name ends in .png or .html"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    run: Run, ramp: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    out = () if "--out" in words else ("--out", tmp_path / "it.png")
+    status, text, err = run("plot", ramp, *words, *out)
+    assert (status, text) == (2, "")
+    assert sentence in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
+    text = tmp_path / "letter.arrows"
+    text.write_text("Dear Sir")
+    assert "is not a recording" in run(command, text)[2]
+    empty = tmp_path / "empty.arrows"
+    with open_writer(empty, {}):
+        pass
+    status, _, err = run(command, empty)
+    assert status == 2
+    assert "holds no rows" in err
+
+
+@pytest.mark.parametrize("command", ["plot", "report"])
+def test_without_the_extra_it_is_named(
+    run: Run, ramp: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multidrop.cli.support.extra.importlib.util, "find_spec", lambda name: None)
+    status, _, err = run(command, ramp)
+    assert status == 2
+    assert "pip install 'multidrop[plot]'" in err

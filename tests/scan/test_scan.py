@@ -1,0 +1,513 @@
+"""Scanning a simulated line on the test's own clock: what is found, how soon, and what is not."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+import pytest
+from line_driver import LineDriver
+from toy import Toy, Unsure
+
+from multidrop.core import Completion, Exchange, Framing, build_reply, build_request, parse_request
+from multidrop.drive import Drive, Script, write
+from multidrop.drive.register import Kept, command, setting
+from multidrop.drive.timing import Settings
+from multidrop.drive.verbs import verb
+from multidrop.drives import MODELS
+from multidrop.drives.delixi_modbus import DelixiModbus
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.erman_er_g_220 import ErmanERG220
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.drives.yd1000 import YD1000
+from multidrop.errors import LineError
+from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
+from multidrop.sim import SimulatedDrive, Wire, simulated
+from multidrop.sim.ibd import SimulatedIBD
+from multidrop.sim.protocol import Reason, Refusal
+
+FAMILIES = list(MODELS.values())
+READS = {Framing.RTU: {1, 2, 3, 4}, Framing.ASCII: {1, 2, 3, 4}, Framing.DELIXI: {3, 7}}
+ALL_EIGHT = (
+    ErmanERG220(1),
+    InvtCHE(2, baudrate=19200, format="8E1"),
+    InnovertIBD(3),
+    InnovertIBD(4, framing="ascii", format="8O1"),
+    DelixiModbus(5, baudrate=4800),
+    DelixiModbus(6, framing="ascii"),
+    DelixiNative(7, baudrate=19200),
+    YD1000(8),
+)
+
+
+class Pair(Wire):
+    """A line on which a drive hears only what is sent in its own format, as on a real one.
+
+    A second stop bit is silence to the other side: it does not matter.
+    """
+
+    def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
+        super().__init__(drives)
+        self._all_ears = self._ears
+        self.request = b""
+
+    def send(self, frame: bytes, now: float, settings: Settings) -> None:
+        self.request = frame
+        self._ears = [it for it in self._all_ears if _alike(it.settings, settings)]
+        self.receive(frame, now, settings.baudrate)
+        self._ears = self._all_ears
+
+
+def _alike(one: Settings, other: Settings) -> bool:
+    return one.baudrate == other.baudrate and one.format[:2] == other.format[:2]
+
+
+class Line:
+    """Carries exchanges out on a wire; time passes only as far as the line wants it to."""
+
+    def __init__(self, wire: Pair) -> None:
+        self.wire = wire
+        self.driver = LineDriver()
+        self.begun = self.driver.now
+        self.sent: list[tuple[Framing, bytes]] = []
+        self.seen = bytearray()  # and not read yet
+
+    @property
+    def seconds(self) -> float:
+        return (self.driver.now - self.begun) / 1e9
+
+    def carry_out(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion:
+        self.pass_until(max(self.driver.now, not_before_ns))
+        self.driver.begin(exchange)
+        while (want := self.driver.want) != "done":
+            if want == "write":
+                self.send(self.driver.take(), exchange)
+            elif want == "wait":
+                self.pass_until(self.driver.wake)
+            elif self.seen:
+                self.driver.receive(bytes(self.seen))
+                self.seen.clear()
+            elif self.driver.wake > self.driver.now:
+                self.pass_until(min(self.driver.wake, self.next_byte()))
+        return self.driver.completion
+
+    def send(self, frame: bytes, exchange: Exchange) -> None:
+        self.sent.append((exchange.framing, frame))
+        self.wire.send(frame, self.driver.now / 1e9, Settings(*exchange.settings))
+
+    def next_byte(self) -> int:
+        wake = self.wire.wake
+        return 1 << 62 if wake is None else max(self.driver.now, int(wake * 1e9) + 1)
+
+    def pass_until(self, end: int) -> None:
+        while (at := self.next_byte()) <= end:
+            self.seen += self.wire.advance(at / 1e9)
+        self.driver.now = max(self.driver.now, end)
+
+
+def found(line: Line, plan: Sequence[Sweep], families: Sequence[type] = FAMILIES) -> list[object]:
+    """All findings but the progress."""
+    return [it for it in scan(line.carry_out, plan, families) if not isinstance(it, Progress)]
+
+
+def drives(findings: Sequence[object]) -> set[tuple[int, str, str, str]]:
+    return {
+        (it.address, " or ".join(it.models), f"{it.settings}", f"{it.framing}")
+        for it in findings
+        if isinstance(it, Found)
+    }
+
+
+def declared(*drives: object) -> set[tuple[int, str, str, str]]:
+    return {(it.address, it.model, f"{it.settings}", f"{it.framing}") for it in drives}
+
+
+@pytest.mark.story
+def test_all_eight_are_found_at_their_settings_and_nothing_else() -> None:
+    line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
+    findings = found(line, sweeps(FAMILIES))
+    assert drives(findings) == declared(*ALL_EIGHT)
+    assert len(findings) == len(ALL_EIGHT)
+    assert not any(it.doubt for it in findings)
+
+
+@pytest.mark.story
+def test_only_reads_are_sent() -> None:
+    wire = Pair([simulated(it) for it in ALL_EIGHT])
+    line = Line(wire)
+    found(line, sweeps(FAMILIES))
+    functions = {(framing, parse_request(framing, frame)[1].function) for framing, frame in line.sent}
+    assert all(function in READS[framing] for framing, function in functions)
+    assert not any(it.counters.writes for it in wire.drives)
+
+
+def test_the_usual_settings_come_first() -> None:
+    line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
+    soon = [it for it in ALL_EIGHT if it.settings == type(it)(1, framing=it.framing).settings]
+    assert len(soon) == 4
+    left = declared(*soon)
+    for it in scan(line.carry_out, sweeps(FAMILIES), FAMILIES):
+        if isinstance(it, Found):
+            left -= drives([it])
+        if not left:
+            break
+    assert line.seconds < 15
+
+
+@pytest.mark.parametrize("format", ["8N1", "8E1"])
+def test_a_sweep_takes_little_more_than_its_silences_and_time_outs(format: str) -> None:
+    nobody = Pair([simulated(YD1000(9))])
+    line = Line(nobody)
+    plan = sweeps(FAMILIES, addresses=range(10, 248), baudrates=[9600], formats=[format])
+    assert found(line, plan) == []
+    assert line.seconds <= 1.02 * sum(sweep.needed for sweep in plan)
+
+
+def test_what_a_sweep_needs_is_its_silences_requests_and_time_outs() -> None:
+    (sweep, patient) = sweeps([InvtCHE], addresses=[1, 2], baudrates=[9600], formats=["8N1"])
+    character = 10 / 9600
+    each = 3.5 * character + 1 / 9600 + 8 * character
+    assert sweep.needed == pytest.approx(2 * (each + 0.020 + 2 * InvtCHE.response_delay))
+    assert patient.needed == pytest.approx(2 * (each + InvtCHE.response_timeout))
+
+
+def test_the_progress_counts_down_to_nothing() -> None:
+    line = Line(Pair([simulated(InvtCHE(3))]))
+    plan = sweeps([InvtCHE], addresses=range(1, 5), baudrates=[9600], formats=["8N1"])
+    left = [it.left for it in scan(line.carry_out, plan, [InvtCHE]) if isinstance(it, Progress)]
+    assert left == sorted(left, reverse=True)
+    assert left[-1] == 0
+
+
+class Echo(Line):
+    """An adapter that hears what it sends."""
+
+    def send(self, frame: bytes, exchange: Exchange) -> None:
+        super().send(frame, exchange)
+        self.seen += frame
+
+
+@pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
+def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
+    there = [it for it in ALL_EIGHT if type(it) in families and it.settings.baudrate in (9600, 19200)]
+    line = Echo(Pair([simulated(it) for it in ALL_EIGHT]))
+    plan = sweeps(families, baudrates=[9600, 19200])
+    assert drives(found(line, plan, families)) == declared(*there)
+
+
+def test_a_line_without_drives_has_none() -> None:
+    quiet = Pair([simulated(InvtCHE(31))])
+    for line in (Line(quiet), Echo(quiet)):
+        assert found(line, sweeps(FAMILIES, addresses=range(1, 31), baudrates=[9600])) == []
+
+
+class Junk(Line):
+    """A stray byte before every reply, and noise of its own every few requests."""
+
+    every = 4
+
+    def send(self, frame: bytes, exchange: Exchange) -> None:
+        super().send(frame, exchange)
+        if len(self.sent) % self.every == 0:
+            self.seen += b"\xf7\x00\x9c"[: 1 + len(self.sent) % 3]
+
+
+def test_some_noise_is_neither_a_drive_nor_several() -> None:
+    line = Junk(Pair([simulated(it) for it in ALL_EIGHT]))
+    findings = found(line, sweeps(FAMILIES, baudrates=[9600, 38400]))
+    assert drives(findings) == declared(*(it for it in ALL_EIGHT if it.settings.baudrate in (9600, 38400)))
+    assert not any(isinstance(it, Crowd) for it in findings)
+
+
+def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
+    class Always(Junk):
+        every = 1
+
+    line = Always(Pair([simulated(InvtCHE(3))]))
+    findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
+    assert drives(findings) == declared(InvtCHE(3))
+    noise = [it for it in findings if isinstance(it, Noise)]
+    assert noise
+    assert noise[0].garbled == 30
+    assert not any(isinstance(it, Crowd) for it in findings)
+
+
+class Shared(Pair):
+    """Another drive has the address of one of them and answers too: the pair is low where either is."""
+
+    def __init__(self, drives: Sequence[SimulatedDrive], twin: SimulatedDrive) -> None:
+        super().__init__(drives)
+        self.twin = twin
+
+    def distort(self, reply: bytes) -> bytes:
+        framing = self.twin.drive.framing
+        _, request = parse_request(framing, self.request)
+        answer = self.twin.answer(request, 0.0) if request else None
+        if answer is None:
+            return reply
+        other = build_reply(framing, answer)
+        return bytes(one & two for one, two in itertools.zip_longest(reply, other, fillvalue=0xFF))
+
+
+def test_two_drives_at_one_address_are_recognised() -> None:
+    one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
+    one["output_current"], twin["output_current"] = 41.1, 77.7
+    line = Line(Shared([simulated(InvtCHE(1)), one, simulated(InnovertIBD(4))], twin))
+    findings = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
+    assert drives(findings) == declared(InvtCHE(1), InnovertIBD(4))
+    assert [it for it in findings if not isinstance(it, Found)] == [
+        Crowd(3, Settings(9600, "8N1"), Framing.RTU)
+    ]
+
+
+class Everything(Echo, Junk):
+    """Echo, stray bytes and noise together."""
+
+
+@pytest.mark.story
+@pytest.mark.long
+def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address() -> None:
+    one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
+    one["output_current"], twin["output_current"] = 41.1, 77.7
+    line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
+    findings = found(line, sweeps(FAMILIES))
+    assert drives(findings) == declared(*ALL_EIGHT)
+    assert {it.address for it in findings if not isinstance(it, Found)} == {9}
+    assert {type(it) for it in findings} == {Found, Crowd}
+
+
+class OneAfterTheOther(Shared):
+    """The second drive at the address is slower: it answers when the first one has done."""
+
+    def distort(self, reply: bytes) -> bytes:
+        _, request = parse_request(self.twin.drive.framing, self.request)
+        answer = self.twin.answer(request, 0.0) if request else None
+        return reply if answer is None else reply + build_reply(self.twin.drive.framing, answer)
+
+
+def test_two_drives_that_answer_one_after_the_other_are_doubted() -> None:
+    one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
+    line = Line(OneAfterTheOther([one, simulated(InnovertIBD(4))], twin))
+    findings = found(line, sweeps([InnovertIBD], baudrates=[9600], formats=["8N1"]), [InnovertIBD])
+    doubts = {it.address: it.doubt for it in findings if isinstance(it, Found)}
+    assert "second drive" in doubts[3]
+    assert doubts[4] == ""
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.15, 0.3])
+def test_a_drive_that_answers_late_is_found_all_the_same(delay: float) -> None:
+    slow = simulated(InvtCHE(3), response_delay=delay)
+    line = Line(Pair([slow, simulated(InvtCHE(5))]))
+    plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
+    findings = found(line, plan, [InvtCHE])
+    assert drives(findings) == declared(InvtCHE(3), InvtCHE(5))
+    delays = {it.address: it.response_delay for it in findings if isinstance(it, Found)}
+    assert delays[3] == pytest.approx(delay, abs=5e-3)
+
+
+def test_a_slow_line_is_waited_for_longer_once_it_is_known() -> None:
+    line = Line(Pair([simulated(InvtCHE(at), response_delay=0.04) for at in (1, 9)]))
+    brisk = sweeps([InvtCHE], baudrates=[9600])
+    brisk = brisk[: len(brisk) // 2]
+    left = [it.left for it in scan(line.carry_out, brisk, [InvtCHE]) if isinstance(it, Progress)]
+    quiet = Line(Pair([simulated(InvtCHE(40))]))
+    usual = [it.left for it in scan(quiet.carry_out, brisk, [InvtCHE]) if isinstance(it, Progress)]
+    assert left[31] > usual[31]
+
+
+def test_a_drive_of_no_family_is_unknown() -> None:
+    line = Line(Pair([SimulatedDrive(Toy(7))]))
+    (it,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
+    assert isinstance(it, Found)
+    assert (it.address, it.models) == (7, ())
+
+
+def test_a_family_of_one_s_own_is_found() -> None:
+    line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
+    families = [*FAMILIES, Unsure]
+    findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
+    assert drives(findings) == {(7, "toy", "19200 8N1", "rtu"), (2, "invt-che", "9600 8N1", "rtu")}
+
+
+class Addressed(Toy):
+    """A family of one's own, whose drives hold their address."""
+
+    model = "addressed"
+    address_setting = setting(0x20, span=(1, 31), kept=Kept.EEPROM)
+
+
+class Older(SimulatedDrive):
+    """Its firmware does not have the address yet."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start == Addressed.address_setting.address:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().read(function, start, count)
+
+
+@pytest.mark.parametrize(
+    ("kind", "held", "models"),
+    [(SimulatedDrive, 7, ("addressed",)), (SimulatedDrive, 9, ()), (Older, 0, ("addressed",))],
+)
+def test_who_holds_another_address_is_of_another_family(
+    kind: type[SimulatedDrive], held: int, models: tuple[str, ...]
+) -> None:
+    drive = kind(Addressed(7))
+    drive["address_setting"] = held
+    plan = sweeps([Addressed], baudrates=[9600], formats=["8N1"])
+    findings = found(Line(Pair([drive])), plan, [Addressed])
+    assert [(it.address, it.models) for it in findings if isinstance(it, Found)] == [(7, models)]
+
+
+class Meddler(Toy):
+    """A family of one's own, whose author took a write for a look."""
+
+    model = "meddler"
+
+    @verb
+    def identify(self) -> Script[None]:
+        yield from write(Toy.frequency, 10.0)
+
+    def resembles(self) -> Script[bool]:
+        yield from write(Toy.frequency, 10.0)
+        return True
+
+
+def test_a_look_that_would_write_names_nobody_and_writes_nothing() -> None:
+    drive = SimulatedDrive(Meddler(7))
+    plan = sweeps([Meddler], baudrates=[9600], formats=["8N1"])
+    findings = found(Line(Pair([drive])), plan, [Meddler])
+    assert drives(findings) == {(7, "", "9600 8N1", "rtu")}
+    assert not drive.counters.writes
+
+
+class Commanded(Drive):
+    """A family of one's own, of which nothing can be read."""
+
+    model = "commanded"
+    speed = command(1, "rpm")
+
+
+def test_a_family_of_which_nothing_can_be_read_is_not_asked() -> None:
+    plan = sweeps([InvtCHE, Commanded], baudrates=[9600], formats=["8N1"])
+    assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
+
+
+def test_a_drive_that_was_found_is_asked_for_once() -> None:
+    line = Line(Pair([simulated(InvtCHE(2, format="8N2"))]))
+    findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1", "8N2"]), [InvtCHE])
+    assert len(drives(findings)) == 1
+
+
+class Stubborn(Line):
+    """A port that has no parity."""
+
+    def carry_out(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion:
+        if exchange.settings[1][1] != "N":
+            raise LineError("port", "the port does not take the parity that the drive needs")
+        return super().carry_out(exchange, not_before_ns=not_before_ns)
+
+
+def test_settings_that_the_port_refuses_are_passed_over_and_told() -> None:
+    line = Stubborn(Pair([simulated(InvtCHE(2))]))
+    findings = found(line, sweeps([InvtCHE], baudrates=[9600]), [InvtCHE])
+    assert drives(findings) == declared(InvtCHE(2))
+    untried = {it.settings.format for it in findings if isinstance(it, Untried)}
+    assert untried == {"8E1", "8O1", "8E2", "8O2"}
+
+
+class Vanishing(Line):
+    """A port that is lost after some exchanges."""
+
+    def carry_out(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion:
+        if len(self.sent) == 20:
+            raise LineError("port", "the port was lost (hung up)")
+        return super().carry_out(exchange, not_before_ns=not_before_ns)
+
+
+def test_a_port_that_is_lost_ends_the_scan_after_what_was_found() -> None:
+    line = Vanishing(Pair([simulated(InvtCHE(2))]))
+    findings = scan(line.carry_out, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
+    assert drives([next(it for it in findings if isinstance(it, Found))]) == declared(InvtCHE(2))
+    with pytest.raises(LineError, match=r"^port: the port was lost \(hung up\)$"):
+        list(findings)
+
+
+def test_a_port_that_takes_nothing_is_an_error() -> None:
+    line = Stubborn(Pair([simulated(InvtCHE(2))]))
+    with pytest.raises(LineError, match="parity"):
+        found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8E1"]))
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        ({"baudrates": [300]}, "baud rate 300 is none that these families have: 1200, 2400, "),
+        ({"formats": ["7N1"]}, "format 7N1 is none that these families have: 7E1, "),
+        ({"addresses": [250]}, "no family has such an address"),
+        ({"baudrates": [1200], "formats": ["7E1"], "addresses": [40]}, "no family has such an address"),
+    ],
+)
+def test_what_nobody_can_answer_is_a_mistake(asked: dict[str, list[object]], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        sweeps(FAMILIES, **asked)
+
+
+def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
+    for sweep in plan:
+        yield build_request(sweep.framing, sweep.question.to(1))
+
+
+def test_every_question_is_a_read_of_the_documents() -> None:
+    for sweep in sweeps(FAMILIES):
+        assert sweep.question.function in READS[sweep.framing]
+        for family in sweep.families:
+            reads = {it.table.read for it in family.registers.values() if it.readable}
+            assert sweep.question.function in reads
+    assert len(set(questions(sweeps(FAMILIES)))) < 10
+
+
+class Bare(SimulatedIBD):
+    """An IBD of which only what examples of its manual show is there: the addresses above are inferred."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        if start >= 200:
+            raise Refusal(Reason.READ_ADDRESS)
+        return super().read(function, start, count)
+
+
+def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
+    bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
+    line = Line(Pair([Bare(it) for it in bare]))
+    plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
+    findings = found(line, plan)
+    assert drives(findings) == declared(*bare)
+    assert {it.doubt for it in findings} == {"it only reads like one: look at its name plate"}
+    text = plant_text("/dev/ttyUSB0", findings, MODELS)
+    assert text.count("# it only reads like one: look at its name plate") == 2
+    assert text.count("# confirmed = 1  # once its name plate says so") == 2
+
+
+def test_what_has_other_bits_than_an_ibd_s_terminals_is_none() -> None:
+    for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
+        drive = Bare(InnovertIBD(3))
+        drive.shows = {(0x03, 22): lambda self, bits=bits: bits}
+        line = Line(Pair([drive]))
+        assert drives(found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))) == {
+            (3, "", "9600 8N1", "rtu")
+        }
+
+
+class Anything(SimulatedDrive):
+    """Says 0 for whatever it is asked, as some gateways do."""
+
+    def read(self, function: int, start: int, count: int) -> list[int]:
+        return [0] * count
+
+
+def test_a_device_that_answers_everything_is_of_no_family() -> None:
+    line = Line(Pair([Anything(Toy(7))]))
+    (it,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
+    assert isinstance(it, Found)
+    assert (it.address, it.models) == (7, ())

@@ -1,0 +1,243 @@
+"""A simulated drive of a class of one's own: memory, access, limits, refusals, counters."""
+
+import math
+
+import pytest
+
+from multidrop.core import Message, NumberFormat
+from multidrop.drive import Drive
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Kept,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
+from multidrop.sim import EncodedDrive, SimulatedDrive, encoded, simulated
+
+ON, OFF = b"\xff\x00", b"\x00\x00"
+
+
+class Own(Drive):
+    """As a user declares it."""
+
+    most_registers = {HOLDING: 10, INPUT: 4, COIL: 16, DISCRETE: 16}
+    readable_gaps = {HOLDING: range(0x10, 0x20)}
+    broadcasts = True
+
+    output_frequency = reading(0x01, "Hz", step=0.1, table=INPUT)
+    temperature = reading(0x02, "°C", number_format=NumberFormat.I16, table=INPUT)
+    energy = reading(0x03, "kWh", step=0.01, number_format=NumberFormat.U32, table=INPUT)
+    energy_swapped = reading(0x05, "kWh", step=0.01, number_format=NumberFormat.U32_SWAPPED, table=INPUT)
+    power = reading(0x07, "kW", number_format=NumberFormat.F32, table=INPUT)
+    acceleration_time = setting(
+        0x10, "s", step=0.1, span=(0.1, 600), default=5, kept=Kept.EEPROM, ram_address=0x8010
+    )
+    total = setting(0x12, number_format=NumberFormat.U32)
+    frequency = command(0x30, "Hz", step=0.01, span=(0, 50), kept=Kept.RAM)
+    offset = setting(0x40, "%", number_format=NumberFormat.I16, span=(-100, 100))
+    relay = setting(0x05, table=COIL)
+    lamp = setting(0x06, table=COIL)
+    door = reading(0x05, table=DISCRETE)
+
+
+@pytest.fixture
+def sim() -> SimulatedDrive:
+    return SimulatedDrive(Own(7))
+
+
+def ask(sim: SimulatedDrive, function: int, start: int, count: int = 0, data: bytes = b"") -> Message | None:
+    return sim.answer(Message(7, function, start, count, data), 0.0)
+
+
+def data_of(reply: Message | None) -> str:
+    assert reply is not None
+    assert not reply.exception
+    return reply.data.hex(" ")
+
+
+def exception_of(reply: Message | None) -> int:
+    assert reply is not None
+    return reply.exception
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "function", "start", "count", "words"),
+    [
+        ("output_frequency", 50.0, 4, 1, 1, "01 f4"),
+        ("temperature", -10, 4, 2, 1, "ff f6"),
+        ("energy", 12345.67, 4, 3, 2, "00 12 d6 87"),  # 1234567 = 12D687H
+        ("energy_swapped", 12345.67, 4, 5, 2, "d6 87 00 12"),
+        ("power", 1.5, 4, 7, 2, "3f c0 00 00"),
+        ("door", 1, 2, 5, 1, "01"),
+        ("relay", 1, 1, 4, 3, "02"),
+    ],
+)
+def test_a_value_that_is_set_is_what_is_read(
+    sim: SimulatedDrive, name: str, value: float, function: int, start: int, count: int, words: str
+) -> None:
+    if name == "relay":
+        sim.memory.make_readable(COIL, [4])
+    sim[name] = value
+    assert data_of(ask(sim, function, start, count)) == words
+    assert sim[name] == value
+
+
+def test_defaults_and_readable_gaps(sim: SimulatedDrive) -> None:
+    assert data_of(ask(sim, 3, 0x10, 4)) == "00 32 00 00 00 00 00 00"
+
+
+def test_one_register_is_written_and_read_back(sim: SimulatedDrive) -> None:
+    request = Message(7, 6, 0x10, data=b"\x00\xc8")
+    assert sim.answer(request, 3.5) == request
+    assert sim["acceleration_time"] == 20
+    assert data_of(ask(sim, 3, 0x10, 1)) == "00 c8"
+    (written,) = sim.counters.writes
+    assert written == (3.5, "acceleration_time", 0x10, 200)
+
+
+def test_several_registers_are_written(sim: SimulatedDrive) -> None:
+    assert ask(sim, 0x10, 0x12, 2, b"\x00\x12\xd6\x87") == Message(7, 0x10, 0x12, 2)
+    assert sim["total"] == 1234567
+
+
+def test_coils(sim: SimulatedDrive) -> None:
+    assert ask(sim, 5, 5, data=ON) == Message(7, 5, 5, data=ON)
+    assert ask(sim, 0x0F, 5, 2, b"\x02") == Message(7, 0x0F, 5, 2)
+    assert (sim["relay"], sim["lamp"]) == (0, 1)
+    assert exception_of(ask(sim, 5, 5, data=b"\x12\x34")) == 3
+
+
+def test_a_write_of_several_happens_whole_or_not_at_all(sim: SimulatedDrive) -> None:
+    assert exception_of(ask(sim, 0x10, 0x12, 3, bytes(range(1, 7)))) == 2
+    assert sim["total"] == 0
+    assert not sim.counters.writes
+
+
+@pytest.mark.parametrize(
+    ("function", "start", "count", "data", "code"),
+    [
+        (3, 0x10, 11, b"", 3),
+        (3, 0x10, 0, b"", 3),
+        (4, 0x00, 1, b"", 2),
+        (4, 0x08, 2, b"", 2),  # one defined, one not
+        (3, 0xFFFF, 2, b"", 2),
+        (3, 0x30, 1, b"", 2),  # write-only
+        (3, 0x8010, 1, b"", 2),  # the alias is for writing only
+        (6, 0x01, 0, b"\x00\x01", 2),  # an input register
+        (6, 0x11, 0, b"\x00\x01", 2),  # a gap
+        (6, 0x30, 0, b"\x13\x89", 3),  # 50.01 Hz
+        (8, 0x01, 0, b"\x00\x00", 1),
+        (0x2B, 0, 0, b"", 1),
+    ],
+)
+def test_refusals(sim: SimulatedDrive, function: int, start: int, count: int, data: bytes, code: int) -> None:
+    assert exception_of(ask(sim, function, start, count, data)) == code
+    assert sim.counters.refusals == 1
+
+
+def test_a_span_knows_signs(sim: SimulatedDrive) -> None:
+    assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9c")) == 0  # -100
+    assert sim["offset"] == -100
+    assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9b")) == 3
+
+
+def test_a_dead_drive(sim: SimulatedDrive) -> None:
+    sim.deaf_until = math.inf
+    assert ask(sim, 4, 1, 1) is None
+    assert sim.counters.requests == 0
+
+
+def test_diagnostics_echo(sim: SimulatedDrive) -> None:
+    assert ask(sim, 8, 0, data=b"\xa5\x37") == Message(7, 8, 0, data=b"\xa5\x37")
+
+
+def test_another_address_is_silence(sim: SimulatedDrive) -> None:
+    assert sim.answer(Message(8, 4, 1, 1), 0.0) is None
+    assert sim.counters.requests == 0
+
+
+def test_a_broadcast_is_obeyed_and_never_answered(sim: SimulatedDrive) -> None:
+    assert sim.answer(Message(0, 6, 0x30, data=b"\x13\x88"), 0.0) is None
+    assert sim.memory.get(Own.frequency) == 50
+    assert sim.answer(Message(0, 6, 0x99, data=b"\x13\x88"), 0.0) is None
+    assert sim.answer(Message(0, 4, 1, 1), 0.0) is None
+    assert (sim.counters.broadcasts, sim.counters.requests) == (3, 0)
+
+
+def test_a_class_without_broadcasts_ignores_them() -> None:
+    class Deaf(Own):
+        broadcasts = False
+
+    sim = SimulatedDrive(Deaf(7))
+    assert sim.answer(Message(0, 6, 0x30, data=b"\x13\x88"), 0.0) is None
+    assert sim["frequency"] == 0
+
+
+def test_eeprom_wear_is_counted_and_the_ram_alias_spares_it(sim: SimulatedDrive) -> None:
+    ask(sim, 6, 0x10, data=b"\x00\xc8")
+    ask(sim, 6, 0x10, data=b"\x00\xc8")
+    ask(sim, 6, 0x8010, data=b"\x01\x90")
+    ask(sim, 6, 0x30, data=b"\x00\x01")
+    assert sim.counters.eeprom_writes == {"acceleration_time": 2}
+    assert sim["acceleration_time"] == 40
+
+
+def test_requests_are_counted_by_function(sim: SimulatedDrive) -> None:
+    ask(sim, 4, 1, 1)
+    ask(sim, 4, 1, 1)
+    ask(sim, 6, 0x10, data=b"\x00\xc8")
+    assert sim.counters.functions == {4: 2, 6: 1}
+    assert (sim.counters.requests, sim.counters.replies) == (3, 3)
+
+
+def test_writes_are_remembered_within_bounds(sim: SimulatedDrive) -> None:
+    for _ in range(11_000):
+        ask(sim, 6, 0x10, data=b"\x00\xc8")
+    assert len(sim.counters.writes) == 10_000
+    assert sim.counters.eeprom_writes["acceleration_time"] == 11_000
+
+
+def test_a_write_only_register_may_be_read_from_outside(sim: SimulatedDrive) -> None:
+    ask(sim, 6, 0x30, data=b"\x13\x88")
+    assert sim["frequency"] == 50
+
+
+def test_a_class_of_one_s_own_needs_no_family() -> None:
+    assert type(simulated(Own(3))) is SimulatedDrive
+
+
+def every_register() -> list[tuple[Register[float], int]]:
+    return [(it, at) for it in Own.registers.values() if it.readable for at in range(it.words)]
+
+
+@pytest.mark.parametrize(("register", "at"), every_register(), ids=str)
+def test_an_encoded_drive_says_who_and_where_it_is(register: Register[float], at: int) -> None:
+    sim = EncodedDrive(Own(7))
+    table, where = register.table, register.address + at
+    numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}
+    expected = (7 * 257 + where * 31 + numbers[table]) & 0x7FFF
+    assert encoded(7, table, where) == expected
+    reply = ask(sim, table.read or 0, where, 1)
+    assert reply is not None
+    width = {COIL: 0x1, DISCRETE: 0x1}.get(table, 0xFFFF)
+    assert int.from_bytes(reply.data) == expected & width
+
+
+def test_an_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
+    sim = EncodedDrive(Own(7))
+    before = ask(sim, 3, 0x10, 1)
+    request = Message(7, 6, 0x10, data=b"\x00\xc8")
+    assert sim.answer(request, 0.0) == request
+    assert ask(sim, 3, 0x10, 1) == before
+
+
+def test_neighbouring_drives_and_registers_have_different_codes() -> None:
+    tables = (HOLDING, INPUT, Table("another", 7, None))
+    codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
+    assert len(codes) == 8 * 3 * 8

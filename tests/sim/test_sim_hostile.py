@@ -1,0 +1,249 @@
+"""What each fault does to the bytes of a hostile line, and how a faults' file is read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import checksums
+import pytest
+from lines import until
+from test_sim_wire import timeline
+from toy import Toy
+
+from multidrop.bus import exchange
+from multidrop.cli import main
+from multidrop.core import Message, Peer, Result
+from multidrop.drives import YD1000
+from multidrop.errors import LineError
+from multidrop.plant.loader import parse_duration
+from multidrop.sim import Faults, HostileWire, SimulatedDrive, Simulator, load_faults, simulated
+from multidrop.sim.faults import RATES
+from multidrop.transport.line import Line
+
+READ = checksums.rtu("01 03 00 02 00 01")
+REPLY = checksums.rtu("01 03 02 00 00")
+START = checksums.rtu("01 06 10 00 C4 00")  # of a YD1000
+WHOLE = 5.0  # s, in which all that is on its way comes
+
+
+class Heard:
+    """What a client hears of a hostile line, on a clock that moves with its requests."""
+
+    def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
+        self.wire = HostileWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))
+        self.now = 0.0
+
+    def after(self, request: bytes = READ) -> list[tuple[float, bytes]]:
+        begun = self.now
+        self.wire.receive(request, begun)
+        pieces = timeline(self.wire, begun + WHOLE)
+        self.now += WHOLE
+        return [(at - begun, piece) for at, piece in pieces]
+
+    def bytes_after(self, request: bytes = READ) -> bytes:
+        return b"".join(piece for _, piece in self.after(request))
+
+
+def bits(one: bytes, other: bytes) -> int:
+    return (int.from_bytes(one) ^ int.from_bytes(other)).bit_count()
+
+
+def test_without_faults_it_is_a_wire() -> None:
+    assert Heard().bytes_after() == REPLY
+
+
+def test_the_same_seed_brings_the_same_faults() -> None:
+    def story(seed: int) -> list[Any]:
+        line = Heard(seed=seed, drop=0.2, delay=0.3, noise=0.2, merge=0.2, split=0.3)
+        return [line.after() for _ in range(50)]
+
+    assert story(1) == story(1) != story(2)
+
+
+@pytest.mark.parametrize(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
+def test_a_frame_is_damaged_once(fault: str, length: int) -> None:
+    line = Heard(**{fault: 0.5})
+    found = [line.bytes_after() for _ in range(200)]
+    damaged = [it for it in found if it not in (REPLY, b"")]
+    assert 20 < len(damaged) < 80  # half of them, where the request was spared
+    assert {len(it) - len(REPLY) for it in damaged} == {length}
+    if fault == "flip":
+        assert {bits(it, REPLY) for it in damaged} == {1}
+    assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
+
+
+def test_a_reply_comes_twice() -> None:
+    assert Heard(twice=1).bytes_after() == 2 * REPLY
+
+
+def test_a_reply_comes_late() -> None:
+    usual = Heard().after()[0][0]
+    delays = [Heard(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
+    assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
+
+
+def test_a_reply_waits_for_the_next_one() -> None:
+    line = Heard(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
+    line.wire.receive(READ, 0.0)
+    assert timeline(line.wire, 0.3) == []
+    line.wire.receive(checksums.rtu("02 03 00 02 00 01"), 0.3)
+    heard = timeline(line.wire, WHOLE)
+    assert b"".join(piece for _, piece in heard) == REPLY + checksums.rtu("02 03 02 00 00")
+    assert heard[-1][0] < 0.5
+
+
+def test_a_reply_waits_only_so_long_for_the_next_one() -> None:
+    line = Heard(merge=1, late=0.2)
+    heard = line.after()
+    assert b"".join(piece for _, piece in heard) == REPLY
+    assert heard[-1][0] < 0.4
+
+
+def test_a_reply_has_a_pause_inside() -> None:
+    pauses = []
+    for seed in range(50):
+        times, pieces = zip(*Heard(split=1, pause=0.5, seed=seed).after(), strict=True)
+        assert b"".join(pieces) == REPLY
+        pauses.append(times[-1] - times[0] - 6 * Toy(1).settings.character)
+    assert max(pauses) > 0.4
+
+
+def test_a_request_comes_back() -> None:
+    assert Heard(echo=1).bytes_after() == READ + REPLY
+
+
+def test_noise_is_heard_before_a_reply_and_by_the_drives() -> None:
+    lengths = set()
+    line = Heard(noise=1, burst=9)
+    for _ in range(100):
+        heard = line.bytes_after()
+        assert heard.endswith(REPLY)
+        lengths.add(len(heard) - len(REPLY))
+    assert lengths == set(range(1, 10))
+
+
+def test_noise_comes_with_a_motor_s_start() -> None:
+    line = Heard(simulated(YD1000(1)), start_noise=1)
+    stop = checksums.rtu("01 06 10 00 C0 00")
+    assert line.bytes_after(stop) == stop
+    assert len(line.bytes_after(START)) > len(START)
+    assert line.bytes_after(START) == START  # it runs already
+    assert line.wire.struck["start_noise"] == 1
+
+
+# ---- the port ----
+
+
+@pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
+def test_a_port_hangs_up_and_is_back_where_it_was(port: str, tmp_path: Path) -> None:
+    where = str(tmp_path / port) if port == "link" else port
+    wire = HostileWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
+    with Simulator([wire]) as sim:
+        path = sim.wires[0].path
+        names = set()
+        for _ in range(5):
+            line = opened(path)
+            names.add(Path(path).resolve())
+            with pytest.raises(LineError):
+                read(line)
+            line.close()
+        assert wire.struck["hang_up"] >= 5
+        wire.faults = Faults()
+        line = opened(path)
+        assert read(line) == REPLY
+        line.close()
+    assert len(names) >= (2 if port == "link" else 1)
+    assert not list(tmp_path.iterdir())
+
+
+def opened(path: str) -> Line:
+    found: list[Line] = []
+
+    def is_open() -> bool:
+        try:
+            found.append(Line(path))
+        except LineError:
+            return False
+        return True
+
+    until(is_open)
+    return found[0]
+
+
+def read(line: Line) -> bytes:
+    drive = Toy(1)
+    asked = exchange(drive, Message(1, 3, 2, 1), Peer(least_timeout=5, most_timeout=5))
+    found = line.carry_out(asked)
+    assert found.result > 0, Result(found.result)
+    return found.raw
+
+
+def test_a_bare_pty_cannot_hang_up() -> None:
+    with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
+        HostileWire([simulated(Toy(1))], Faults(hang_up=0.1))
+
+
+# ---- the file ----
+
+
+def test_all_that_a_file_says(tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text("\n".join([*(f"{name} = 0.25" for name in RATES), 'late = "2 s"', "seed = 3"]))
+    assert load_faults(path) == Faults(**dict.fromkeys(RATES, 0.25), late=2.0, seed=3)
+
+
+def test_every_mistake_is_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text('drop = 1.5\nflips = 0.1\nlate = "soon"\nburst = 0\nseed = "x"\naway = 3\ndelay = true\n')
+    with pytest.raises(ValueError, match=re.escape(str(path))) as mistake:
+        load_faults(path)
+    with pytest.raises(ValueError, match="is not a duration") as soon:
+        parse_duration("soon")
+    assert str(mistake.value).splitlines() == [
+        f"{path}: {sentence}"
+        for sentence in (
+            "unknown key 'flips'; did you mean 'flip'?",
+            "seed = 'x' is not right; write seed = 7",
+            "delay = True is not right; write delay = 0.01",
+            'away = 3 is not right; write away = "1 s"',
+            f"late = {soon.value}",
+            "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01",
+            "burst = 0 is not from 1 to 4096 characters",
+        )
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [(None, r"the faults' file cannot be read: No such file"), ("drop =", "is not TOML: ")],
+)
+def test_what_is_no_faults_file(text: str | None, sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}: {sentence}"):
+        load_faults(path)
+
+
+def test_the_command_says_what_the_file_may_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--help"]) == 0
+    told = capsys.readouterr().out
+    assert all(re.search(rf"^  {name} = ", told, re.MULTILINE) for name in (*RATES, "seed", "late"))
+
+
+def test_the_command_reports_a_mistake_in_the_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    plant, faults = tmp_path / "plant.toml", tmp_path / "faults.toml"
+    plant.write_text(
+        '[[line]]\nname = "a"\nport = "a"\n[[line.drive]]\nname = "b"\nmodel = "yd1000"\naddress = 1\n'
+    )
+    faults.write_text("drop = 2\n")
+    words = ["simulate", str(plant), "--ports", str(tmp_path / "ports"), "--faults", str(faults)]
+    assert main(words) == 2
+    assert capsys.readouterr().err == (
+        f"multidrop: {faults}: drop = 2 is not a rate; write one from 0 to 1, such as 0.01\n"
+    )
+    assert not (tmp_path / "ports").exists()

@@ -1,0 +1,251 @@
+"""One line of simulated drives: who hears what, and when every byte is through. The clock is the test's."""
+
+from __future__ import annotations
+
+import checksums
+import pytest
+
+from multidrop.core import Framing
+from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, setting
+from multidrop.drives.delixi_modbus import DelixiModbus
+from multidrop.drives.delixi_native import DelixiNative
+from multidrop.drives.erman_er_g_220 import ErmanERG220
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
+from multidrop.drives.yd1000 import YD1000
+from multidrop.sim import SimulatedDrive, Wire, simulated
+
+
+class Own(Drive):
+    framings = (Framing.RTU, Framing.ASCII)
+    most_registers = {HOLDING: 10}
+    broadcasts = True
+    value = setting(0x01)
+    another = setting(0x02)
+
+
+READ = checksums.rtu("01 03 00 01 00 01")
+CHARACTER_8N1 = 10 / 9600
+
+
+def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
+    """Every piece that the client hears, at the wake that brings it."""
+    heard = []
+    for _ in range(10_000):
+        wake = wire.wake
+        if wake is None or wake > until:
+            break
+        piece = wire.advance(wake)
+        if piece:
+            heard.append((wake, piece))
+    return heard
+
+
+def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) -> bytes:
+    wire.receive(frame, now, baudrate)
+    return b"".join(piece for _, piece in timeline(wire, now + 5))
+
+
+def test_the_reply_waits_for_the_request_s_last_bit_and_the_drive() -> None:
+    wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.02)])
+    wire.receive(READ, 10.0)
+    heard = timeline(wire, 11.0)
+    assert b"".join(piece for _, piece in heard) == checksums.rtu("01 03 02 00 00")
+    begin = 10.0 + 8 * CHARACTER_8N1 + 0.02
+    assert heard[0][0] == pytest.approx(begin + CHARACTER_8N1)
+    assert heard[-1][0] == pytest.approx(begin + 7 * CHARACTER_8N1)
+
+
+@pytest.mark.parametrize("baudrate", [1200, 9600, 19200, 38400, 115200])
+def test_no_byte_comes_before_its_last_bit_and_none_much_later(baudrate: int) -> None:
+    drive = Own(1, baudrate=baudrate)
+    wire = Wire([SimulatedDrive(drive, response_delay=0.05)])
+    wire.receive(checksums.rtu("01 03 00 01 00 02"), 0.0)
+    character = 10 / baudrate
+    begin = 8 * character + 0.05
+    passed = 0
+    for at, piece in timeline(wire, 1.0):
+        passed += len(piece)
+        ends = begin + passed * character
+        assert at == pytest.approx(ends)  # its last byte: on time
+        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9  # its first
+    assert passed == 9
+
+
+def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
+    wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.0)])
+    wire.receive(READ, 0.0)
+    assert timeline(wire, 1.0)[0][0] == pytest.approx((8 + 3.5 + 1) * CHARACTER_8N1)
+
+
+@pytest.mark.parametrize(
+    ("drive", "request_", "silence"),
+    [
+        (ErmanERG220(1), "01 04 00 01 00 01", 1.75e-3),
+        (InnovertIBD(1), "01 03 00 03 00 01", 10e-3),
+        (YD1000(1), "01 03 11 00 00 01", 24 * 11 / 9600),
+    ],
+    ids=lambda it: getattr(it, "model", None),
+)
+def test_each_family_s_silence_before_its_reply(drive: Drive, request_: str, silence: float) -> None:
+    wire = Wire([simulated(drive, response_delay=0.0)])
+    wire.receive(checksums.rtu(request_), 0.0)
+    character = drive.settings.character
+    assert timeline(wire, 1.0)[-1][0] == pytest.approx((8 + 7) * character + silence)
+
+
+def test_an_unpaced_wire_has_no_waits() -> None:
+    wire = Wire([SimulatedDrive(Own(1), response_delay=0.5)], unpaced=True)
+    wire.receive(READ, 10.0)
+    assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
+    wire.receive(READ, 10.0)
+    assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
+
+
+def test_a_request_within_the_silence_after_a_reply_is_not_understood() -> None:
+    sim = simulated(InnovertIBD(1))
+    wire = Wire([sim])
+    request = checksums.rtu("01 03 00 03 00 01")
+    wire.receive(request, 0.0)
+    end = timeline(wire, 5.0)[-1][0]
+    assert exchange(wire, request, end + 9.5e-3) == b""
+    assert sim.counters.early == 1
+    assert exchange(wire, request, end + 1.0) != b""
+    end = 100.0
+    wire.receive(request, end)
+    end = timeline(wire, end + 5)[-1][0]
+    assert exchange(wire, request, end + 10e-3) != b""
+    assert sim.counters.early == 1
+
+
+def test_a_request_that_begins_while_a_reply_is_under_way_is_not_understood() -> None:
+    sim = SimulatedDrive(Own(1), response_delay=0.02)
+    wire = Wire([sim])
+    wire.receive(READ, 0.0)
+    wire.advance(8 * CHARACTER_8N1 + 0.02 + 2 * CHARACTER_8N1)
+    wire.receive(READ, 8 * CHARACTER_8N1 + 0.02 + 3 * CHARACTER_8N1)
+    timeline(wire, 5.0)
+    assert sim.counters.early == 1
+    assert sim.counters.requests == 1
+
+
+def test_where_no_document_demands_it_a_missing_silence_is_only_counted() -> None:
+    sim = SimulatedDrive(Own(1), response_delay=0.02)
+    wire = Wire([sim])
+    wire.receive(READ, 0.0)
+    end = timeline(wire, 5.0)[-1][0]
+    assert exchange(wire, READ, end + 1e-3) != b""
+    assert sim.counters.early == 1
+
+
+def test_a_quick_drive_does_not_wait_for_a_slow_one_s_late_reply() -> None:
+    slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
+    slow["value"], quick["value"] = 1, 2
+    wire = Wire([slow, quick])
+    wire.receive(READ, 0.0)
+    wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.2)
+    heard = timeline(wire, 5.0)
+    quick_reply, slow_reply = checksums.rtu("02 03 02 00 02"), checksums.rtu("01 03 02 00 01")
+    assert b"".join(piece for _, piece in heard) == quick_reply + slow_reply
+    assert heard[6][0] == pytest.approx(0.2 + 0.01 + (8 + 7) * CHARACTER_8N1)
+    assert heard[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
+
+
+def test_replies_that_meet_follow_one_another() -> None:
+    slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
+    wire = Wire([slow, quick])
+    wire.receive(READ, 0.0)
+    wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.487)
+    heard = timeline(wire, 5.0)
+    first, second = checksums.rtu("02 03 02 00 00"), checksums.rtu("01 03 02 00 00")
+    assert b"".join(piece for _, piece in heard) in (first + second, second + first)
+    assert heard[-1][0] - heard[0][0] == pytest.approx(13 * CHARACTER_8N1)
+
+
+def test_a_late_reply_is_sent_all_the_same() -> None:
+    slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
+    slow["value"], quick["value"] = 1, 2
+    wire = Wire([slow, quick])
+    wire.receive(READ, 0.0)
+    assert timeline(wire, 0.2) == []
+    heard = exchange(wire, checksums.rtu("02 03 00 01 00 01"), 0.6)
+    assert heard == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
+
+
+def test_two_framings_share_a_line() -> None:
+    rtu, text = Own(1, framing="rtu"), Own(2, framing="ascii")
+    native = DelixiNative(3)
+    wire = Wire([simulated(rtu), simulated(text), simulated(native)], unpaced=True)
+    for frame, reply in [
+        (READ, checksums.rtu("01 03 02 00 00")),
+        (checksums.ascii("020300010001"), checksums.ascii("0203020000")),
+        (checksums.delixi("0303000000000000"), checksums.delixi("0303000100000000")),
+        (READ, checksums.rtu("01 03 02 00 00")),
+        (checksums.ascii("010300010001"), b""),  # its address is RTU's
+        (checksums.rtu("02 03 00 01 00 01"), b""),
+    ]:
+        wire.receive(frame, 0.0)
+        assert wire.advance(10.0) == reply
+
+
+def test_a_drive_hears_its_own_baud_rate_only() -> None:
+    slow, fast = Own(1, baudrate=9600), Own(2, baudrate=19200)
+    wire = Wire([simulated(slow), simulated(fast)])
+    other = checksums.rtu("02 03 00 01 00 01")
+    assert exchange(wire, READ, 0.0, 19200) == b""
+    assert exchange(wire, READ, 10.0, 9600) != b""
+    assert exchange(wire, other, 20.0, 9600) == b""
+    assert exchange(wire, other, 30.0, 19200) != b""
+    assert exchange(wire, READ, 40.0, None) != b""  # where it cannot be seen, everything is heard
+
+
+def test_what_was_begun_at_another_baud_rate_is_forgotten() -> None:
+    wire = Wire([simulated(Own(1, baudrate=9600))])
+    wire.receive(READ[:4], 0.0, 9600)
+    wire.receive(b"", 0.001, 19200)
+    assert exchange(wire, READ, 0.002, 9600) != b""
+
+
+def test_all_drives_obey_a_broadcast_and_none_answers() -> None:
+    sims = [
+        simulated(Own(address, framing=framing))
+        for address, framing in ((1, "rtu"), (2, "rtu"), (3, "ascii"))
+    ]
+    wire = Wire(sims)
+    assert exchange(wire, checksums.rtu("00 06 00 01 00 2A"), 0.0) == b""
+    assert [sim["value"] for sim in sims] == [42, 42, 0]
+
+
+def test_an_absent_address_is_silence() -> None:
+    assert exchange(Wire([simulated(Own(1))]), checksums.rtu("09 03 00 01 00 01"), 0.0) == b""
+
+
+def test_the_same_address_twice_is_a_mistake() -> None:
+    with pytest.raises(ValueError, match="the same address"):
+        Wire([simulated(Own(1)), simulated(Own(1))])
+    Wire([simulated(Own(1)), simulated(Own(1, framing="ascii")), simulated(Own(1, baudrate=19200))])
+    with pytest.raises(ValueError, match="at least one drive"):
+        Wire([])
+
+
+def test_noise_can_be_put_on_replies() -> None:
+    class Noisy(Wire):
+        def distort(self, reply: bytes) -> bytes:
+            return b"\x00" + reply
+
+    assert exchange(Noisy([simulated(Own(1))]), READ, 0.0) == b"\x00" + checksums.rtu("01 03 02 00 00")
+
+
+def test_a_wire_that_nothing_happens_on_needs_no_waking() -> None:
+    wire = Wire([simulated(it) for it in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
+    assert wire.wake is None
+    wire.receive(b"\x01", 0.0)
+    assert wire.wake is not None
+    timeline(wire, 1.0)
+    assert wire.wake is None
+
+
+def test_a_path_is_known_only_while_it_is_open() -> None:
+    with pytest.raises(RuntimeError, match="not open"):
+        _ = Wire([simulated(Own(1))], name="hall-1").path

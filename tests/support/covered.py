@@ -1,0 +1,95 @@
+"""A table of what the tests reached, in Python and in C, and the lines that they did not.
+
+`python tests/support/covered.py JSON BUILD`: coverage.py's report, and the directory in which the core was
+built with --coverage. What is not reached is in README.md here, with the reason.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+
+
+@dataclass
+class Reach:
+    lines: int = 0
+    branches: int = 0
+    taken: int = 0
+    missed: set[int] = field(default_factory=set)  # lines
+    untaken: set[tuple[int, int]] = field(
+        default_factory=set
+    )  # branches of the others: from where, which way
+
+
+def of_python(report: Path) -> dict[str, Reach]:
+    found = {}
+    for path, it in json.loads(report.read_text())["files"].items():
+        summary = it["summary"]
+        name = "src/multidrop/" + path.rpartition("multidrop/")[2]
+        missed = set(it["missing_lines"])
+        untaken = {(line, to) for line, to in it["missing_branches"] if line not in missed}
+        figures = (summary[it] for it in ("num_statements", "num_branches", "covered_branches"))
+        found[name] = Reach(*figures, missed, untaken)
+    return found
+
+
+def of_c(build: Path) -> dict[str, Reach]:
+    found: defaultdict[str, Reach] = defaultdict(Reach)
+    for counts in sorted(build.rglob("*.gcda")):
+        command = ["gcov", "--json-format", "--stdout", "--branch-probabilities", counts]
+        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        for file in (it for line in text.splitlines() for it in json.loads(line)["files"]):
+            if "/csrc/" not in file["file"]:
+                continue
+            reach = found["csrc/" + file["file"].rpartition("/csrc/")[2]]
+            for line in file["lines"]:
+                number, ways = line["line_number"], line["branches"]
+                reach.lines += 1
+                untaken = {(number, way) for way, it in enumerate(ways) if it["count"] == 0}
+                reach.branches += len(ways)
+                reach.taken += len(ways) - len(untaken)
+                if line["count"]:
+                    reach.untaken |= untaken
+                else:
+                    reach.missed.add(number)
+    return dict(found)
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """1-3 7 9-10"""
+    runs = groupby(enumerate(sorted(numbers)), lambda it: it[1] - it[0])
+    ends = [[number for _, number in run] for _, run in runs]
+    return " ".join(f"{it[0]}-{it[-1]}" if len(it) > 1 else f"{it[0]}" for it in ends)
+
+
+def room(name: str) -> str:
+    """What is one row: a file of the core, a directory of Python."""
+    return name if name.endswith((".c", ".h")) else name.rpartition("/")[0] + "/"
+
+
+def main(report: str, build: str) -> None:
+    reached = of_c(Path(build)) | of_python(Path(report))
+    rooms: defaultdict[str, list[Reach]] = defaultdict(list)
+    for name, reach in sorted(reached.items()):
+        rooms[room(name)].append(reach)
+    print(f"{'':28}{'lines':>8}{'reached':>9}{'branches':>10}{'reached':>9}")
+    for name, reaches in [*rooms.items(), ("all", [*reached.values()])]:
+        lines, branches = sum(it.lines for it in reaches), sum(it.branches for it in reaches)
+        hit = lines - sum(len(it.missed) for it in reaches)
+        taken = sum(it.taken for it in reaches)
+        print(f"{name:28}{lines:8}{hit / (lines or 1):9.1%}{branches:10}{taken / (branches or 1):9.1%}")
+    for name, reach in sorted(reached.items()):
+        if reach.missed:
+            print(f"not reached: {name} {spans(reach.missed)}")
+        if reach.untaken:
+            print(f"one way only: {name} {spans({line for line, _ in reach.untaken})}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

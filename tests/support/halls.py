@@ -1,0 +1,131 @@
+"""A bus whose line is simulated drives in this very thread, at a time that only the test lets pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from multidrop import bus
+from multidrop.control import call, performer
+from multidrop.control import identity as identity_check
+from multidrop.control import writer as writing
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Message,
+    Peer,
+    Result,
+    build_reply,
+    build_request,
+    parse_reply,
+)
+from multidrop.drive import Drive
+from multidrop.sim import PoweredDrive, SimulatedDrive, simulated
+from multidrop.transport import exchange as exchanges
+
+EXCHANGE_TIME = 0.02  # s
+TIMEOUT = 0.3
+
+READING = {1, 2, 3, 4}
+QUERYING = {3, 7}  # of Delixi's own protocol
+
+
+def text(frame: bytes) -> str:
+    """As documents print it."""
+    return frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
+
+
+class Hall:
+    """Drives that are simulated, and a bus to them; every frame that was sent is kept.
+
+    `loses(request)` says whether the reply to it is lost, `deafens(request)` whether it never arrives.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
+        self.sims = sims
+        self.seconds = 1000.0
+        self.frames: list[tuple[Message, str]] = []
+        self.loses: Callable[[Message], bool] = lambda request: False
+        self.deafens: Callable[[Message], bool] = lambda request: False
+        self.answers: Callable[[Message], bytes | None] = lambda request: None  # instead of the drives
+        self.queue_time = 0.0  # until an exchange's turn comes
+        self.queue = object()  # the open port
+        self.has_echo = False
+        self.port = self.identity = "hall"
+        monkeypatch.setattr(bus, "Line", lambda port, echo: self)
+        for module in (performer, exchanges, writing, identity_check):
+            monkeypatch.setattr(module, "sleep", self.sleep)
+        for module in (bus, call, exchanges, performer, writing):
+            monkeypatch.setattr(module, "now_ns", lambda: round(self.seconds * 1e9))
+        monkeypatch.setattr(writing, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
+        self.bus = bus.Bus("hall", **details)
+
+    def sleep(self, seconds: float) -> None:
+        self.seconds += seconds
+
+    is_lost = False
+
+    def close(self) -> None:
+        pass
+
+    def regain(self) -> None:
+        """Whatever stands in the way of that is the test's."""
+
+    def overruns(self) -> None:
+        return None
+
+    def inherit(self, peer: Peer, before: Peer) -> None:
+        peer.inherit(before)
+
+    def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
+        request = exchange.request
+        self.seconds += self.queue_time
+        is_overtaken = exchange.permit is not None and not exchange.permit.is_good
+        if is_overtaken or (expires_ns and self.seconds * 1e9 > expires_ns):
+            return self._completion(int(Result.EXPIRED))
+        frame = build_request(exchange.framing, request)
+        self.frames.append((request, text(frame)))
+        self.seconds += EXCHANGE_TIME
+        reply = self.answers(request)
+        if reply is None and not self.deafens(request):
+            heard = [
+                it.answer(request, self.seconds) for it in self.sims if it.drive.framing is exchange.framing
+            ]
+            replies = [it for it in heard if it is not None]
+            assert len(replies) <= 1
+            reply = build_reply(exchange.framing, replies[0]) if replies else None
+        if request.address == 0:
+            return self._completion(0)
+        if reply is None or self.loses(request):
+            self.seconds += TIMEOUT
+            return self._completion(int(Result.NO_REPLY))
+        used, message = parse_reply(exchange.framing, reply, request)
+        return self._completion(used or int(Result.CUT_SHORT), message, reply)
+
+    def _completion(self, result: int, reply: Message | None = None, raw: bytes = b"") -> Completion:
+        at = round(self.seconds * 1e9)
+        return Completion(result, 0, at, at, at, at, 0, 0, reply or Message(0, 0), raw)
+
+    def attach(self, drive: Drive) -> Any:
+        return self.bus.attach(drive)
+
+    @property
+    def written(self) -> list[str]:
+        """The frames that were no reads."""
+        return [frame for request, frame in self.frames if is_write(request)]
+
+
+def is_write(request: Message) -> bool:
+    if len(request.data) == 4:  # Delixi's own
+        return request.function not in QUERYING
+    return request.function not in READING
+
+
+def one(monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any) -> tuple[Hall, Any, PoweredDrive]:
+    """A hall with one drive that is what it is declared to be."""
+    sim = simulated(drive)
+    assert isinstance(sim, PoweredDrive)
+    hall = Hall(monkeypatch, sim, **details)
+    return hall, hall.attach(drive), sim

@@ -1,0 +1,247 @@
+"""What libmodbus and pymodbus make of frames, in our words: a message, or why it is refused."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from damage import BITS, ECHOES, READS, Said
+from peers import build_with_libmodbus, require_module
+
+from multidrop.core import Framing, Message
+
+Verdict = Message | str  # a string: refused, and why
+
+JUDGE = Path(__file__).parents[1] / "c" / "libmodbus_judge.c"
+EXCEPTIONS = range(12)  # errno of libmodbus for exceptions 00 to 0B; what it says for itself comes after
+EMBBADEXC = 14
+UNKNOWN_CODE = "an exception whose code is not told"
+NO_FUNCTION = "it has no such function"
+
+
+def pack_bits(bits: Sequence[Any]) -> bytes:
+    number = sum(bool(bit) << at for at, bit in enumerate(bits))
+    return number.to_bytes((len(bits) + 7) // 8, "little")
+
+
+def pack_words(words: Sequence[int]) -> bytes:
+    return struct.pack(f">{len(words)}H", *words)
+
+
+def _text(octets: bytes) -> str:
+    return octets.hex() or "-"
+
+
+# ---- libmodbus: a program that is given all cases at once ----
+
+
+class Libmodbus:
+    """libmodbus as server and as client."""
+
+    def __init__(self, built: Path) -> None:
+        self._program = build_with_libmodbus(JUDGE, built)
+
+    def _run(self, lines: Iterable[str]) -> list[str]:
+        said = "".join(f"{line}\n" for line in lines)
+        done = subprocess.run([self._program], input=said, capture_output=True, text=True, check=True)
+        return done.stdout.splitlines()
+
+    def hear(self, requests: Sequence[Said]) -> list[Heard | str]:
+        """What its server does at these requests, each addressed to it."""
+        return [_heard(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
+
+    def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
+        """The requests that its client sends, and what it makes of these replies."""
+        asked = [it.request for it in replies]
+        lines = [
+            f"reply {it.address} {it.function} {it.start} {it.count} {_text(it.data)} {_text(said.frame)}"
+            for it, said in zip(asked, replies, strict=True)
+        ]
+        return [_answered(it, line) for it, line in zip(asked, self._run(lines), strict=True)]
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a server understood, as far as it shows: bytes used, its reply, and cells (table, address)."""
+
+    used: int
+    reply: bytes
+    changes: dict[tuple[int, int], int] = field(default_factory=dict)
+
+
+def _heard(line: str) -> Heard | str:
+    word, *rest = line.split()
+    if word == "refused":
+        return line
+    used, reply, changes = rest
+    cells = [cell.split(":") for cell in changes.split(",") if changes != "-"]
+    return Heard(
+        int(used),
+        b"" if reply == "-" else bytes.fromhex(reply),
+        {(int(table), int(address)): int(value) for table, address, value in cells},
+    )
+
+
+def _answered(request: Message, line: str) -> tuple[bytes, Verdict]:
+    sent, word, *rest = line.split()
+    if word != "error":
+        return bytes.fromhex(sent), _confirmed(request, word)
+    errno = int(rest[0])
+    if errno == EMBBADEXC:
+        return bytes.fromhex(sent), UNKNOWN_CODE
+    if errno in EXCEPTIONS:
+        return bytes.fromhex(sent), Message(request.address, request.function, exception=errno)
+    return bytes.fromhex(sent), f"errno {errno}"
+
+
+def _confirmed(request: Message, values: str) -> Message:
+    """A client that read these values, or is content with the confirmation of its write."""
+    if request.function in ECHOES:
+        return request
+    data = b""
+    if request.function in READS:
+        numbers = [int(value) for value in values.split(",")]
+        data = pack_bits(numbers) if request.function in BITS else pack_words(numbers)
+    return Message(request.address, request.function, request.start, request.count, data)
+
+
+# ---- what a server with the judge's cells must do ----
+
+
+def expected(used: int, request: Message) -> Heard:
+    """The same of a server that understood this, by the application protocol V1.1b3, section 6."""
+    changes: dict[tuple[int, int], int] = {}
+    reply = _carry_out(request, changes)
+    return Heard(used, reply if request.address else b"", changes)
+
+
+def _cell(function: int, address: int) -> int:
+    """As the judge fills them."""
+    fill = {
+        1: int(address % 3 == 0),
+        2: int(address % 5 == 0),
+        3: address * 31 + 7,
+        4: address * 17 + 3,
+    }
+    return fill[function] & 0xFFFF
+
+
+def _carry_out(request: Message, changes: dict[tuple[int, int], int]) -> bytes:
+    """The reply's PDU: function and what follows."""
+    function, start, count = request.function, request.start, request.count
+    if function == 8:
+        return bytes([function]) + start.to_bytes(2) + request.data
+    most = {1: 2000, 2: 2000, 3: 125, 4: 125, 15: 1968, 16: 123}.get(function, 1)
+    many = 1 if function in ECHOES else count
+    table = 1 if function in (1, 5, 15) else 3 if function in (3, 6, 16) else function
+    coil = {b"\xff\x00": 1, b"\0\0": 0}
+    if not 1 <= many <= most or (function == 5 and request.data not in coil):
+        return bytes([function | 0x80, 3])
+    if start + many > 0x10000:
+        return bytes([function | 0x80, 2])
+    cells = [_cell(table, start + at) for at in range(many)]
+    if function in READS:
+        data = pack_bits(cells) if function in BITS else pack_words(cells)
+        return bytes([function, len(data)]) + data
+    if function == 5:
+        written = [coil[request.data]]
+    elif function == 15:
+        written = [request.data[at // 8] >> at % 8 & 1 for at in range(many)]
+    else:
+        written = list(struct.unpack(f">{many}H", request.data))
+    for at, (before, after) in enumerate(zip(cells, written, strict=True)):
+        if before != after:
+            changes[table, start + at] = after
+    tail = request.data if function in ECHOES else count.to_bytes(2)
+    return bytes([function]) + start.to_bytes(2) + tail
+
+
+# ---- pymodbus: its framers and messages ----
+
+
+class Pymodbus:
+    """pymodbus as server and as client, above its ports."""
+
+    def __init__(self, framing: Framing) -> None:
+        framer = require_module("pymodbus.framer")
+        self._pdu = require_module("pymodbus.pdu")
+        self._failure = require_module("pymodbus.exceptions").ModbusException
+        kind = {Framing.RTU: framer.FramerType.RTU, Framing.ASCII: framer.FramerType.ASCII}[framing]
+        make = framer.FRAMER_NAME_TO_CLASS[kind]
+        self._server = make(self._pdu.DecodePDU(True))
+        self._client = make(self._pdu.DecodePDU(False))
+
+    def hear(self, said: Said) -> Verdict:
+        """The request that its server understands."""
+        return self._open(self._server, said, address=0)
+
+    def ask(self, said: Said) -> Verdict:
+        """What its client makes of the reply."""
+        found = self._open(self._client, said, said.request.address)
+        if isinstance(found, Message) and found.function in READS and not found.exception:
+            return replace(found, start=said.request.start, count=said.request.count)
+        return found
+
+    def _open(self, framer: Any, said: Said, address: int) -> Verdict:
+        try:
+            _, pdu = framer.handleFrame(said.frame, address, 0)
+        except (ValueError, self._failure) as failure:
+            return f"{type(failure).__name__}: {failure}"
+        return "no frame" if pdu is None else _said(pdu)
+
+    def build_request(self, request: Message) -> bytes:
+        return bytes(self._server.buildFrame(self._pdu_of(self._server, request)))
+
+    def build_reply(self, reply: Message) -> bytes:
+        if reply.exception:
+            refusal = self._pdu.ExceptionResponse(reply.function, reply.exception, device_id=reply.address)
+            return bytes(self._server.buildFrame(refusal))
+        return bytes(self._client.buildFrame(self._pdu_of(self._client, reply)))
+
+    def _pdu_of(self, framer: Any, message: Message) -> Any:
+        head = bytes([message.address, message.function, 0, 0])  # 0: the subfunction of 08
+        kind = framer.decoder.lookupPduClass(head)
+        return kind(dev_id=message.address, **_fields(message))
+
+
+def _fields(message: Message) -> dict[str, Any]:
+    """As pymodbus names them."""
+    function = message.function
+    if function == 0x08:
+        return {"message": message.data}
+    fields: dict[str, Any] = {"address": message.start}
+    if not message.data:
+        return fields | {"count": message.count}
+    if function == 0x05:
+        return fields | {"bits": [message.data == b"\xff\x00"]}
+    if function in BITS:
+        bits = [bool(message.data[at // 8] >> at % 8 & 1) for at in range(message.count)]
+        return fields | {"bits": bits}
+    return fields | {"registers": list(struct.unpack(f">{len(message.data) // 2}H", message.data))}
+
+
+def _said(pdu: Any) -> Message:
+    function = pdu.function_code
+    if pdu.isError():
+        return Message(pdu.dev_id, function & 0x7F, exception=pdu.exception_code)
+    if function == 0x08:
+        said = pdu.message
+        return Message(pdu.dev_id, function, pdu.sub_function_code, data=_octets(said))
+    data = b""
+    if function == 0x05:
+        data = b"\xff\x00" if pdu.bits[0] else b"\0\0"
+    elif pdu.bits or pdu.registers:
+        data = pack_bits(pdu.bits) if pdu.bits else pack_words(pdu.registers)
+    count = 0 if function in ECHOES else pdu.count
+    return Message(pdu.dev_id, function, pdu.address, count, data)
+
+
+def _octets(said: Any) -> bytes:
+    """The data of 08 as pymodbus has them: octets, a number, or several."""
+    if isinstance(said, bytes):
+        return said
+    return pack_words([said] if isinstance(said, int) else said)

@@ -1,0 +1,138 @@
+"""Simulated lines to poll and command: in a process of their own, and what their values prove."""
+
+from __future__ import annotations
+
+import heapq
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+
+from multidrop.drive import Drive
+from multidrop.drive.register import Register
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
+
+PATIENCE = 30.0  # s, for what comes at once but on a machine that has much else to do
+patient = pytest.mark.usefixtures("_patient")  # drives are waited for as long as it takes
+
+
+def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
+    """Wait for a condition; the test fails when it is not met at last."""
+    end = monotonic() + patience
+    while not met():
+        assert monotonic() < end, f"not met within {patience:g} s"
+        sleep(0.005)
+
+
+class Faulty(Wire):
+    """A wire on which every reply has the fate that it is given."""
+
+    def __init__(
+        self, drives: Sequence[SimulatedDrive], fate: Callable[[bytes], bytes], **details: Any
+    ) -> None:
+        super().__init__(drives, **details)
+        self.fate = fate
+
+    def distort(self, reply: bytes) -> bytes:
+        return self.fate(reply)
+
+
+# ---- in a process of their own ----
+
+
+class LateWire(Wire):
+    """What `distort` holds up comes later, beside all else."""
+
+    def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
+        super().__init__(drives, **details)
+        self._late: list[tuple[float, bytes]] = []  # a heap
+        self._now = 0.0
+
+    def hold_up(self, reply: bytes, seconds: float) -> bytes:
+        """What is left of it by now: nothing."""
+        heapq.heappush(self._late, (self._now + seconds, reply))
+        return b""
+
+    def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
+        self._now = now
+        super().receive(chunk, now, baudrate)
+
+    def advance(self, now: float) -> bytes:
+        self._now = now
+        heard = super().advance(now)
+        while self._late and self._late[0][0] <= now:
+            heard += heapq.heappop(self._late)[1]
+        return heard
+
+    @property
+    def wake(self) -> float | None:
+        times = [at for at, _ in self._late[:1]]
+        return min([*times, *([] if super().wake is None else [super().wake])], default=None)
+
+
+@contextmanager
+def served(make: Callable[[], Sequence[Wire]]) -> Iterator[list[str]]:
+    """The paths of wires that another process runs; `make` is a function that it can import."""
+    ours, theirs = multiprocessing.Pipe()
+    context = multiprocessing.get_context("spawn")
+    process = context.Process(target=_serve, args=(make, theirs), daemon=True)
+    process.start()
+    try:
+        assert ours.poll(PATIENCE)
+        yield ours.recv()
+    finally:
+        process.terminate()
+        process.join()
+        process.close()
+        ours.close()
+        theirs.close()
+
+
+def _serve(make: Callable[[], Sequence[Wire]], connection: Connection) -> None:
+    def announce(simulator: Simulator) -> None:
+        connection.send([wire.path for wire in simulator.wires])
+
+    serve(make(), announce)
+
+
+# ---- plants without a file ----
+
+
+def polled(drive: Drive, registers: Iterable[Register[Any]], every: float | None = None) -> PolledDrive:
+    return PolledDrive(drive, tuple(Polled(register, every) for register in registers))
+
+
+def line(port: str, *drives: PolledDrive, name: str = "line") -> PlantLine:
+    return PlantLine(name, port, None, None, drives)
+
+
+def plant(*lines: PlantLine) -> Plant:
+    return Plant(lines, Path("plant.toml"))
+
+
+def rows_of(poller: Poller) -> list[Row]:
+    """All that waits to be taken."""
+    found: list[Row] = []
+    while batch := poller.take():
+        found += batch
+    return found
+
+
+# ---- what a value proves ----
+
+
+def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
+    """The same for all that is polled, by the names of drive and register."""
+    return {
+        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
+        for it in drives
+        for poll in it.polls
+    }

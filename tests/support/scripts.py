@@ -1,0 +1,134 @@
+"""Carries out verbs without a bus: reads are answered from a table, writes become frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from fractions import Fraction
+from typing import Any
+
+from multidrop.control.rules import conditions, raw_count
+from multidrop.core import Message, build_request
+from multidrop.drive import Drive, Read, Script, Wait
+from multidrop.drive.register import COIL, Carrier, Register
+
+
+def frame(drive: Drive, register: Register[Any], value: Any) -> str:
+    """The frame that writes this value, as documents print it; not the library's own way to it."""
+    raw = (
+        value.value if isinstance(value, Enum) else round(Fraction(str(value)) / Fraction(str(register.step)))
+    )
+    address, function = register.address, register.table.write
+    assert function is not None
+    if register.table is COIL:
+        message = Message(drive.address, function, address, data=b"\xff\x00" if raw else b"\x00\x00")
+    elif register.table.carrier is Carrier.NUMBER:
+        message = Message(drive.address, function, raw, data=bytes(4))
+    elif register.table.carrier is Carrier.LONG:
+        message = Message(drive.address, function, address, data=struct.pack(">I", raw))
+    else:
+        message = Message(drive.address, function, address, data=struct.pack(">H", raw))
+    sent = build_request(drive.framing, message)
+    return sent.decode().strip() if sent.startswith(b":") else sent.hex(" ").upper()
+
+
+class Wire:
+    """A drive that says what the test tells it to.
+
+    `says` has a value for each register's name, or a list of them for one read after another (the
+    last one stays); an exception is raised instead. `loses` has the exceptions of the first writes of
+    a frame, and `turns` what it says after a frame. What is written is held, unless `says` has another
+    value. The rules of registers hold as on a bus; what they look at is not counted in `reads`.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        says: Mapping[str, Any] | None = None,
+        loses: Mapping[str, Sequence[Exception]] | None = None,
+        turns: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.drive = drive
+        self.says: dict[str, list[Any]] = {}
+        self.say(says or {})
+        self.turns = turns or {}
+        self.loses = {text: list(it) for text, it in (loses or {}).items()}
+        self.held: dict[str, Any] = {}
+        self.sent: list[str] = []
+        self.reads: list[str] = []
+        self.seconds = 0.0
+        drive.perform = self.run
+
+    def say(self, says: Mapping[str, Any]) -> None:
+        """From now on."""
+        self.says |= {name: list(it) if isinstance(it, list) else [it] for name, it in says.items()}
+
+    def run(self, script: Script[Any]) -> Any:
+        return self._run(script, self._step)
+
+    def _run(self, script: Script[Any], carry_out: Callable[[Any], Any]) -> Any:
+        try:
+            step = next(script)
+            while True:
+                try:
+                    result = carry_out(step)
+                except Exception as failure:
+                    step = script.throw(failure)
+                else:
+                    step = script.send(result)
+        except StopIteration as end:
+            return end.value
+
+    def _step(self, step: Any) -> Any:
+        if isinstance(step, Wait):
+            self.seconds += step.seconds
+            return None
+        if isinstance(step, Read):
+            self.reads.append(step.register.name)
+            assert step.register.readable
+            return self._said(step.register)
+        raw_count(self.drive, step.register, step.value)
+        self._run(
+            conditions(self.drive, step.register, step.value), lambda look: self.says[look.register.name][0]
+        )
+        text = frame(self.drive, step.register, step.value)
+        self.sent.append(text)
+        if self.loses.get(text):
+            raise self.loses[text].pop(0)
+        self.say(self.turns.get(text, {}))
+        if step.register.name not in self.says:
+            self.held[step.register.name] = step.value
+        return self._said(step.register)
+
+    def _said(self, register: Register[Any]) -> Any:
+        if register.name in self.held:
+            return self.held[register.name]
+        values = self.says[register.name]
+        value = values.pop(0) if len(values) > 1 else values[0]
+        if isinstance(value, Exception):
+            raise value
+        return value
+
+
+def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
+    """Every register as (table, address, name, unit or enumeration, step)."""
+    return {
+        (
+            f"{it.table.read or 0:02X}/{it.table.write or 0:02X}",
+            f"{it.address:04X}",
+            name,
+            it.values.__name__ if it.values is not None else it.unit,
+            it.step if it.values is None else None,
+        )
+        for name, it in drive.registers.items()
+    }
+
+
+def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
+    """The same from a table typed by hand; a step is "-" where there is none, "?" where it is not stated."""
+    found = set()
+    for line in table.strip().splitlines():
+        functions, address, name, step, *unit = line.split()
+        found.add((functions, address, name, " ".join(unit), None if step in "?-" else float(step)))
+    return found

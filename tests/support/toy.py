@@ -1,0 +1,83 @@
+"""A family that no document describes, as a user would declare one: for tests of what is common to all."""
+
+from enum import IntEnum, IntFlag
+
+from multidrop.drive import Condition, Direction, Drive, Framing, Script, State, read, write
+from multidrop.drive.register import HOLDING, Kept, command, reading, setting
+from multidrop.drive.verbs import Option, verb
+
+
+class Fault(IntEnum):
+    NONE = 0
+    OVERCURRENT = 1
+
+
+class Status(IntFlag):
+    RUNNING = 1
+    REVERSE = 2
+
+
+class Toy(Drive):
+    """Toy; what its manual leaves open:
+
+    - the scale of `mystery`.
+    """
+
+    model = "toy"
+    title = "TOY T1"
+    manual = "TOY T1 user's manual, chapter 5"
+    framings = (Framing.RTU, Framing.ASCII)
+    addresses = range(1, 32)
+    baudrates = (9600, 19200)
+    most_registers = {HOLDING: 10}
+    options = {"rated_frequency": Option("Hz", (10, 400), "rated frequency of the motor")}
+
+    output_frequency = reading(0x01, "Hz", step=0.1, place="table 3")
+    output_current = reading(0x02, "A", step=0.01)
+    mystery = reading(0x03, step=None, note="the manual gives no scale")
+    fault = reading(0x04, Fault)
+    status = reading(0x05, Status)
+    acceleration_time = setting(0x0A, "s", step=0.1, span=(0.1, 600), kept=Kept.EEPROM, while_running=False)
+    sealed = setting(0x0B, never="it is the maker's")
+    control = command(0x14, Status)
+    frequency = command(0x15, "Hz", step=0.01, span=(0, 50), moves=False)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Take it for a toy: there is nothing else on a test's line."""
+        yield from ()
+
+    @verb
+    def start(self, direction: Direction | None = None) -> Script[None]:
+        """Start the motor."""
+        reverse = Status.REVERSE if direction is Direction.REVERSE else Status(0)
+        yield from write(Toy.control, Status.RUNNING | reverse)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from write(Toy.control, Status(0))
+
+    @verb
+    def set_frequency(self, hz: float) -> Script[None]:
+        """Write the frequency setpoint in Hz."""
+        yield from write(Toy.frequency, hz)
+
+    @verb
+    def state(self) -> Script[State]:
+        """What the drive says of itself."""
+        status = yield from read(Toy.status)
+        return State(Condition.RUNNING if status & Status.RUNNING else Condition.STOPPED)
+
+
+class PatientToy(Toy):
+    """One that is waited for however busy the machine is, and however soon it answered before."""
+
+    response_timeout = 60.0
+    response_delay = 15.0  # a learnt time-out is never less than four of them
+
+
+class Unsure(Toy):
+    """It cannot tell its drives from others."""
+
+    identify = Drive.identify

@@ -1,0 +1,429 @@
+"""Ports of every kind are opened, fail with one sentence each, and leave nothing behind."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from lines import line, plant, polled, rows_of, until
+from serial import Serial, rfc2217
+from toy import PatientToy, Toy
+
+from multidrop.bus import Bus
+from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
+from multidrop.core import Echo, Port, set_settings
+from multidrop.errors import LineError, NoReply, Unconfirmed
+from multidrop.poller import Poller
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.transport import line as line_module
+from multidrop.transport.bridge import MOST_STALL_MS
+from multidrop.transport.line import Line
+
+
+def wire(port: str = "pty") -> Wire:
+    drive = simulated(Toy(1))
+    drive["output_current"] = 3.25
+    return Wire([drive], unpaced=True, port=port)
+
+
+def descriptors() -> int:
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+def read_and_write(bus: Bus) -> None:
+    toy = bus.attach(PatientToy, 1)
+    assert bus.read(toy, toy.output_current) == 3.25
+    assert bus.write(toy, toy.frequency, 25.0) == 25.0
+
+
+# ---- the kinds of ports ----
+
+
+def test_a_socket() -> None:
+    with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path) as bus:
+        read_and_write(bus)
+    assert sim.wires[0].drives[0]["frequency"] == 25.0
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
+def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No loopback loses packets: what is looked at is what the kernel is told."""
+    told: list[int] = []
+
+    class Watched(Port):
+        def __init__(self, fd: int, must_take: int) -> None:
+            with socket.socket(fileno=os.dup(fd)) as connection:
+                told.append(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT))
+            super().__init__(fd, must_take)
+
+    monkeypatch.setattr(line_module, "Port", Watched)
+    with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path):
+        assert told == [MOST_STALL_MS]
+
+
+@pytest.mark.parametrize("echo", ["auto", "on", "off"])
+def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
+    echo: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Echo] = []
+    monkeypatch.setattr(Port, "tell_echo", lambda port, it: told.append(it))
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
+        bus.line.reopen()
+        assert told == [Echo(echo)] * 2
+
+
+def test_an_echo_is_told_in_one_of_three_words() -> None:
+    with pytest.raises(ValueError, match='echo \'loud\' is none of "auto", "on" and "off"'):
+        Bus("/dev/null", echo="loud")
+
+
+def test_a_pty_is_opened_again_and_again() -> None:
+    with Simulator([wire()]) as sim:
+        for _ in range(5):
+            with Bus(sim.wires[0].path) as bus:
+                read_and_write(bus)
+
+
+def test_a_pty_at_settings_that_it_cannot_have() -> None:
+    """It stays at 8 bits without parity whatever it is told, and all bytes pass."""
+    drive = simulated(Toy(1, format="8E1"))
+    drive["output_current"] = 3.25
+    with Simulator([Wire([drive], unpaced=True)]) as sim:
+        for _ in range(2):
+            with Bus(sim.wires[0].path, format="8E1") as bus:
+                read_and_write(bus)
+
+
+def test_a_port_is_told_to_hold_no_bytes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As USB adapters do for 16 ms."""
+    told: list[bool] = []
+    monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:
+        read_and_write(bus)
+        bus.line.reopen()
+    assert told == [True, True]
+
+
+@pytest.mark.parametrize("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
+def test_a_port_that_does_hold_bytes_back_is_opened(
+    monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
+) -> None:
+    def refuse(port: Serial, wanted: bool) -> None:
+        raise refusal
+
+    monkeypatch.setattr(Serial, "set_low_latency_mode", refuse)
+    with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:
+        read_and_write(bus)
+
+
+class SerialServer:
+    """A port at the far end of a network (RFC 2217), behind which is a simulated line.
+
+    Its settings are only kept here, where a test can see them.
+    """
+
+    def __init__(self, path: str) -> None:
+        settings = {"baudrate": 0, "bytesize": 8, "parity": "N", "stopbits": 1}
+        modem_lines = {"cts": True, "dsr": True, "ri": False, "cd": True}
+        flushes = dict.fromkeys(("reset_input_buffer", "reset_output_buffer"), lambda: None)
+        self.port = SimpleNamespace(**settings, **modem_lines, **flushes)
+        host, port = path.removeprefix("socket://").split(":")
+        self._wire = socket.create_connection((host, int(port)))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"rfc2217://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        client, _ = self._listener.accept()
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        manager = rfc2217.PortManager(self.port, SimpleNamespace(write=client.sendall))
+        back = threading.Thread(target=self._copy_back, args=(client, manager), daemon=True)
+        back.start()
+        with suppress(OSError):  # whoever is connected may leave while it is spoken to
+            while received := client.recv(1024):
+                self._wire.sendall(b"".join(manager.filter(received)))
+        with suppress(OSError):
+            self._wire.shutdown(socket.SHUT_RDWR)
+        back.join()
+        client.close()
+
+    def _copy_back(self, client: socket.socket, manager: rfc2217.PortManager) -> None:
+        with suppress(OSError):
+            while heard := self._wire.recv(1024):
+                client.sendall(b"".join(manager.escape(heard)))
+
+    def close(self) -> None:
+        self._thread.join()
+        self._listener.close()
+        self._wire.close()
+
+
+@pytest.fixture
+def server() -> Iterator[SerialServer]:
+    with Simulator([wire("socket://127.0.0.1:0")]) as sim:
+        server = SerialServer(sim.wires[0].path)
+        yield server
+        server.close()
+
+
+pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning")
+
+
+@pyserials_own
+def test_a_port_without_a_descriptor(server: SerialServer) -> None:
+    with Bus(server.url, baudrate=19200, format="8E1") as bus:
+        read_and_write(bus)
+        far = server.port
+        assert (far.baudrate, far.bytesize, far.parity, far.stopbits) == (19200, 8, "E", 1)
+
+
+@pyserials_own
+def test_a_port_without_a_descriptor_is_polled(server: SerialServer) -> None:
+    toy = polled(Toy(1, baudrate=19200), [Toy.output_current])
+    with Poller(plant(line(server.url, toy))) as poller:
+        rows = []
+        until(lambda: rows.extend(rows_of(poller)) or any(row.value == 3.25 for row in rows))
+        assert server.port.baudrate == 19200
+
+
+@pyserials_own
+def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServer) -> None:
+    slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)
+    with pytest.raises(LineError, match=r"cannot change its settings from drive to drive$"):
+        Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
+
+
+# ---- ports that cannot be opened ----
+
+
+@pytest.mark.parametrize(
+    ("port", "reason"),
+    [
+        ("{tmp}/absent", "there is no such port"),
+        ("{tmp}/file/port", "Not a directory"),
+        ("{tmp}/file", "it is not a serial port"),
+        ("{tmp}", "it is a directory, not a serial port"),
+        ("/dev/null", "it is not a serial port"),
+        ("socket://127.0.0.1:{closed}", "nothing listens there"),
+        ("rfc2217://127.0.0.1:{closed}", "nothing listens there"),
+        ("socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"),
+        ("rfc2217://:4001", "it needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
+        ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
+        (
+            "sokcet://127.0.0.1:4001",
+            "there is no sokcet://; a URL is such as socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
+        ),
+        ("socket://[fe80::1%nowhere]:4001", "Name or service not known"),
+        ("spy://{tmp}/absent", "there is no such port"),
+    ],
+)
+def test_what_cannot_be_opened_is_a_sentence(tmp_path: Path, port: str, reason: str) -> None:
+    (tmp_path / "file").write_text("no port")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        closed = listener.getsockname()[1]
+    port = port.format(tmp=tmp_path, closed=closed)
+    with pytest.raises(LineError) as caught:
+        Line(port)
+    assert str(caught.value) == f"{port}: {reason}"
+    assert (caught.value.port, caught.value.reason) == (port, reason)
+    assert isinstance(caught.value, OSError)
+    is_mistaken = any(word in reason for word in ("needs a host", "out of range", "there is no sokcet"))
+    assert isinstance(caught.value, ValueError) == is_mistaken
+
+
+def test_a_port_is_opened_by_one_at_a_time() -> None:
+    with Simulator([wire()]) as sim:
+        port = sim.wires[0].path
+        with Bus(port) as first:
+            with pytest.raises(LineError) as caught:
+                Line(port)
+            assert str(caught.value) == f"{port}: it is in use by another program"
+            read_and_write(first)
+        Line(port).close()
+
+
+def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path) -> None:
+    with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
+        Line(sim.wires[0].path).close()  # what the process has once is there now
+        before = descriptors(), threading.active_count()
+        for it in sim.wires:
+            for _ in range(3):
+                Line(it.path).close()
+        for _ in range(3):
+            Line("loop://").close()
+            with pytest.raises(LineError):
+                Line("/dev/null")
+        assert (descriptors(), threading.active_count()) == before
+
+
+# ---- ports that fail later ----
+
+
+def vanishing_pty() -> tuple[str, Callable[[], None]]:
+    """A pty that hangs up, as an adapter does that is pulled, when it has heard a request."""
+    master, slave = os.openpty()
+    path = os.ttyname(slave)
+
+    def hang_up() -> None:
+        os.read(master, 1024)
+        os.close(slave)
+        os.close(master)
+
+    return path, hang_up
+
+
+def vanishing_socket() -> tuple[str, Callable[[], None]]:
+    """A peer that closes the connection when it has heard a request."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    path = f"socket://127.0.0.1:{listener.getsockname()[1]}"
+
+    def hang_up() -> None:
+        with listener, listener.accept()[0] as client:
+            client.recv(1024)
+
+    return path, hang_up
+
+
+def test_a_port_that_is_flooded_before_its_first_exchange_and_after_it() -> None:
+    master, slave = os.openpty()
+    with Bus(os.ttyname(slave)) as bus:
+        toy = bus.attach(Toy(1))
+        for _ in range(2):
+            for _ in range(4):
+                os.write(master, b"\xff" * 1000)
+            with pytest.raises(NoReply):
+                bus.read(toy, toy.output_current)
+    os.close(slave)
+    os.close(master)
+
+
+@pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
+def test_a_port_that_is_lost_in_mid_exchange(make: Callable[[], tuple[str, Callable[[], None]]]) -> None:
+    path, hang_up = make()
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    with Bus(path) as bus:
+        toy = bus.attach(PatientToy, 1)
+        for _ in range(2):  # and it stays lost
+            with pytest.raises(LineError) as caught:
+                bus.read(toy, toy.output_current)
+            assert str(caught.value).startswith(f"{path}: the port was lost (")
+            assert "\n" not in str(caught.value)
+        thread.join()
+        with pytest.raises(LineError):
+            bus.line.reopen()
+        with pytest.raises(LineError, match=r": it is closed$"):
+            bus.read(toy, toy.output_current)
+
+
+@pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
+def test_a_write_on_a_port_that_is_lost_may_have_happened(
+    make: Callable[[], tuple[str, Callable[[], None]]],
+) -> None:
+    path, hang_up = make()
+    thread = threading.Thread(target=hang_up)
+    thread.start()
+    with Bus(path) as bus:
+        toy = bus.attach(PatientToy, 1)
+        with pytest.raises(Unconfirmed, match=r"it is not known whether .* took effect: the port was lost"):
+            bus.raw(toy, 6, 0x15, bytes(2))
+        thread.join()
+        with pytest.raises(LineError):  # and this has not
+            bus.raw(toy, 6, 0x15, bytes(2))
+
+
+def test_a_port_is_opened_again_under_its_link(tmp_path: Path) -> None:
+    link = tmp_path / "by-id"
+    with Simulator([wire(str(link))]), Bus(str(link)) as bus:
+        read_and_write(bus)
+        first = link.readlink()
+        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # its number is not given again so long
+    with Simulator([wire(str(link))]):
+        assert link.readlink() != first
+        bus.line.reopen()
+        assert bus.read(bus.drives[0], Toy.output_current) == 3.25
+        bus.close()
+    os.close(held)
+
+
+def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None:
+    with (
+        Simulator([wire()]) as sim,
+        Bus(sim.wires[0].path) as bus,
+        CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as writer,
+        Tapped({"hall-1": bus}, writer) as tapped,
+    ):
+        toy = bus.attach(Toy, 1)
+        tapped.collect()
+        bus.line.reopen()
+        assert bus.read(toy, toy.output_current) == 3.25
+    with Capture(tmp_path / "a.pcapng") as capture:
+        assert [(row.register, row.value) for rows in Decoding(capture) for row in rows] == [
+            ("holding_register_2", 325)
+        ]
+
+
+def test_a_bridged_port_has_its_settings_when_it_is_opened_again() -> None:
+    """spy:// is pyserial's own way to watch a port; the drive hears nothing at another baud rate."""
+    with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
+        path = sim.wires[0].path
+        with Bus(f"spy://{path}", baudrate=19200) as bus:
+            toy = bus.attach(Toy, 1)
+            assert bus.read(toy, toy.output_current) == 0
+            with Path(path).open("rb", buffering=0) as port:
+                set_settings(port.fileno(), 9600, "8N1")
+            bus.line.reopen()
+            assert bus.read(toy, toy.output_current) == 0
+
+
+def test_a_bridged_port_that_cannot_be_set_up_is_a_sentence() -> None:
+    master, slave = os.openpty()
+    port = f"spy://{os.ttyname(slave)}"
+    with Bus(port) as bus:
+        toy = bus.attach(Toy, 1)
+        os.close(slave)
+        os.close(master)
+        with pytest.raises(LineError) as caught:
+            bus.read(toy, toy.output_current)
+    assert caught.value.port == port
+    assert "Input/output error" in caught.value.reason
+    assert "\n" not in str(caught.value)
+
+
+def test_a_closed_bus_says_so() -> None:
+    with Simulator([wire()]) as sim:
+        with Bus(sim.wires[0].path) as bus:
+            toy = bus.attach(Toy, 1)
+        bus.close()  # twice is no mistake
+        with pytest.raises(LineError) as caught:
+            bus.read(toy, toy.output_current)
+        assert str(caught.value) == f"{sim.wires[0].path}: it is closed"
+
+
+def test_closing_ends_what_waits_for_a_reply() -> None:
+    """One thread waits for a drive that says nothing, another closes the bus."""
+    failures: list[LineError] = []
+    master, slave = os.openpty()
+    bus = Bus(os.ttyname(slave))
+    slow = bus.attach(PatientToy, 1)
+
+    def wait() -> None:
+        with pytest.raises(LineError) as caught:
+            bus.read(slow, slow.output_current)
+        failures.append(caught.value)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    os.read(master, 1024)  # the request
+    bus.close()
+    waiting.join()
+    os.close(slave)
+    os.close(master)
+    assert [it.port for it in failures] == [bus.line.port]

@@ -1,0 +1,383 @@
+"""Ports behind a network: what a cut or a stall held up never arrives later, and a flood fills no memory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count, pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from lines import until
+from serial import SerialException, rfc2217
+from servers.network_server import END, manager
+from toy import Status, Toy
+
+from multidrop.bus import Bus
+from multidrop.errors import Unconfirmed
+from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
+from multidrop.transport.exchange import WRITE_TIMEOUT
+from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, MOST_SUBOPTION, RFC2217Port, Telnet
+
+SERVER = Path(__file__).parents[1] / "support" / "servers" / "network_server.py"
+IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
+
+pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning")
+
+
+# ---- telnet ----
+
+
+def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
+    edges = [0, *sorted(at % (len(stream) + 1) for at in cuts), len(stream)]
+    return [stream[begin:end] for begin, end in pairwise(edges)]
+
+
+def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
+    """What a stream says, its data in one piece where nothing comes between."""
+    telnet, found = Telnet(), list[tuple[bytes, bytes]]()
+    for chunk in chunks:
+        for kind, content in telnet.split(chunk):
+            if not kind and found and not found[-1][0]:
+                found[-1] = b"", found[-1][1] + content
+            else:
+                found.append((kind, content))
+    return found
+
+
+@given(st.binary(max_size=200), st.lists(st.integers(0, 1000), max_size=20))
+def test_a_far_end_s_escaped_data_come_back(data: bytes, cuts: list[int]) -> None:
+    near, far = socket.socketpair()
+    stream = b"".join(manager(near).escape(data))
+    near.close()
+    far.close()
+    assert split(pieces(stream, cuts)) == ([(b"", data)] if data else [])
+
+
+@given(
+    st.lists(st.sampled_from([IAC, SB, SE, rfc2217.DO, rfc2217.WONT, b"\xf1", b"a", b"\x2c"]), max_size=40),
+    st.lists(st.integers(0, 1000), max_size=20),
+)
+def test_a_stream_means_the_same_in_any_pieces(stream: list[bytes], cuts: list[int]) -> None:
+    whole = b"".join(stream)
+    assert split(pieces(whole, cuts)) == split([whole])
+
+
+def test_what_a_stream_says() -> None:
+    stream = b"ab" + IAC + rfc2217.DO + b"\x2c" + IAC + SB + b"\x2c\x65" + IAC + IAC + IAC + SE + b"c"
+    assert split([stream]) == [
+        (b"", b"ab"),
+        (rfc2217.DO, b"\x2c"),
+        (SB, b"\x2c\x65\xff"),
+        (b"", b"c"),
+    ]
+
+
+def test_a_suboption_without_an_end_fills_no_memory() -> None:
+    telnet, flood = Telnet(), bytes(65536)
+    assert not list(telnet.split(IAC + SB))
+    tracemalloc.start()
+    try:
+        for _ in range(100):
+            for _, content in telnet.split(flood):
+                assert len(content) <= len(flood)
+        assert tracemalloc.get_traced_memory()[0] < 8 * MOST_SUBOPTION
+    finally:
+        tracemalloc.stop()
+
+
+# ---- a flood ----
+
+
+@contextmanager
+def flooding() -> Iterator[tuple[str, threading.Event]]:
+    """The URL of a port that sends without an end, once it is set up, and what tells that it sent 32 MB."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    sent = threading.Event()
+
+    def flood(client: socket.socket) -> None:
+        with suppress(OSError):
+            for _ in range(512):
+                client.sendall(bytes(65536))
+        sent.set()
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        far = manager(client)
+        floods = threading.Thread(target=flood, args=(client,))
+        purges = 0
+        with suppress(OSError):
+            while received := client.recv(1024):
+                b"".join(far.filter(received))
+                purges += received.count(rfc2217.COM_PORT_OPTION + rfc2217.PURGE_DATA)
+                if purges == 2 and not floods.ident:  # its buffers are empty: it is open
+                    floods.start()
+        client.close()
+        floods.join()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    yield f"rfc2217://127.0.0.1:{listener.getsockname()[1]}", sent
+    thread.join()
+    listener.close()
+
+
+@pyserials_own
+def test_a_flood_that_nobody_reads_fills_no_memory() -> None:
+    with flooding() as (url, sent):
+        port = RFC2217Port()
+        port.port = url
+        port.timeout = 0.01
+        port.open()
+        assert sent.wait(60)
+        held = sum(len(chunk) for chunk in list(port._read_buffer.queue))
+        port.close()
+    assert 0 < held <= MOST_CHUNKS * MOST_RECEIVED
+
+
+# ---- requests that are too late ----
+
+
+class HeldUp:
+    """A port that takes nothing until it is let go; what it was given is kept."""
+
+    def __init__(self) -> None:
+        self.begun, self.free = threading.Event(), threading.Event()
+        self.written: list[bytes] = []
+        self.timeout = 0.0
+
+    def write(self, request: bytes) -> None:
+        self.begun.set()
+        self.free.wait()
+        self.written.append(request)
+
+    def read(self, size: int) -> bytes:
+        time.sleep(self.timeout)
+        return b""
+
+    def read_all(self) -> bytes:
+        return b""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
+def test_a_request_that_waited_behind_another_is_never_sent() -> None:
+    """It was given up meanwhile, and may be a start."""
+    port = HeldUp()
+    bridge = Bridge(port)  # type: ignore[arg-type]
+    os.write(bridge.theirs.fileno(), b"first")
+    assert port.begun.wait(60)
+    os.write(bridge.theirs.fileno(), b"start")
+    time.sleep(2 * MOST_AGE)
+    port.free.set()
+
+    def later() -> bool:
+        os.write(bridge.theirs.fileno(), b"later")
+        return b"later" in port.written
+
+    until(later)
+    bridge.close()
+    assert b"start" not in port.written
+
+
+def test_what_comes_is_handed_over_in_pieces_that_the_core_reads_whole() -> None:
+    port = HeldUp()
+    arrived = bytes(range(256)) * 20
+    chunks = [arrived[:1], b""]
+    port.read = lambda size: chunks.pop(0) if chunks else b""  # type: ignore[method-assign]
+    port.read_all = lambda: arrived[1:]  # type: ignore[method-assign]
+    bridge = Bridge(port)  # type: ignore[arg-type]
+    heard = b""
+
+    def all_of_it() -> bool:
+        nonlocal heard
+        with suppress(BlockingIOError):
+            heard += os.read(bridge.theirs.fileno(), 1024)
+        return len(heard) >= len(arrived)
+
+    until(all_of_it)
+    bridge.close()
+    assert heard == arrived
+
+
+def test_a_bridge_closes_while_nobody_takes_what_comes() -> None:
+    port = HeldUp()
+    port.read = lambda size: bytes(1024)  # type: ignore[method-assign]
+    bridge = Bridge(port)  # type: ignore[arg-type]
+    bridge.close()
+    assert not any(thread.is_alive() for thread in bridge._threads)
+
+
+def test_a_network_that_takes_nothing_is_a_lost_port_at_once() -> None:
+    near, far = socket.socketpair()
+    near.settimeout(3600)  # pyserial's own is 5 s
+    port = RFC2217Port()
+    port.is_open, port._socket, port._write_lock = True, near, threading.Lock()
+
+    def fill() -> None:
+        while True:
+            port.write(bytes(1024))
+
+    with pytest.raises(SerialException, match=r"the connection failed|takes nothing more"):
+        fill()
+    port.is_open = False
+    near.close()
+    far.close()
+
+
+# ---- a network that is cut ----
+
+
+_DONE, _TIME_WAIT = "05", "06"  # everything of ours has arrived (net/tcp_states.h: TCP_FIN_WAIT2)
+_numbers = count()
+
+
+def connections(port: int) -> list[list[str]]:
+    """This machine's connections to that port in which the kernel may still send something."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return [row for row in rows if row[2].endswith(f":{port:04X}") and row[3] not in (_DONE, _TIME_WAIT)]
+
+
+def waits_to_arrive(port: int) -> bool:
+    """Return True while the kernel has something that the far end has not confirmed."""
+    return any(int(row[4].partition(":")[0], 16) for row in connections(port))
+
+
+class FarNetwork:
+    """A network of its own, with a server in it, that can be cut off and joined again."""
+
+    def __init__(self, kind: str) -> None:
+        number = next(_numbers)
+        self.name = f"md{os.getpid()}-{number}"
+        ours, theirs = f"{self.name}a", f"{self.name}b"
+        self._theirs = theirs
+        net = f"10.{200 + os.getpid() % 50}.{os.getpid() // 50 % 250}"
+        near, far = f"{net}.{4 * number + 1}", f"{net}.{4 * number + 2}"
+        self._ip("netns", "add", self.name)
+        try:
+            self._make(ours, near, far)
+        except subprocess.CalledProcessError:
+            self._ip("netns", "del", self.name)
+            raise
+        words = ["ip", "netns", "exec", self.name, sys.executable, str(SERVER), kind, far]
+        self._server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        assert self._server.stdout is not None
+        self.port = int(self._server.stdout.readline())
+        self.address = far
+        self.url = f"{kind}://{self.address}:{self.port}"
+
+    def _make(self, ours: str, near: str, far: str) -> None:
+        """A pair of cards. They know each other's number: else a packet waits seconds for it."""
+        near_card, far_card = "02:00:00:00:00:01", "02:00:00:00:00:02"
+        peer = ("peer", "name", self._theirs, "address", far_card, "netns", self.name)
+        self._ip("link", "add", ours, "address", near_card, "type", "veth", *peer)
+        self._ip("addr", "add", f"{near}/30", "dev", ours)
+        self._ip("link", "set", ours, "up")
+        self._ip("-n", self.name, "addr", "add", f"{far}/30", "dev", self._theirs)
+        self.join()
+        known = ("nud", "permanent", "dev")
+        self._ip("neigh", "replace", far, "lladdr", far_card, *known, ours)
+        self._ip("-n", self.name, "neigh", "replace", near, "lladdr", near_card, *known, self._theirs)
+
+    def _ip(self, *words: str) -> None:
+        subprocess.run(["ip", *words], check=True, capture_output=True)
+
+    def cut(self) -> None:
+        self._ip("-n", self.name, "link", "set", self._theirs, "down")
+
+    def join(self) -> None:
+        self._ip("-n", self.name, "link", "set", self._theirs, "up")
+
+    def _ends(self) -> bool:
+        with suppress(OSError), socket.create_connection((self.address, self.port), timeout=1) as last:
+            last.sendall(END)
+            while last.recv(1024):
+                pass
+            return True
+        return False
+
+    def all_heard(self) -> str:
+        """What the server heard on its serial line, once the network is joined again."""
+        self.join()
+        until(lambda: not connections(self.port))  # the kernel repeats nothing any more
+        until(self._ends)
+        heard, _ = self._server.communicate()
+        return heard
+
+    def close(self) -> None:
+        if self._server.poll() is None:
+            self._server.kill()
+            self._server.communicate()
+        self._ip("netns", "del", self.name)
+
+
+@pytest.fixture(params=["rfc2217", "socket"])
+def far_network(request: pytest.FixtureRequest) -> Iterator[FarNetwork]:
+    if os.geteuid() != 0 or shutil.which("ip") is None:
+        pytest.skip("a network of its own needs root and ip")
+    try:
+        network = FarNetwork(request.param)
+    except (subprocess.CalledProcessError, OSError) as failure:
+        pytest.skip(f"this system makes no network namespace: {failure}")
+    yield network
+    network.close()
+
+
+START = "010600140001"  # write 1, which starts it, to the control register of drive 1
+
+
+def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
+    """Send a START that is given up. What was confirmed before lets it leave: nothing is owed."""
+    bus.raw(toy, 6, 0x14, bytes([0, 2]))
+    network.cut()
+    with pytest.raises(Unconfirmed):
+        bus.raw(toy, 6, 0x14, bytes([0, Status.RUNNING]))
+
+
+@pyserials_own
+def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: FarNetwork) -> None:
+    with Bus(far_network.url, echo="off") as bus:
+        start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
+    heard = far_network.all_heard()
+    assert "010600140002" in heard
+    assert START not in heard
+
+
+@pyserials_own
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
+def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:
+    """Although the network is joined again as soon as the caller was told."""
+    with Bus(far_network.url, echo="off") as bus:
+        start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
+        far_network.join()
+        until(lambda: not waits_to_arrive(far_network.port))  # it arrived, or was given up
+    heard = far_network.all_heard()
+    assert "010600140002" in heard
+    assert START not in heard
+
+
+def test_a_network_is_given_up_before_a_write_is() -> None:
+    """Else a write could arrive when its caller was told that it is unconfirmed."""
+    assert MOST_AGE + MOST_STALL_MS / 1000 <= WRITE_TIMEOUT
+
+
+def test_every_connection_is_told_to_hand_on_nothing_late() -> None:
+    """Without a network to cut: what the kernel is told."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        near = socket.create_connection(listener.getsockname())
+        far, _ = listener.accept()
+        hand_on_nothing_late(near)
+        assert near.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8) == bytes([1, 0, 0, 0, 0, 0, 0, 0])
+        near.close()
+        with pytest.raises(ConnectionResetError):
+            far.recv(1)
+        far.close()

@@ -1,0 +1,116 @@
+"""Reads by hand are planned and made once, and anew when what they were made for has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import permutations
+from typing import Any
+
+import pytest
+from toy import PatientToy, Toy
+
+from multidrop.bus import Bus
+from multidrop.drive.timing import Settings
+from multidrop.planning.bus_time import silence
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.transport import exchange as exchanges
+
+WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
+
+
+class Counted:
+    """How often blocks were chosen, and how many exchanges were made."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.plans = self.made = 0
+        blocks, reading = exchanges.blocks, exchanges.reading
+
+        def choose(*given: Any) -> Any:
+            self.plans += 1
+            return blocks(*given)
+
+        def make(*given: Any) -> Any:
+            self.made += 1
+            return reading(*given)
+
+        monkeypatch.setattr(exchanges, "blocks", choose)
+        monkeypatch.setattr(exchanges, "reading", make)
+
+    def since(self) -> tuple[int, int]:
+        """Since it was asked last."""
+        found = self.plans, self.made
+        self.plans = self.made = 0
+        return found
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
+    return Counted(monkeypatch)
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    drives = [SimulatedDrive(Toy(address)) for address in (1, 2)]
+    with Simulator([Wire(drives, unpaced=True)]) as sim, Bus(sim.wires[0].path) as opened:
+        yield opened
+
+
+def test_registers_that_are_read_again_are_planned_once(bus: Bus, counted: Counted) -> None:
+    one, other = bus.attach(PatientToy, 1), bus.attach(PatientToy, 2)
+    first = bus.read_many(one, WANTED)
+    assert counted.since() == (1, 2)
+    assert [bus.read_many(one, WANTED) for _ in range(5)] == 5 * [first]
+    assert counted.since() == (0, 0)
+    bus.read(one, Toy.acceleration_time)  # the block is one of those above
+    assert counted.since() == (1, 0)
+    bus.read_many(other, WANTED)
+    assert counted.since() == (1, 2)
+
+
+def test_a_drive_that_left_leaves_nothing_behind(bus: Bus, counted: Counted) -> None:
+    drive = bus.attach(PatientToy, 1)
+    bus.read_many(drive, WANTED)
+    bus.detach(drive)
+    with pytest.raises(ValueError, match="is not attached to this bus"):
+        bus.read_many(drive, WANTED)
+    assert bus._exchanges._prepared == {}
+    counted.since()
+    bus.attach(drive)
+    bus.read_many(drive, WANTED)
+    assert counted.since() == (1, 2)
+
+
+def test_a_port_that_was_opened_again_is_asked_anew(bus: Bus, counted: Counted) -> None:
+    drive = bus.attach(PatientToy, 1)
+    bus.read_many(drive, WANTED)
+    bus.line.reopen()
+    counted.since()
+    bus.read_many(drive, WANTED)
+    assert counted.since() == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("settings", Settings(19200, "8N1")), ("agreed_silence", 0.01), ("response_delay", 0.2), ("address", 3)],
+)
+def test_what_a_drive_is_told_meanwhile_is_heeded(bus: Bus, name: str, value: object) -> None:
+    drive = bus.attach(PatientToy, 1)
+    before = bus._exchanges._prepare(drive)
+    assert bus._exchanges._prepare(drive) is before
+    setattr(drive, name, value)
+    after = bus._exchanges._prepare(drive)
+    assert after is not before
+    assert bus._exchanges._prepare(drive) is after
+    made = after.exchange(after.blocks(WANTED)[0])
+    assert made.settings[0] == drive.settings.baudrate
+    assert made.request.address == drive.address
+    assert made.c.silence_ns == round(silence(drive) * 1e9)
+
+
+def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exchanges, "MOST_PREPARED", 3)
+    drive = bus.attach(PatientToy, 1)
+    for wanted in permutations(WANTED):
+        assert set(bus.read_many(drive, wanted)) == {register.name for register in WANTED}
+    prepared = bus._exchanges._prepare(drive)
+    assert prepared.blocks.cache_info().currsize == 3

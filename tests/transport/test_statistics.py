@@ -1,0 +1,256 @@
+"""Statistics: every ending of an exchange in the guide's counters, quantiles, spans, and whose they are."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+
+import pytest
+from checksums import rtu
+from hypothesis import given
+from hypothesis import strategies as st
+from line_driver import MS, LineDriver
+from lines import line as a_line
+from lines import plant, polled, rows_of, until
+from multidrop._core import ffi, lib
+from test_learning import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
+from toy import Toy
+
+import multidrop.transport.line
+from multidrop import Bus, Poller
+from multidrop.core import Counters, Exchange, Framing, Message, Peer, delay_edge
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport.statistics import Diagnostics, LineStatistics, Statistics, look
+
+__all__ = ["drive", "line"]  # fixtures
+
+LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these the error is known
+
+# ---- response delays ----
+
+
+def counters_of(delays_ns: list[int]) -> Counters:
+    known = Peer(least_timeout=0.02, most_timeout=1)
+    for delay in delays_ns:
+        lib.md_counters_answer(ffi.addressof(known.c.counters), delay, 0)
+    return known.counters()
+
+
+@given(st.lists(st.integers(LEAST_NS, MOST_NS - 1), min_size=1))
+def test_quantiles_are_within_a_part_in_16(delays_ns: list[int]) -> None:
+    found = Statistics(1.0, counters_of(delays_ns)).delays
+    ordered = sorted(delays_ns)
+    for told, percent in ((found.p50, 50), (found.p90, 90), (found.p99, 99)):
+        true = ordered[-(-percent * len(ordered) // 100) - 1]  # as many are not longer
+        assert told * 1e9 == pytest.approx(true, rel=1 / 16 + 1e-9)
+    assert found.longest == max(delays_ns) / 1e9
+    assert found.replies == len(delays_ns)
+
+
+@pytest.mark.parametrize("delay_ns", [0, 1, LEAST_NS - 1, MOST_NS, 10 * MOST_NS, (1 << 63) - 1])
+def test_delays_outside_of_the_buckets_are_counted_too(delay_ns: int) -> None:
+    found = Statistics(1.0, counters_of([delay_ns])).delays
+    assert (found.replies, found.longest) == (1, delay_ns / 1e9)
+    assert 0 <= found.p50 <= found.p99 <= found.longest
+
+
+def test_buckets_follow_each_other_closely() -> None:
+    edges = [delay_edge(bucket) for bucket in range(129)]
+    assert edges == sorted(set(edges))
+    assert edges[0] == 0
+    assert edges[128] == MOST_NS
+    assert all(high - low <= low / 8 for low, high in pairwise(edges[1:]))
+
+
+def test_no_reply_has_no_delay() -> None:
+    found = Statistics(1.0, Counters()).delays
+    assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
+
+
+def test_what_is_counted_is_the_drives_own_delay(line: LineDriver, drive: Peer) -> None:
+    for delay in (10, 10, 10, 15):
+        answer(line, drive, delay * MS)
+    found = Statistics(1.0, drive.counters()).delays
+    assert found.longest == pytest.approx(0.015)
+    assert found.p50 == pytest.approx(0.010, rel=1 / 16)
+
+
+@pytest.mark.parametrize("delay_ms", [0, 3, 20])
+def test_a_wire_is_used_for_what_its_settings_say(line: LineDriver, drive: Peer, delay_ms: int) -> None:
+    for _ in range(10):
+        answer(line, drive, delay_ms * MS)
+    characters = (8 + 7) * CHARACTER
+    assert drive.counters().ideal_ns == pytest.approx(10 * (characters + delay_ms * MS + SILENCE), rel=0.1)
+
+
+def test_a_port_without_a_wire_is_not_used_for_longer_than_there_is(line: LineDriver, drive: Peer) -> None:
+    """The whole reply is there after 0.1 ms, where a wire takes 15 characters."""
+    begun = line.now
+    for _ in range(100):
+        ask(line, drive)
+        line.now += MS // 10
+        line.receive(reply())
+        line.wait_until_done()
+    line.now += 8 * CHARACTER  # the last request is reckoned to leave by then
+    found = Statistics((line.now - begun) / 1e9, drive.counters())
+    assert found.samples == 100
+    assert 0.9 < found.utilisation <= 1.0 + 1e-9
+
+
+# ---- the guide's counters ----
+
+
+def exchange(request: Message, known: Peer, framing: Framing) -> Exchange:
+    return Exchange(framing, request, known, baudrate=9600, format="8N1", character=1e-3, silence=4e-3)
+
+
+GOOD = Counter(bus_messages=1, server_messages=1)
+ASKED = Counter(server_messages=1)
+DAMAGED = ASKED + Counter(bus_communication_errors=1)
+REFUSED = GOOD + Counter(bus_exception_errors=1)
+ENDINGS: dict[str, tuple[Message, bytes, Counter[str]]] = {
+    "a reply": (READ, rtu("01 03 02 00 07"), GOOD),
+    "an exception": (READ, rtu("01 83 02"), REFUSED),
+    "busy": (READ, rtu("01 83 06"), REFUSED + Counter(server_busies=1)),
+    "negative acknowledge": (READ, rtu("01 83 07"), REFUSED + Counter(server_naks=1)),
+    "a confirmation": (WRITE, rtu("01 06 00 02 00 07"), GOOD),
+    "another write's": (WRITE, rtu("01 06 00 02 00 08"), GOOD),
+    "nothing": (READ, b"", ASKED + Counter(server_no_responses=1)),
+    "a bad checksum": (READ, rtu("01 03 02 00 07")[:-1] + b"\0", DAMAGED),
+    "half of it": (READ, rtu("01 03 02 00 07")[:4], DAMAGED),
+    "another drive's": (READ, rtu("02 03 02 00 07"), ASKED),
+    "a broadcast": (Message(0, 6, 2, data=bytes(2)), b"", ASKED + Counter(server_no_responses=1)),
+}
+
+
+def counted(known: Peer) -> Counter[str]:
+    found: Diagnostics = Statistics(1.0, known.counters()).diagnostics
+    assert found.bus_character_overruns is None
+    return +Counter({name: count for name, count in vars(found).items() if count})
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_guides_counters(line: LineDriver, drive: Peer, ending: str) -> None:
+    request, received, expected = ENDINGS[ending]
+    line.echo = lib.MD_NO_ECHO
+    ask(line, drive, request)
+    line.now += 20 * CHARACTER
+    line.receive(received)
+    line.wait_until_done()
+    assert counted(drive) == expected
+
+
+def test_noise_on_a_line_of_text(line: LineDriver, drive: Peer) -> None:
+    line.begin(exchange(READ, drive, Framing.ASCII))
+    line.wait_until_write()
+    line.receive(b"\xff\xff")
+    line.wait_until_done()
+    assert counted(drive) == DAMAGED
+
+
+def test_a_late_reply_is_a_message_of_its_own(line: LineDriver, drive: Peer) -> None:
+    ask(line, drive)
+    line.wait_until_done()
+    line.receive(rtu("01 03 02 00 07"))
+    assert counted(drive) == GOOD + Counter(server_no_responses=1)
+    assert Statistics(1.0, drive.counters()).late_replies == 1
+
+
+def test_what_never_left_is_no_message(line: LineDriver, drive: Peer) -> None:
+    line.begin(exchange(READ, drive, Framing.RTU))
+    line.lose(5)
+    assert counted(drive) == Counter()
+    assert Statistics(1.0, drive.counters()).misses == {"port lost": 1}
+
+
+def test_what_the_port_lost_is_read_from_its_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    def counts(fd: int, request: int, answer: bytearray) -> None:
+        assert request == 0x545D  # TIOCGICOUNT of asm-generic/ioctls.h
+        # linux/serial.h: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
+        answer[:] = struct.pack("20i", 1, 2, 3, 4, 5, 6, 7, 100, 9, 10, 20, *[0] * 9)
+
+    with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
+        assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has none
+        monkeypatch.setattr(multidrop.transport.line.fcntl, "ioctl", counts)
+        assert bus.line.overruns() == 120
+
+
+# ---- spans ----
+
+
+def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> LineStatistics:
+    return look(seconds, drives, overruns)
+
+
+def test_a_span_is_the_difference_of_two_looks() -> None:
+    one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({-10: 3})))
+    two = line_of(
+        12,
+        8,
+        pump=Counters(sent=150, ideal_ns=5 * 10**9, missed=Counter({-10: 3, -3: 1})),
+        fan=Counters(sent=10, ideal_ns=10**9),
+    )
+    found = two.since(one)
+    assert (found.seconds, found.exchanges, found.exchanges_per_second) == (2, 60, 30)
+    assert found.utilisation == 1.0
+    assert found.misses == {"bad checksum": 1}
+    assert found.diagnostics.bus_character_overruns == 3
+    assert {name: it.exchanges for name, it in found.drives.items()} == {"pump": 50, "fan": 10}
+    assert found.drives["pump"].utilisation == 0.5
+
+
+def test_the_longest_delay_of_a_span() -> None:
+    early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
+    found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
+    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # no record: its bucket's end
+    record = counters_of([50 * MS, 8 * MS, 70 * MS])
+    assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
+
+
+# ---- of a bus and of a poller ----
+
+
+@pytest.fixture
+def toy() -> SimulatedDrive:
+    return simulated(Toy(1, name="pump"))
+
+
+def test_a_bus_has_statistics(toy: SimulatedDrive) -> None:
+    with Simulator([Wire([toy], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
+        pump, nobody = bus.attach(Toy, 1, name="pump"), bus.attach(Toy, 2, name="nobody")
+        bus.read_many(pump, pump.readings())
+        with pytest.raises(TimeoutError):
+            bus.read(nobody, Toy.output_current)
+        found = bus.statistics()
+        asked = found.drives["pump"].exchanges  # more than were answered, where the machine was slow
+        assert asked >= found.drives["pump"].delays.replies > 0
+        assert found.drives["nobody"].diagnostics.server_no_responses == found.drives["nobody"].exchanges == 3
+        assert found.exchanges == asked + 3
+        bus.reset_statistics()
+        assert bus.statistics().exchanges == 0
+        bus.read(pump, Toy.output_current)
+        assert bus.statistics().delays.replies == 1
+    assert bus.statistics() == bus.statistics()  # it stands still once the bus is closed
+    assert bus.statistics().delays.replies == 1
+
+
+def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
+    toys = [polled(Toy(1, name="pump"), [Toy.output_current]), polled(Toy(9, name="none"), [Toy.fault], 0.01)]
+    with Simulator([Wire([toy], unpaced=True)]) as sim:
+        poller = Poller(plant(a_line(sim.wires[0].path, *toys)))
+
+        def has(condition: Callable[[LineStatistics], bool]) -> Callable[[], bool]:
+            return lambda: condition(poller.statistics()["line"])
+
+        with poller:
+            until(has(lambda it: it.drives["none"].misses["not asked: drive is silent"] > 3))
+            until(has(lambda it: it.drives["pump"].samples > 100))
+    rows = rows_of(poller)
+    found = poller.statistics()["line"]
+    assert found.samples == sum(row.value is not None for row in rows)
+    assert found.misses == Counter(row.status for row in rows if row.value is None)
+    assert 0 < found.drives["pump"].utilisation <= found.utilisation
+    poller.reset_statistics()
+    assert poller.statistics()["line"].exchanges == 0
