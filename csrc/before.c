@@ -1,6 +1,6 @@
 /* What is asked before an exchange: proofs that no late answer is taken for its reply, and then, where it is
  * unknown whether the adapter echoes, a question whose reply is never a copy of it. */
-#include "late.h"
+#include "internal.h"
 
 enum { MOST_PROOFS_ASKED = 12 };
 

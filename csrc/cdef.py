@@ -1,6 +1,6 @@
-"""Write the cffi module's C source: `python cdef.py HEADER OUTPUT`.
+"""Write the cffi module's C source: `python cdef.py OUTPUT`.
 
-The cdef is the marked part of the header itself; there is no second copy of the contract.
+The cdef is the marked part of each header; there is no second copy of the contract.
 """
 
 import sys
@@ -8,13 +8,15 @@ from pathlib import Path
 
 from cffi import FFI
 
+HEADERS = ("multidrop.h", "internal.h")
 
-def main(header: str, output: str) -> None:
-    text = Path(header).read_text()
-    contract = text.split("/* cdef: begin */")[1].split("/* cdef: end */")[0]
+
+def main(output: str) -> None:
     ffi = FFI()
-    ffi.cdef(contract)
-    ffi.set_source("multidrop._core", '#include "multidrop.h"', py_limited_api=True)
+    for header in HEADERS:
+        text = Path(__file__).with_name(header).read_text()
+        ffi.cdef(text.split("/* cdef: begin */")[1].split("/* cdef: end */")[0])
+    ffi.set_source("multidrop._core", '#include "internal.h"', py_limited_api=True)
     ffi.emit_c_code(output)
 
 

@@ -1,5 +1,5 @@
 /* The three checksums of the five families. */
-#include "multidrop.h"
+#include "internal.h"
 
 /* CRC-16/MODBUS, polynomial A001H (8005H reversed), of every byte value that 0 to 3 zero bytes
  * follow: the CRC of a byte is the sum, without carry, of the CRCs of its bits, which stand below. */

@@ -1,5 +1,5 @@
 /* The two clocks: one that only grows, and the time of day. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <stdatomic.h>
 #include <time.h>

@@ -1,5 +1,5 @@
 /* Completions become columns of numbers in engineering units. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -90,8 +90,8 @@ static uint16_t status_of(const struct md_completion *completion, const struct m
     if (completion->result < 0)
         return (uint16_t)-completion->result;
     if (reply->exception)
-        return (uint16_t)(256 + reply->exception);
-    return is_inside(reply->data_len, field->at, field->wire) ? 0 : -MD_BAD_LENGTH;
+        return (uint16_t)(MD_EXCEPTION + reply->exception);
+    return is_inside(reply->data_len, field->at, field->wire) ? MD_OK : -MD_BAD_LENGTH;
 }
 
 int md_columns_add(struct md_columns *columns, const struct md_block *block,

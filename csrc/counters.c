@@ -2,12 +2,12 @@
  *
  * Numbers only rise, and nobody else writes them: whoever wants those of a span of time takes the
  * difference of two looks. Response delays fall into buckets, PARTS of them to each doubling. */
-#include "multidrop.h"
+#include "internal.h"
 
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
-_Static_assert(sizeof((struct md_counters){0}).missed == (1 - MD_MAYBE_ECHO) * sizeof(uint64_t), "every reason has a place");
+_Static_assert(MD_STATUSES == 1 - MD_MAYBE_ECHO, "every status has a place");
 
 static int bucket(int64_t ns)
 {

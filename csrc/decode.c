@@ -1,5 +1,5 @@
 /* What was sniffed becomes columns, as fast as a disk delivers it. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <string.h>
 

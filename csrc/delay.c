@@ -1,6 +1,5 @@
 /* What is learnt of a drive from the delays of its replies: when to look for one, and how long to wait. */
-#include "multidrop.h"
-#include "times.h"
+#include "internal.h"
 
 /* ---- when to look ---- */
 

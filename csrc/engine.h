@@ -3,8 +3,7 @@
 #ifndef MULTIDROP_ENGINE_H
 #define MULTIDROP_ENGINE_H
 
-#include "multidrop.h"
-#include "waiter.h"
+#include "internal.h"
 
 #include <pthread.h>
 #include <stdatomic.h>

@@ -2,7 +2,7 @@
  *
  * Both Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3, serial-line
  * guide V1.02); here they are called the body. Delixi's body is A K P1 P0 D3 D2 D1 D0. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <string.h>
 

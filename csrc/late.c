@@ -9,8 +9,7 @@
  *
  * A reply that fits an outstanding question as well is counted as the answer to that one. Whichever it
  * answers, the earliest request that it fits is accounted for, and so is all that was sent before it. */
-#include "late.h"
-#include "times.h"
+#include "internal.h"
 
 #include <string.h>
 

@@ -6,8 +6,7 @@
  * the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). Whether the adapter
  * echoes what it sends shows in the replies that are no copies of their requests, and where a copy
  * is all that comes before a time-out; until it does, no copy is taken for the reply. */
-#include "late.h"
-#include "times.h"
+#include "internal.h"
 
 #include <errno.h>
 #include <string.h>

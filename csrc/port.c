@@ -3,7 +3,7 @@
  * tcsetattr() reports EINVAL when nothing of what it was asked for took effect, so that a pty
  * cannot be reopened at even parity. Linux has an ioctl that does not, and takes any baud rate; other
  * systems take what their termios knows. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <errno.h>
 #include <string.h>

@@ -1,5 +1,5 @@
 /* Why a request has no reply, told from what came in its place. */
-#include "multidrop.h"
+#include "internal.h"
 
 /* How much a reason says about what went wrong. The one that says most is reported, and of several
  * that say as much the first: a frame from another address may hold our own further on. */

@@ -3,7 +3,7 @@
  * The thread never waits for a client: rows gather in chunks of bounded number. It holds the lock for
  * as long as one exchange's rows take, and a client for as long as it takes to unhook a chunk. */
 #define _GNU_SOURCE
-#include "multidrop.h"
+#include "internal.h"
 
 #include <errno.h>
 #include <pthread.h>
@@ -141,6 +141,11 @@ void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *blo
             row_queue->dropped += (uint64_t)block->count;
     }
     pthread_mutex_unlock(&row_queue->mutex);
+}
+
+void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status, int64_t due_ns)
+{
+    md_row_queue_add(row_queue, block, &(struct md_completion){.result = -status, .begun_ns = due_ns});
 }
 
 struct md_columns *md_row_queue_take(struct md_row_queue *row_queue)

@@ -4,7 +4,7 @@
  * a frame may be. What follows a request is first tried as its reply, then as a request, then as a
  * reply whose request was not stream. At most three frames are tried at a byte, so that garbage costs
  * no more than its length. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <string.h>
 

@@ -1,5 +1,5 @@
 /* The bytes of one line that were sniffed or read from a capture, in the pieces in which they came. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <string.h>
 

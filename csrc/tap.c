@@ -2,7 +2,7 @@
  *
  * The line's thread puts, one other takes, and neither waits for the other: what finds no room is
  * counted. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <string.h>
 

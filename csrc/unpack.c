@@ -1,7 +1,7 @@
 /* Packets out of capture files: pcap and pcapng, as others and we write them.
  *
  * The blocks that describe a pcapng file's interfaces are rare, and the caller's to read. */
-#include "multidrop.h"
+#include "internal.h"
 
 enum {
     ENHANCED_PACKET = 6,

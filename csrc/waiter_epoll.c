@@ -1,6 +1,6 @@
 /* Waiting for many descriptors at once, as Linux does it. */
 #define _GNU_SOURCE
-#include "waiter.h"
+#include "internal.h"
 
 #include <poll.h>
 #include <stdlib.h>

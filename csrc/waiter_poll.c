@@ -2,7 +2,7 @@
 #ifdef __linux__
 #define _GNU_SOURCE
 #endif
-#include "waiter.h"
+#include "internal.h"
 
 #include <errno.h>
 #include <poll.h>

@@ -1,5 +1,5 @@
 /* A wakeup: any thread may ring it, and whoever waits for its descriptor wakes. */
-#include "waiter.h"
+#include "internal.h"
 
 #include <fcntl.h>
 #include <unistd.h>

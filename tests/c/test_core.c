@@ -7,7 +7,7 @@
  *
  * Without -fsanitize it also runs under valgrind: --error-exitcode=99 --leak-check=full. All bytes
  * that are parsed end at a page that cannot be read, so that even without tools an over-read kills. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <math.h>
 #include <stdio.h>

@@ -1,6 +1,6 @@
 /* How long the system is asked to wait, to the nanosecond: what it is asked comes here. */
 #define _GNU_SOURCE
-#include "waiter.h"
+#include "internal.h"
 
 #include <assert.h>
 #include <errno.h>

@@ -1,6 +1,6 @@
 /* Waiting where the system refuses epoll_pwait2(), as old kernels and some containers do. */
 #define _GNU_SOURCE
-#include "waiter.h"
+#include "internal.h"
 
 #include <assert.h>
 #include <errno.h>

@@ -5,7 +5,7 @@
 #ifndef FUZZ_H
 #define FUZZ_H
 
-#include "multidrop.h"
+#include "internal.h"
 
 #include <stdint.h>
 #include <stdio.h>

@@ -116,7 +116,7 @@ def scratch() -> Iterator[Path]:
         shutil.copy(ROOT / "pyproject.toml", tree)
         for name in ("checked", "module"):
             (tree / name).mkdir()
-        _must(tree, sys.executable, "csrc/cdef.py", "csrc/multidrop.h", "module/_core.c")
+        _must(tree, sys.executable, "csrc/cdef.py", "module/_core.c")
         headers = f"-I{sysconfig.get_path('include')}"
         sources = {name: f"csrc/{name}.c" for name in _core(tree)}
         for name, source in {"test_core": "tests/c/test_core.c", **sources}.items():

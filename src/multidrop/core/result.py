@@ -1,4 +1,4 @@
-"""Why there is no reply: as a number, as a status in columns, and in words."""
+"""Why there is no frame, no reply, no value: as numbers, and in words."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from enum import IntEnum
 from multidrop._core import lib
 
 
-class Result(IntEnum):
-    """Why there is no reply, or why bytes are not what was looked for (enum md_result)."""
+class FrameFault(IntEnum):
+    """Why bytes are no frame (enum md_frame_fault)."""
 
     INCOMPLETE = lib.MD_INCOMPLETE
     NO_START = lib.MD_NO_START
@@ -19,52 +19,73 @@ class Result(IntEnum):
     BAD_LENGTH = lib.MD_BAD_LENGTH
     BAD_ECHO = lib.MD_BAD_ECHO
     BAD_REQUEST = lib.MD_BAD_REQUEST
+
+
+class Outcome(IntEnum):
+    """Why an exchange has no reply; a FrameFault where something came in its place (enum md_outcome)."""
+
     CUT_SHORT = lib.MD_CUT_SHORT
     NO_REPLY = lib.MD_NO_REPLY
     LINE_LOST = lib.MD_LINE_LOST
     SETTINGS_REFUSED = lib.MD_SETTINGS_REFUSED
     LATE_ANSWER_DUE = lib.MD_LATE_ANSWER_DUE
     EXPIRED = lib.MD_EXPIRED
-    NOT_ASKED = lib.MD_NOT_ASKED
     POLL_ENDED = lib.MD_POLL_ENDED
     MAYBE_ECHO = lib.MD_MAYBE_ECHO
 
+
+class Status(IntEnum):
+    """A row's status, but for exceptions: why it has no value (enum md_status)."""
+
+    OK = lib.MD_OK
+    NO_START = -FrameFault.NO_START
+    BAD_CHARACTER = -FrameFault.BAD_CHARACTER
+    BAD_CHECKSUM = -FrameFault.BAD_CHECKSUM
+    BAD_ADDRESS = -FrameFault.BAD_ADDRESS
+    BAD_FUNCTION = -FrameFault.BAD_FUNCTION
+    BAD_LENGTH = -FrameFault.BAD_LENGTH
+    BAD_ECHO = -FrameFault.BAD_ECHO
+    BAD_REQUEST = -FrameFault.BAD_REQUEST
+    CUT_SHORT = -Outcome.CUT_SHORT
+    NO_REPLY = -Outcome.NO_REPLY
+    LINE_LOST = -Outcome.LINE_LOST
+    SETTINGS_REFUSED = -Outcome.SETTINGS_REFUSED
+    LATE_ANSWER_DUE = -Outcome.LATE_ANSWER_DUE
+    EXPIRED = -Outcome.EXPIRED
+    NOT_ASKED = lib.MD_NOT_ASKED
+    POLL_ENDED = -Outcome.POLL_ENDED
+    MAYBE_ECHO = -Outcome.MAYBE_ECHO
+
     def __str__(self) -> str:
-        return _REASONS[self]
+        return STATUSES[self]
 
 
-_REASONS = {
-    Result.INCOMPLETE: "ok",
-    Result.NO_START: "no frame in what was received",
-    Result.BAD_CHARACTER: "bad character",
-    Result.BAD_CHECKSUM: "bad checksum",
-    Result.BAD_ADDRESS: "reply from another address",
-    Result.BAD_FUNCTION: "reply to another function",
-    Result.BAD_LENGTH: "reply of another length",
-    Result.BAD_ECHO: "write confirmed with another address or value",
-    Result.BAD_REQUEST: "request cannot be built",
-    Result.CUT_SHORT: "reply cut short",
-    Result.NO_REPLY: "no reply",
-    Result.LINE_LOST: "port lost",
-    Result.SETTINGS_REFUSED: "port refused its settings",
-    Result.LATE_ANSWER_DUE: "not asked: late reply due",
-    Result.EXPIRED: "not sent: expired",
-    Result.NOT_ASKED: "not asked: drive is silent",
-    Result.POLL_ENDED: "poll ended",
-    Result.MAYBE_ECHO: "maybe the adapter's echo",
+_WORDS: dict[int, str] = {
+    Status.OK: "ok",
+    Status.NO_START: "no frame in what was received",
+    Status.BAD_CHARACTER: "bad character",
+    Status.BAD_CHECKSUM: "bad checksum",
+    Status.BAD_ADDRESS: "reply from another address",
+    Status.BAD_FUNCTION: "reply to another function",
+    Status.BAD_LENGTH: "reply of another length",
+    Status.BAD_ECHO: "write confirmed with another address or value",
+    Status.BAD_REQUEST: "request cannot be built",
+    Status.CUT_SHORT: "reply cut short",
+    Status.NO_REPLY: "no reply",
+    Status.LINE_LOST: "port lost",
+    Status.SETTINGS_REFUSED: "port refused its settings",
+    Status.LATE_ANSWER_DUE: "not asked: late reply due",
+    Status.EXPIRED: "not sent: expired",
+    Status.NOT_ASKED: "not asked: drive is silent",
+    Status.POLL_ENDED: "poll ended",
+    Status.MAYBE_ECHO: "maybe the adapter's echo",
 }
 
-UNASKED = "not "  # so begin the reasons of misses that no request left for
-EXCEPTION_STATUS = 256  # a column's status of exception code n is 256 + n
-
+UNASKED = "not "  # begins the statuses of values for which no request left
+EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # + the exception's code
 
 STATUSES = (
-    *(_REASONS[Result(-code)] for code in range(-min(Result) + 1)),
-    *([""] * (EXCEPTION_STATUS + min(Result) - 1)),  # codes that are not used
+    *(_WORDS.get(code, "") for code in range(EXCEPTION_STATUS)),
     *(f"exception {code:02X}" for code in range(256)),
 )
-
-
-def status_text(status: int) -> str:
-    """What a status column says for the core's status code."""
-    return STATUSES[status]
+"""The words of every status code."""
