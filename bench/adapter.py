@@ -14,11 +14,11 @@ import numpy
 import pyarrow
 import pyarrow.compute
 from jobs import REGISTERS, Job, expected
-from multidrop._core import lib
+from multidrop._core import ffi, lib
 from played import Played, Unpaced
 
 from multidrop.bus import Bus
-from multidrop.core import Columns, Field, Names, RowLayout, new_completion
+from multidrop.core import Columns, Field, Names, RowLayout
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Batch, Row
@@ -130,7 +130,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
     for address in range(1, drives + 1):
         fields = [Field(it.address, it.number_format, it.address, 1, 10) for it in registers]
         data = b"".join(value.to_bytes(2, "big") for value in expected(address))
-        found = new_completion()
+        found = ffi.new("struct md_completion *")
         found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
         found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
         replies.append((RowLayout(address - 1, fields), found))

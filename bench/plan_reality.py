@@ -23,7 +23,7 @@ import tables
 from played import Played
 from programs import paced_line
 
-from multidrop.core import Framing, Result
+from multidrop.core import Framing, Status
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.planning.blocks import Planned, planned
@@ -84,7 +84,7 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
         ]
     delays = {drive: poller.bus("line").peer(drive).response_delay for drive, _ in wanted}
     misses = Counter(poller.summary()["lines"]["line"]["misses"])
-    del misses[str(Result.POLL_ENDED)]
+    del misses[str(Status.POLL_ENDED)]
     return Case(name, cycle(wanted, {}), cycle(wanted, delays), middle(times), misses.total())
 
 

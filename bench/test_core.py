@@ -8,6 +8,7 @@ from ctypes import CDLL
 from typing import Any
 
 import pytest
+from multidrop._core import ffi, lib
 
 from multidrop.core import (
     Columns,
@@ -22,7 +23,6 @@ from multidrop.core import (
     RowQueue,
     build_request,
     crc16,
-    new_completion,
     parse_reply,
     set_settings,
 )
@@ -75,8 +75,9 @@ def fd(responder: str) -> Any:
 
 def carry_out(port: Port, exchanges: list[Exchange], row_queue: RowQueue) -> Columns:
     """Queue them all, and take their rows."""
+    last = port.done + len(exchanges)
     port.submit(exchanges, [0] * len(exchanges))
-    while port.pending:
+    while port.done != last:
         row_queue.await_calls(0.02)
     columns = row_queue.take()
     assert columns is not None
@@ -98,7 +99,7 @@ def test_256_exchanges_of_a_bare_c_loop(benchmark: Any, fd: int, bare: CDLL) -> 
 
 
 def test_decode_ten_values(benchmark: Any, fd: int) -> None:
-    found = new_completion()
+    found = ffi.new("struct md_completion *")
     with closing(Port(fd, -1)) as port:
         reply = port.carry_out(unhurried(READ_TEN)).reply
     found.result, found.sent_ns, found.first_ns = 25, 1, 2
@@ -108,7 +109,7 @@ def test_decode_ten_values(benchmark: Any, fd: int) -> None:
 
     def decode() -> None:
         columns.c.rows = 0
-        columns.add(TEN_VALUES, found, 0)
+        lib.md_columns_add(columns.c, TEN_VALUES.c, found, 0)
 
     benchmark(decode)
     assert columns.array("value")[0] == 0x0304 / 10

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from multidrop._core import ffi, lib
 
-from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, new_completion
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.polling.batch import Batch
 from multidrop.recording import open_writer
 
@@ -18,12 +19,12 @@ REGISTERS = [f"register_{at}" for at in range(16)]
 @pytest.fixture
 def batch() -> Batch:
     """4096 rows of one drive's sixteen registers."""
-    found = new_completion()
+    found = ffi.new("struct md_completion *")
     found.result, found.sent_ns, found.first_ns = 37, 1, 2
     found.reply.data_len, found.reply.data[0:32] = 32, list(range(32))
     block = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in range(16)])
     columns = Columns(ROWS)
-    while columns.add(block, found, 0):
+    while lib.md_columns_add(columns.c, block.c, found, 0):
         pass
     return Batch(columns, Names(["pump-1"]), Names(REGISTERS))
 

@@ -15,12 +15,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from completions import new_completion
 from line_driver import LineDriver
 from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import Completion, Exchange, Message, Result, RowQueue, completion, new_completion
+from multidrop.core import Completion, Exchange, Failure, Message, RowQueue, completion
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.plant.model import PolledDrive
@@ -120,7 +121,7 @@ class WorldPort:
 
     def stop(self) -> None:
         if self.end():
-            self._driver.abandon(Result.POLL_ENDED)
+            self._driver.abandon(Failure.POLL_ENDED)
             self._finish()
 
     # ---- the core's side ----
@@ -130,7 +131,7 @@ class WorldPort:
         self.lost = True
         self._round.clear()
         while self._under_way or self._take_up():
-            self._driver.abandon(Result.LINE_LOST, ENODEV)
+            self._driver.abandon(Failure.LINE_LOST, ENODEV)
             self._finish()
         self._call()
 
@@ -177,7 +178,7 @@ class WorldPort:
             if self._turn is Turn.QUEUED and exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
                 again = (at_ns for other, at_ns in self._queue if other is exchange)
                 if now >= next(again, NEVER):
-                    self._driver.abandon(Result.EXPIRED)
+                    self._driver.abandon(Failure.EXPIRED)
         elif self._round:
             self._ask(Turn.REPEATED, self._round[0])
             self._round.rotate(-1)
