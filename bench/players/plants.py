@@ -22,7 +22,7 @@ from multidrop.cli.demo import DRIVES, OPTIONS
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
-from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, Wire, proof, serve, simulated
+from multidrop.sim import EncodedDrive, Faults, FaultyWire, Simulator, Wire, proof, serve, simulated
 
 MOTOR = "fan"
 EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
@@ -89,7 +89,7 @@ class RunningPlant:
 def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
     """The plant's lines with these faults, each drive but the motors' one of encoded values."""
     return [
-        HostileWire(
+        FaultyWire(
             [
                 simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
                 for it in line.drives

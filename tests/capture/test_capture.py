@@ -339,7 +339,7 @@ def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tm
     path.write_bytes(described()[:-6])
     with Capture(path) as capture:
         assert list(capture) == [None]
-        assert (capture.lines, capture.torn) == ([], 14)
+        assert (capture.lines, capture.truncated) == ([], 14)
 
 
 @pytest.mark.parametrize(
@@ -383,7 +383,7 @@ def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) ->
         path.write_bytes(content[: len(content) - cut])
         with Capture(path) as capture:
             read.append(sum(map(len, Decoding(capture))))
-            assert capture.torn < 300
+            assert capture.truncated < 300
     assert read == sorted(read, reverse=True)
     assert read[0] > read[-1] == 0
 
@@ -597,7 +597,7 @@ def test_pieces_of_a_file_are_one_capture(
     with Capture(path) as capture:
         for _ in capture:
             pass
-        assert capture.torn == len(OTHER_BLOCK) - 3
+        assert capture.truncated == len(OTHER_BLOCK) - 3
 
 
 OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # of statistics

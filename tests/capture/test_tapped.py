@@ -21,7 +21,7 @@ from test_mixed_line import LATEST, fast_drives, real_drives, real_wires
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped
 from multidrop.capture import flight_recorder as flight
-from multidrop.capture.anomalies import Watch
+from multidrop.capture.anomalies import AnomalyWatch
 from multidrop.capture.pcapng_writer import WRAPPINGS
 from multidrop.cli.poll.tapping import tapping_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
@@ -101,7 +101,7 @@ def captured(
             assert tapped.lost == 0
     with Capture(capture) as found:
         decoded = [row for batch in Decoding(found, known) for row in batch]
-        assert found.torn == 0
+        assert found.truncated == 0
     return rows, decoded
 
 
@@ -273,8 +273,8 @@ class Flight:
             self.seconds += 1
             time_ns = round(self.seconds * 1e9)
             self.recorder.append(WRAPPINGS.packet(0, Side.NOISE, time_ns, bytes([round(self.seconds) % 256])))
-            self.recorder.heed([])
-        self.recorder.heed(list(troubles))
+            self.recorder.report([])
+        self.recorder.report(list(troubles))
 
 
 def seconds_in(path: Path) -> list[int]:
@@ -358,7 +358,7 @@ class Watched:
         self.port: Any = SimpleNamespace(lost=False)
         pump: Any = SimpleNamespace(name="pump-1")
         bus: Any = SimpleNamespace(line=self, drives=[pump], peer=lambda drive: peer)
-        self.watch = Watch("hall-1", bus)
+        self.watch = AnomalyWatch("hall-1", bus)
 
     @property
     def queue(self) -> Any:
@@ -372,7 +372,7 @@ class Watched:
         self.line.now += 20 * MS
         self.line.receive(reply)
         self.line.wait_until_done()
-        return list(self.watch.look())
+        return list(self.watch.check())
 
 
 def test_damaged_and_late_replies_are_trouble() -> None:
@@ -382,7 +382,7 @@ def test_damaged_and_late_replies_are_trouble() -> None:
     assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
     assert pump.told(GOOD[:-1] + b"\0") == ["hall-1: pump-1: bad checksum"]
     assert pump.told(bytes.fromhex("01 83 03 01 31")) == []  # it only refuses
-    assert list(pump.watch.look()) == []
+    assert list(pump.watch.check()) == []
     assert pump.told(b"") == []
     pump.line.receive(GOOD)
     assert pump.told(GOOD) == ["hall-1: pump-1: late reply"]
@@ -401,10 +401,10 @@ def test_a_lost_port_is_trouble_once() -> None:
     open_port = pump.port
     for lost in (SimpleNamespace(lost=True), None):
         pump.port = lost
-        assert list(pump.watch.look()) == ["hall-1: the port was lost"]
-        assert list(pump.watch.look()) == []
+        assert list(pump.watch.check()) == ["hall-1: the port was lost"]
+        assert list(pump.watch.check()) == []
         pump.port = open_port
-        assert list(pump.watch.look()) == []
+        assert list(pump.watch.check()) == []
 
 
 # ---- on the command line ----

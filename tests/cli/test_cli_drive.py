@@ -22,7 +22,7 @@ from multidrop.control import eeprom_ledger as ledger
 from multidrop.core import Message
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
-from multidrop.sim import PoweredDrive, simulated
+from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.simulator import Simulator
@@ -347,7 +347,7 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
 def che() -> Iterator[tuple[Heard, list[object]]]:
     """What a CHE hears, and the words that name it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         yield Heard(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]

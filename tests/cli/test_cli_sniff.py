@@ -330,7 +330,7 @@ def test_noise_is_told_though_it_does_not_end() -> None:
         heard.put(b"\xff" * 1500, time)
         told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(heard))])
     assert told == [[], [], [(0, 4500)], []]
-    assert [(it.time_ns, len(it.raw)) for it in pairing.rest()] == [(3, 1500)]
+    assert [(it.time_ns, len(it.raw)) for it in pairing.flush()] == [(3, 1500)]
 
 
 METER = """\

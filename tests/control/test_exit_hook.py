@@ -16,7 +16,7 @@ from motors import Heard
 
 from multidrop.control.exit_hook import CUT_SHORT, ExitHook
 from multidrop.drives import InvtCHE
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
@@ -161,9 +161,9 @@ def lines(count: int) -> Iterator[tuple[list[list[Heard]], list[str]]]:
     for _ in range(count):
         sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3, 4)]
         for sim in sims:
-            assert isinstance(sim, PoweredDrive)
+            assert isinstance(sim, MotorDrive)
             sim.motor.acceleration_time, sim.motor.deceleration_time = 0.2, 3.0
-        heard.append([Heard(sim) for sim in sims if isinstance(sim, PoweredDrive)])
+        heard.append([Heard(sim) for sim in sims if isinstance(sim, MotorDrive)])
     with Simulator([Wire([it.sim for it in one], unpaced=True) for one in heard]) as simulator:
         yield heard, [wire.path for wire in simulator.wires]
 

@@ -35,7 +35,7 @@ from multidrop.errors import (
     Unconfirmed,
     Unsupported,
 )
-from multidrop.sim import PoweredDrive, simulated
+from multidrop.sim import MotorDrive, simulated
 from multidrop.transport.exchange import READ_ATTEMPTS
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -180,7 +180,7 @@ def test_a_drive_of_another_family_is_not_written_to(
     if model == actual:
         return
     sim = simulated(MAKE[actual](1))
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     hall = Hall(monkeypatch, sim)
     drive = hall.attach(MAKE[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):

@@ -17,7 +17,7 @@ from multidrop.bus import Bus
 from multidrop.drive import Condition, Drive, read
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import NoReply, NotDone, Refused, Unconfirmed
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -31,11 +31,11 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, PoweredDrive, Heard]]:
+def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorDrive, Heard]]:
     """The drive as its bus knows it; what is there in truth, `other` or the same; and what that hears."""
     drive.response_timeout = PATIENCE
     sim = simulated(other or drive)
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     heard = Heard(sim)
     with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:

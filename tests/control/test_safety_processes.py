@@ -19,7 +19,7 @@ from multidrop.control.audit_log import AuditLog, read_audit
 from multidrop.control.eeprom_ledger import BUDGET, YEAR, Ledger, LedgerCell
 from multidrop.drives import InvtCHE
 from multidrop.errors import NoReply, Unconfirmed
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 CLIENT = """
 import sys, time
@@ -43,9 +43,9 @@ ENDINGS = {  # what the client does after its start, the signal that it is sent,
 
 
 @contextmanager
-def pump() -> Iterator[tuple[PoweredDrive, str]]:
+def pump() -> Iterator[tuple[MotorDrive, str]]:
     sim = simulated(InvtCHE(1, maximum_frequency=50))
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
         yield sim, simulator.wires[0].path

@@ -25,7 +25,7 @@ from multidrop.core import Framing, Message, parse_request
 from multidrop.drive import Condition
 from multidrop.drives import InvtCHE
 from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
@@ -39,7 +39,7 @@ def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]
     heard = []
     for drive in (ours, MAKE[model](2)):
         sim = simulated(drive)
-        assert isinstance(sim, PoweredDrive)
+        assert isinstance(sim, MotorDrive)
         sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
         heard.append(Heard(sim))
     wire = Wire([it.sim for it in heard], unpaced=True)

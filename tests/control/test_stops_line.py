@@ -20,7 +20,7 @@ from multidrop.drive import Condition
 from multidrop.errors import BusError, LineError, NoReply, Overtaken, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.polling.polled_line import PolledLine
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -39,7 +39,7 @@ class Delayed(LateWire):
 def line(model: str) -> Iterator[tuple[Bus, Any, Heard, Delayed]]:
     drive = MAKE[model](1)
     sim = simulated(drive)
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     heard, wire = Heard(sim), Delayed([sim], unpaced=True)
     with Simulator([wire]) as simulator, Bus(simulator.wires[0].path) as bus:
@@ -161,7 +161,7 @@ class Pulled:
         self.link = str(link)
         self.drive = MAKE["invt-che"](1)
         sim = simulated(self.drive)
-        assert isinstance(sim, PoweredDrive)
+        assert isinstance(sim, MotorDrive)
         sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
         self.heard = Heard(sim)
 

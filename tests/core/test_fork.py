@@ -24,7 +24,7 @@ from multidrop.core.fork import only_here
 from multidrop.drives import InvtCHE
 from multidrop.errors import LineError, NoReply
 from multidrop.poller import Poller
-from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*fork:DeprecationWarning",  # that a lock may be held there is what is tested
@@ -288,7 +288,7 @@ ENDS = {
 def test_a_child_stops_no_motor(end: str) -> None:
     """However it ends; its parent still does, when it leaves."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2
     act, status = ENDS[end]
     with Simulator([Wire([sim], unpaced=True)]) as simulator:

@@ -82,10 +82,10 @@ def read_recording(path: Path) -> None:
         batches = list(reader)
         rows = _comparable(batches)
         assert _written_again(path, ".arrows", reader.metadata, batches) == rows
-        if reader.torn:
-            assert repair(path) == reader.torn
+        if reader.truncated:
+            assert repair(path) == reader.truncated
             again = open_reader(path)
-            assert (again.torn, _comparable(again)) == (0, rows)
+            assert (again.truncated, _comparable(again)) == (0, rows)
 
 
 @cache
@@ -117,7 +117,7 @@ def _pair(capture: Capture) -> None:
             junk += sum(len(it.raw) for it in told if isinstance(it, Junk))
             exchanges += sum(1 for it in told if not isinstance(it, Junk) and it.request and it.reply)
     for pairing in pairings:
-        junk += sum(len(it.raw) for it in pairing.rest() if isinstance(it, Junk))
+        junk += sum(len(it.raw) for it in pairing.flush() if isinstance(it, Junk))
     assert junk == sum(it.junk_bytes for it in pairings)
     assert exchanges == sum(it.exchanges for it in pairings)
 

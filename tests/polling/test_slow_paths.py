@@ -25,7 +25,7 @@ from multidrop.control.outcome import Effect
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
-from multidrop.sim import EncodedDrive, Faults, PoweredDrive, SimulatedDrive, simulated
+from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
 from multidrop.transport import exchange as exchanges
 
 pytestmark = pytest.mark.story
@@ -288,7 +288,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     """Its first frame leaves at once; what it asks then waits for as long as answers are known to take."""
     drive = MAKE[model](1)
     sim = simulated(drive)
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     opened, line = path_of([sim], constant(seconds))
     heard = Heard(sim)

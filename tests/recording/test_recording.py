@@ -57,7 +57,7 @@ def rows(reader: RecordingReader) -> list[Row]:
 def test_what_is_written_is_read(tmp_path: Path, suffix: str) -> None:
     reader = open_reader(record(tmp_path / f"a{suffix}"))
     assert reader.metadata == METADATA
-    assert reader.torn == 0
+    assert reader.truncated == 0
     assert rows(reader) == RECORDED
     assert rows(reader) == RECORDED  # and again
 

@@ -25,7 +25,7 @@ from toy import Toy
 from multidrop.core import Columns
 from multidrop.polling.batch import Batch, Row
 from multidrop.recording import FORMATS, RecordingError, RecordingReader, open_reader, open_writer, repair
-from multidrop.recording.append_file import WholeFile
+from multidrop.recording.append_file import AppendFile
 
 growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])
 ROWS = 20  # of a batch
@@ -59,7 +59,7 @@ def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> No
         path.write_bytes(whole[:cut])
         batches = sum(length <= cut for length in lengths) - 1
         reader = open_reader(path)
-        assert reader.torn == cut - lengths[batches]
+        assert reader.truncated == cut - lengths[batches]
         assert reader.metadata == METADATA
         assert rows(reader) == expected[: batches * ROWS]
 
@@ -73,7 +73,7 @@ def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
         path.write_bytes(whole[:cut])
         kept = whole[:cut].rpartition(b"\n")[0] + b"\n"
         reader = open_reader(path)
-        assert reader.torn == cut - len(kept)
+        assert reader.truncated == cut - len(kept)
         assert rows(reader) == expected[: kept.count(b"\n") - 1]
 
 
@@ -89,7 +89,7 @@ def test_long_torn_line_of_csv(tmp_path: Path) -> None:
     with path.open("ab") as file:
         file.write(bytes(200_000))
     reader = open_reader(path)
-    assert (reader.torn, rows(reader)) == (200_000, list(counting(ROWS)))
+    assert (reader.truncated, rows(reader)) == (200_000, list(counting(ROWS)))
 
 
 def test_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_end_marker_of_other_writers_is_not_torn(tmp_path: Path) -> None:
     with pa.ipc.new_stream(path, table.schema) as stream:
         stream.write_table(table)
     reader = open_reader(path)
-    assert (reader.torn, reader.metadata, rows(reader)) == (0, {}, list(example()))
+    assert (reader.truncated, reader.metadata, rows(reader)) == (0, {}, list(example()))
 
 
 # ---- killed ----
@@ -218,7 +218,7 @@ def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
     assert int(saved) >= 500
     assert sentence.endswith(f"the {saved} rows before that can be read")
     reader = open_reader(path)
-    assert (len(rows(reader)), reader.torn) == (int(saved), 0)
+    assert (len(rows(reader)), reader.truncated) == (int(saved), 0)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -275,18 +275,18 @@ def test_a_torn_piece_that_could_not_be_cut_off_is_before_the_next(
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
-        cut = WholeFile._cut
-        monkeypatch.setattr(WholeFile, "_cut", _fail)
+        cut = AppendFile._cut
+        monkeypatch.setattr(AppendFile, "_cut", _fail)
         for _ in range(2):
             with full_at(path.stat().st_size + 100), pytest.raises(RecordingError):
                 writer.write(counting(ROWS, 40000))
-        monkeypatch.setattr(WholeFile, "_cut", cut)
-        assert open_reader(path).torn == 100
+        monkeypatch.setattr(AppendFile, "_cut", cut)
+        assert open_reader(path).truncated == 100
         writer.write(counting(ROWS, ROWS))
     assert rows(open_reader(path)) == list(counting(2 * ROWS))
 
 
-def _fail(file: WholeFile) -> None:
+def _fail(file: AppendFile) -> None:
     raise OSError(5, "Input/output error")
 
 

@@ -456,15 +456,15 @@ def test_what_nobody_can_answer_is_a_mistake(asked: dict[str, list[object]], sen
 
 def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
     for sweep in plan:
-        yield build_request(sweep.framing, sweep.question.to(1))
+        yield build_request(sweep.framing, sweep.request.to(1))
 
 
 def test_every_question_is_a_read_of_the_documents() -> None:
     for sweep in sweeps(FAMILIES):
-        assert sweep.question.function in READS[sweep.framing]
+        assert sweep.request.function in READS[sweep.framing]
         for family in sweep.families:
             reads = {it.table.read for it in family.registers.values() if it.readable}
-            assert sweep.question.function in reads
+            assert sweep.request.function in reads
     assert len(set(questions(sweeps(FAMILIES)))) < 10
 
 

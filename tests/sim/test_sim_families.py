@@ -18,7 +18,7 @@ from multidrop.drives.erman_er_g_220 import ErmanERG220
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE, parameter
 from multidrop.drives.yd1000 import YD1000
-from multidrop.sim import EncodedDrive, PoweredDrive, Wire, encoded, simulated
+from multidrop.sim import EncodedDrive, MotorDrive, Wire, encoded, simulated
 from multidrop.sim.che import SimulatedCHE
 from multidrop.sim.delixi import SimulatedDelixiNative
 from multidrop.sim.yd1000 import SimulatedYD1000
@@ -29,7 +29,7 @@ class Bench:
 
     def __init__(self, drive: Drive) -> None:
         sim = simulated(drive)
-        assert isinstance(sim, PoweredDrive)
+        assert isinstance(sim, MotorDrive)
         self.sim = sim
         self.motor = sim.motor
         self.wire = Wire([sim], unpaced=True)

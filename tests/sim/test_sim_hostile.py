@@ -18,7 +18,7 @@ from multidrop.core import STATUSES, Message, Peer
 from multidrop.drives import YD1000
 from multidrop.errors import LineError
 from multidrop.plant.loader import parse_duration
-from multidrop.sim import Faults, HostileWire, SimulatedDrive, Simulator, load_faults, simulated
+from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
 from multidrop.transport.line import Line
 
@@ -32,7 +32,7 @@ class Heard:
     """What a client hears of a hostile line, on a clock that moves with its requests."""
 
     def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
-        self.wire = HostileWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))
+        self.wire = FaultyWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))
         self.now = 0.0
 
     def after(self, request: bytes = READ) -> list[tuple[float, bytes]]:
@@ -139,7 +139,7 @@ def test_noise_comes_with_a_motor_s_start() -> None:
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
 def test_a_port_hangs_up_and_is_back_where_it_was(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
-    wire = HostileWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
+    wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:
         path = sim.wires[0].path
         names = set()
@@ -182,7 +182,7 @@ def read(line: Line) -> bytes:
 
 def test_a_bare_pty_cannot_hang_up() -> None:
     with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
-        HostileWire([simulated(Toy(1))], Faults(hang_up=0.1))
+        FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
 
 
 # ---- the file ----

@@ -22,7 +22,7 @@ from multidrop.core import (
     parse_reply,
 )
 from multidrop.drive import Drive
-from multidrop.sim import PoweredDrive, SimulatedDrive, simulated
+from multidrop.sim import MotorDrive, SimulatedDrive, simulated
 from multidrop.transport import exchange as exchanges
 
 EXCHANGE_TIME = 0.02  # s
@@ -123,9 +123,9 @@ def is_write(request: Message) -> bool:
     return request.function not in READING
 
 
-def one(monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any) -> tuple[Hall, Any, PoweredDrive]:
+def one(monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any) -> tuple[Hall, Any, MotorDrive]:
     """A hall with one drive that is what it is declared to be."""
     sim = simulated(drive)
-    assert isinstance(sim, PoweredDrive)
+    assert isinstance(sim, MotorDrive)
     hall = Hall(monkeypatch, sim, **details)
     return hall, hall.attach(drive), sim

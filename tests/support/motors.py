@@ -7,7 +7,7 @@ from collections.abc import Callable
 from multidrop.core import Message
 from multidrop.drive import Drive
 from multidrop.drives import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.sim import PoweredDrive
+from multidrop.sim import MotorDrive
 from multidrop.sim.receiver import Frame
 
 MAKE: dict[str, Callable[[int], Drive]] = {
@@ -36,7 +36,7 @@ DELIXI_WRITES = (2, 4, 5, 6)
 class Heard:
     """What a simulated drive hears; `loses(request)` says whether its reply is lost."""
 
-    def __init__(self, sim: PoweredDrive) -> None:
+    def __init__(self, sim: MotorDrive) -> None:
         self.sim = sim
         self.requests: list[Message] = []
         self.loses: Callable[[Message], bool] = lambda request: False

@@ -28,7 +28,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
-from multidrop.sim import HostileWire
+from multidrop.sim import FaultyWire
 from multidrop.transport.exchange import NO_ROWS, exchange
 
 S = 1_000_000_000
@@ -37,7 +37,7 @@ NEVER = 1 << 62
 ENODEV = 19
 
 
-class WorldWire(HostileWire):
+class WorldWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
 
     def open(self) -> None:

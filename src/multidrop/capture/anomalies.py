@@ -1,7 +1,7 @@
-"""What goes wrong on a polled line, as it shows in what is known of its port and its drives.
+"""Anomalies on a polled line, found in the state of its port and the counters of its drives.
 
-There are four kinds: the port is lost; a drive that has answered falls silent; what came in place of a
-reply was none; a reply came after its time-out. That a drive refuses is none of them.
+There are four kinds: the port is lost; a drive that has answered falls silent; a reply is damaged or
+another drive's; a reply comes after its time-out. A refusal is no anomaly.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _BAD = (
 )
 
 
-class Watch:
-    """Watches one line."""
+class AnomalyWatch:
+    """Find the anomalies of one line."""
 
     def __init__(self, name: str, bus: Bus) -> None:
         self._name = name
@@ -34,15 +34,15 @@ class Watch:
         self._drives = [_WatchedDrive(bus, drive) for drive in bus.drives]
         self._is_lost = False
 
-    def look(self) -> Iterator[str]:
-        """What went wrong since the last look, in words."""
+    def check(self) -> Iterator[str]:
+        """Yield a sentence for each anomaly since the last check."""
         port = self._bus.line.queue
         was_lost, self._is_lost = self._is_lost, port is None or port.lost
         if self._is_lost and not was_lost:
             yield f"{self._name}: the port was lost"
         for drive in self._drives:
-            for what in drive.look():
-                yield f"{self._name}: {drive.name}: {what}"
+            for anomaly in drive.check():
+                yield f"{self._name}: {drive.name}: {anomaly}"
 
 
 class _WatchedDrive:
@@ -53,21 +53,19 @@ class _WatchedDrive:
         self._is_silent = True
         self._bad: dict[Status, int] = {}
 
-    def look(self) -> Iterator[str]:
+    def check(self) -> Iterator[str]:
         if self._peer.exchanges == self._exchanges:
             return
         counters = self._peer.counters()
         self._exchanges = counters.exchanges
-        was_silent, self._is_silent = (
-            self._is_silent,
-            self._peer.failures >= SILENT or not counters.answered,
-        )
+        was_silent = self._is_silent
+        self._is_silent = self._peer.failures >= SILENT or not counters.answered
         if self._is_silent and not was_silent:
             yield "fell silent"
         if counters.late > self._late:
             yield "late reply"
-        bad = {why: counters.ended[why] for why in _BAD if why in counters.ended}
-        for why, count in bad.items():
-            if count > self._bad.get(why, 0):
-                yield str(why)
+        bad = {result: counters.ended[result] for result in _BAD if result in counters.ended}
+        for result, count in bad.items():
+            if count > self._bad.get(result, 0):
+                yield str(result)
         self._late, self._bad = counters.late, bad

@@ -1,19 +1,19 @@
 """Captures as columns: a row for every register that was read or written, and for every miss.
 
-Rows are as a poll's: `time` is the request's time stamp, and the value was taken between it and the
-reply's. The captures' clock is the only one, so that `monotonic_ns` is the same number as `time`.
+Rows are those of a poll: `time` is the request's time stamp, and the value was taken between it and the
+reply's. A capture has one clock only: `monotonic_ns` equals `time`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from fractions import Fraction
 
-from multidrop.capture.lookup import Meaning, Meanings, line_of
+from multidrop.capture.lookup import RegisterLookup, RequestTarget, line_of
 from multidrop.capture.pcapng_reader import Capture
 from multidrop.core import Columns, Decoded, Decoder, Field, Names, RowLayout, Stream
-from multidrop.plant import model as plant
-from multidrop.plant.model import Plant
+from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
 ROWS = 1 << 16  # of a batch, at most
@@ -21,32 +21,32 @@ _MOST_NAMES = 60_000  # of registers; a column's codes end at 65535
 
 
 class Decoding:
-    """The rows of a capture, some thousands at a time, those of each line apart."""
+    """The rows of a capture as batches, each of one line."""
 
     def __init__(self, capture: Capture, known: Plant | None = None) -> None:
         self._capture = capture
         self._plant = known
-        self._lines: list[_Line] = []
+        self._lines: list[_LineDecoding] = []
 
     def __iter__(self) -> Iterator[Batch]:
         lines, names = self._lines, self._capture.lines
         for _ in self._capture:
-            lines += [_Line(line_of(self._plant, name)) for name in names[len(lines) :]]
+            lines += [_LineDecoding(line_of(self._plant, name)) for name in names[len(lines) :]]
             for line, stream in zip(lines, self._capture.streams, strict=True):
-                yield from line.hear(stream)
+                yield from line.decode(stream)
         for line in lines:
             yield from line.rest()
 
     def counts(self) -> Counter[str]:
-        """How much was decoded so far, of all lines: exchanges, frames, unknown bytes and so on."""
+        """Return the numbers of exchanges, frames, unknown bytes and so on decoded so far, of all lines."""
         return sum((Counter(line.decoder.counts()) for line in self._lines), Counter())
 
 
-class _Line:
-    """One line's exchanges, as rows that have not been taken yet."""
+class _LineDecoding:
+    """The decoder of one line, and the rows of its next batch."""
 
-    def __init__(self, line: plant.PlantLine | None) -> None:
-        self._meanings = Meanings(line)
+    def __init__(self, line: PlantLine | None) -> None:
+        self._lookup = RegisterLookup(line)
         self.decoder = Decoder()
         self._begin()
 
@@ -55,13 +55,13 @@ class _Line:
         self._drives = Names()
         self._registers = Names()
 
-    def hear(self, stream: Stream) -> Iterator[Batch]:
+    def decode(self, stream: Stream) -> Iterator[Batch]:
         while (done := self.decoder.decode(stream, self._columns)) is not Decoded.ALL:
             if done is Decoded.UNKNOWN and self._learn():
                 continue
             yield Batch(self._columns, self._drives, self._registers)
             self._columns = Columns(ROWS)
-            if done is Decoded.UNKNOWN:  # it knows too much
+            if done is Decoded.UNKNOWN:  # the decoder knows too many requests
                 self.decoder.forget()
                 self._begin()
 
@@ -73,22 +73,15 @@ class _Line:
         framing, request = self.decoder.asked
         if len(self._registers) > _MOST_NAMES:
             return False
-        meaning = self._meanings.of(framing, request)
-        block = self._block(meaning) if request.address else None  # nobody answers a broadcast
+        target = self._lookup.find(framing, request)
+        block = self._layout(target) if request.address else None  # nobody answers a broadcast
         return self.decoder.know(block)
 
-    def _block(self, meaning: Meaning) -> RowLayout:
-        drive = self._drives.number(meaning.drive)
+    def _layout(self, target: RequestTarget) -> RowLayout:
+        drive = self._drives.number(target.drive)
         fields = []
-        for place in meaning.places:
-            scale = place.register.scale if place.register else None
-            fields.append(
-                Field(
-                    place.at,
-                    place.number_format,
-                    self._registers.number(place.name),
-                    scale.numerator if scale else 1,
-                    scale.denominator if scale else 1,
-                )
-            )
+        for place in target.places:
+            scale = place.register.scale if place.register else Fraction(1)
+            name = self._registers.number(place.name)
+            fields.append(Field(place.at, place.number_format, name, scale.numerator, scale.denominator))
         return RowLayout(drive, fields)

@@ -1,4 +1,4 @@
-"""What a request asks for: the plant's registers by name where they are known, else raw ones."""
+"""Look the registers of a request up: the plant's by name where they are known, else raw ones."""
 
 from __future__ import annotations
 
@@ -22,15 +22,19 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
-_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply; a request may ask for more, in vain
-_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # function: a table's
-_DELIXI_READS = (0x03, 0x07)
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply, whatever the request asks for
+_WRITES = {
+    0x05: (0x05,),
+    0x06: (0x06,),
+    0x0F: (0x05, 0x0F),
+    0x10: (0x06, 0x10),
+}  # by function
 _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
 
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register, and where it lies in the data of the exchange; None: not one that is known."""
+    """A register and its offset in the data of an exchange, in words or bits; None: an unknown one."""
 
     name: str
     at: int
@@ -39,8 +43,8 @@ class RegisterPlace:
 
 
 @dataclass(frozen=True)
-class Meaning:
-    """Whom a request asks, and the registers that it reads or writes."""
+class RequestTarget:
+    """The drive that a request is for, and the registers that it reads or writes."""
 
     drive: str
     is_write: bool
@@ -48,28 +52,27 @@ class Meaning:
 
 
 def line_of(plant: Plant | None, name: str) -> PlantLine | None:
-    """The plant's line with this name; its only line has any name."""
+    """Return the plant's line with this name; its only line matches any name."""
     lines = plant.lines if plant else ()
     named = [line for line in lines if line.name == name]
     return named[0] if named else lines[0] if len(lines) == 1 else None
 
 
-class Meanings:
-    """What requests on one line mean."""
+class RegisterLookup:
+    """The registers of one line's drives."""
 
     def __init__(self, line: PlantLine | None) -> None:
         drives = [polled.drive for polled in line.drives] if line else []
         self._drives = {(drive.address, drive.framing): drive for drive in drives}
 
-    def of(self, framing: Framing, request: Message) -> Meaning:
-        """What this request asks for."""
+    def find(self, framing: Framing, request: Message) -> RequestTarget:
         drive = self._drives.get((request.address, framing))
         name = drive.name if drive else f"address {request.address}"
         writes = _DELIXI_WRITES if framing is Framing.DELIXI else _WRITES
         is_write = request.function in writes
         functions = writes.get(request.function, (request.function,))
         known = _known(drive, request, functions, is_write) if drive else ()
-        return Meaning(name, is_write, known or _raw(framing, request))
+        return RequestTarget(name, is_write, known or _raw(framing, request))
 
 
 def _known(
@@ -88,7 +91,7 @@ def _known(
 
 
 def _offset(register: Register[Any], request: Message) -> int | None:
-    """Where in the data it begins, in words or bits; None where it is not wholly in it."""
+    """Return the register's offset in the data; None unless the request covers all of it."""
     if register.table.carrier is Carrier.NUMBER:
         return 0
     end = request.start + max(request.count, 1)

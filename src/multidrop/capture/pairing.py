@@ -1,4 +1,4 @@
-"""Spans of what was sniffed, put together: requests with their replies, and what is neither."""
+"""Pair sniffed frames: requests with their replies, and what is neither."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Side
 
-_MOST_JUNK = 4096  # bytes told at once
+_MOST_JUNK = 4096  # bytes in one Junk
 
 
 @dataclass(frozen=True)
 class SniffedExchange:
-    """A request with its reply; one of the two is None where it was not heard or never came.
+    """A request and its reply; one of the two is None where it was not sniffed or never came.
 
     `is_sure` is False where the request may be the copy that confirms an earlier one.
     """
@@ -42,7 +42,7 @@ Sniffed = SniffedExchange | Junk
 
 
 class Pairing:
-    """Pairs what was heard on one line, and counts it."""
+    """Pair the frames of one line, and count them."""
 
     def __init__(self) -> None:
         self.exchanges = self.broadcasts = self.unanswered = self.strays = self.junk_bytes = 0
@@ -50,7 +50,7 @@ class Pairing:
         self._junk: list[FrameSpan] = []
 
     def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
-        """What the spans tell; the last request is told when its reply or another request came."""
+        """Yield the exchanges of these spans; a request waits for its reply or for the next request."""
         for span in spans:
             if span.kind is Kind.JUNK:
                 yield from self._add_junk(span)
@@ -58,29 +58,28 @@ class Pairing:
             if span.kind is Kind.REPLY and self._asked:
                 asked, self._asked = self._asked, None
                 self.exchanges += 1
-                yield _heard(asked, span)
-                yield from self._told_junk()
+                yield _exchange(asked, span)
+                yield from self._flush_junk()
                 continue
-            yield from self.rest()
+            yield from self.flush()
             if span.kind in (Kind.REPLY, Kind.STRAY):
                 self.strays += 1
-                yield _heard(None, span)
+                yield _exchange(None, span)
             elif span.message.address == 0:
                 self.broadcasts += 1
-                yield _heard(span, None)
+                yield _exchange(span, None)
             else:
                 self._asked = span
 
-    def rest(self) -> Iterator[Sniffed]:
-        """What waits for more, told as it is: nothing more is to come."""
+    def flush(self) -> Iterator[Sniffed]:
+        """Yield what waits, because nothing more is to come."""
         if self._asked:
             asked, self._asked = self._asked, None
             self.unanswered += 1
-            yield _heard(asked, None)
-        yield from self._told_junk()
+            yield _exchange(asked, None)
+        yield from self._flush_junk()
 
     def counts(self) -> dict[str, int]:
-        """How much was heard so far."""
         return {
             "exchanges": self.exchanges,
             "broadcasts": self.broadcasts,
@@ -92,16 +91,16 @@ class Pairing:
     def _add_junk(self, span: FrameSpan) -> Iterator[Sniffed]:
         self.junk_bytes += len(span.raw)
         self._junk.append(span)
-        if sum(len(it.raw) for it in self._junk) >= _MOST_JUNK:
-            yield from self._told_junk()
+        if sum(len(span.raw) for span in self._junk) >= _MOST_JUNK:
+            yield from self._flush_junk()
 
-    def _told_junk(self) -> Iterator[Junk]:
+    def _flush_junk(self) -> Iterator[Junk]:
         if self._junk:
             junk, self._junk = self._junk, []
-            yield Junk(junk[0].time_ns, b"".join(it.raw for it in junk))
+            yield Junk(junk[0].time_ns, b"".join(span.raw for span in junk))
 
 
-def _heard(asked: FrameSpan | None, answer: FrameSpan | None) -> SniffedExchange:
+def _exchange(asked: FrameSpan | None, answer: FrameSpan | None) -> SniffedExchange:
     first = asked or answer
     assert first is not None
     frames = [(Side.ASKING, asked.raw, asked.time_ns)] if asked else []

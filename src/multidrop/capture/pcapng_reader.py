@@ -1,7 +1,7 @@
-"""Reads captures: pcap and pcapng, ours and others', as bytes heard on lines.
+"""Read captures: pcap and pcapng files, ours and others', as streams of bytes on lines.
 
-A capture is read piece by piece: it may be larger than memory, and a piece that is not there any more
-(somebody cut the file short meanwhile) is a sentence, where a mapped file would end the process.
+A capture is read piece by piece: it may be larger than memory, and a file that is cut short meanwhile
+is an error, where a mapped file would end the process.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from io import SEEK_END
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 from multidrop.capture.pcapng_writer import APPLICATION
 from multidrop.core import Stream, Unpacked, Unpacker
@@ -20,38 +20,38 @@ _SHB_APPLICATION = 4
 _IF_NAME, _IF_RESOLUTION, _IF_OFFSET = 2, 9, 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
 _MOST_OFFSET = 1 << 33  # s; nanoseconds since 1970 are kept in 64 bits
-_PCAP = {  # the first four bytes: whether big-endian, and ticks in a second
+_PCAP = {  # first four bytes: is it big-endian, ticks in a second
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),
     b"\x4d\x3c\xb2\xa1": (False, 10**9),
     b"\xa1\xb2\x3c\x4d": (True, 10**9),
 }
 _PCAP_HEADER, _PCAPNG_HEADER = 24, 28
-_PIECE = 1 << 20  # bytes that are looked at together, many times the largest packet
+_PIECE = 1 << 20  # bytes read at a time, many times the largest packet
 _NO_SERIAL_LINE = {1: "Ethernet", 101: "IP", 105: "Wi-Fi", 113: "Linux cooked", 189: "USB", 220: "USB"}
 
 
 class CaptureError(ValueError):
-    """A file is not a capture, or is damaged: says why, and from which byte on."""
+    """A file is not a capture, or is damaged from some byte on."""
 
 
 class Capture:
     """A capture file; leaving the `with` block closes it. Raises CaptureError, and OSError.
 
-    `lines` has the name of every interface met so far, and `heard` what was heard on it; `torn` is how
-    many bytes at the file's end are no whole packet: their writer was killed, or the disk was full.
+    `lines` has the name of every interface met so far, and `streams` its bytes; `truncated` is the
+    number of bytes at the file's end that are no whole packet: the writer was killed, or the disk was full.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.lines: list[str] = []
-        self.torn = 0
+        self.truncated = 0
         self._is_ours = False
         self._file = self.path.open("rb", buffering=0)
         self._order = "<"
         self._unpacker: Unpacker | None = None
         try:
-            self._size = self._file.seek(0, SEEK_END)  # what is appended later is not looked at
+            self._size = self._file.seek(0, SEEK_END)  # what is appended later is not read
             self._begin()
         except BaseException:
             self.close()
@@ -64,15 +64,10 @@ class Capture:
     def close(self) -> None:
         self._file.close()
 
-    def __enter__(self) -> Capture:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _begin(self) -> None:
@@ -96,10 +91,10 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not begin like pcap or pcapng")
 
     def __iter__(self) -> Iterator[None]:
-        """Hear on; the caller takes from every `heard` what it can, each time and at the end."""
+        """Fill `streams`; at each step and at the end the caller takes what it can from every stream."""
         unpacker = self._unpacker
         assert unpacker is not None
-        seen = unpacker.at  # so far the file was read
+        seen = unpacker.at  # end of what was read of the file
         while True:
             state = unpacker.unpack()
             if state is Unpacked.NONSENSE:
@@ -115,13 +110,13 @@ class Capture:
                 unpacker.look_at(piece, unpacker.at)
             else:
                 break
-        self.torn = self._size - unpacker.at
-        for heard in self.streams:
-            heard.end(True)
+        self.truncated = self._size - unpacker.at
+        for stream in self.streams:
+            stream.end(True)
         yield
 
     def _piece(self, at: int, most: int) -> bytes:
-        """So many bytes of the file, or all that there are."""
+        """Return so many bytes of the file, or all that there are."""
         self._file.seek(at)
         piece = self._file.read(most)
         if len(piece) < min(most, self._size - at):
@@ -132,7 +127,7 @@ class Capture:
         return piece
 
     def _read_block(self, unpacker: Unpacker) -> bool:
-        """Take in a block that is not a packet of the usual kind; False where the file is cut."""
+        """Read a block that is no enhanced packet; return False where the file is truncated."""
         at = unpacker.at
         kind = self._read("I", at)
         if kind == _SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
@@ -197,7 +192,7 @@ class Capture:
             at += 4 + size + -size % 4
 
     def _order_at(self, at: int) -> str:
-        """The byte order of the section that begins there."""
+        """Return the byte order of the section that begins there."""
         magic = self._piece(at + 8, 4)
         if magic not in (b"\x1a\x2b\x3c\x4d", b"\x4d\x3c\x2b\x1a"):
             raise self._damaged(at)

@@ -1,4 +1,4 @@
-"""Writes captures: pcapng whose RTU frames Wireshark decodes without being told how."""
+"""Write captures: pcapng whose RTU frames Wireshark decodes without settings."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import struct
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 from multidrop.core import Side, Wrappings
-from multidrop.recording.append_file import WholeFile
-from multidrop.recording.format import RecordingError
+from multidrop.recording.append_file import AppendFile
+from multidrop.recording.format import RecordingError, writing
 
 EXPORTED_PDU = 252
 APPLICATION = b"multidrop"  # begins the application's name in captures of ours
@@ -29,23 +29,21 @@ _TCP = 2
 class CaptureWriter:
     """A capture that is being written; leaving the `with` block closes it. Raises RecordingError.
 
-    `lines` are those of which packets are appended. Each frame is given to the system at once: after a
-    crash all of them are there.
+    `lines` are those whose packets are appended. Each packet is given to the system at once, so that none
+    is lost in a crash.
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
         self.path = Path(path)
         self._lines: dict[str, int] = {}
-        try:
-            self._file = WholeFile(self.path)
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path) from failure
+        with writing(self.path):
+            self._file = AppendFile(self.path)
         options = [(_SHB_APPLICATION, APPLICATION + b" " + version("multidrop").encode())]
         if comment:
             options.insert(0, (_COMMENT, comment.encode()))
         head = struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)
         try:
-            self._append(_block(_SECTION, head + _options(*options)))
+            self.append(_block(_SECTION, head + _options(*options)))
             for line in lines:
                 self._declare(line)
         except RecordingError:
@@ -53,41 +51,31 @@ class CaptureWriter:
             raise
 
     def write(self, raw: bytes, side: Side, time_ns: int, line: str) -> None:
-        """Append what was on the line at this time (UTC, ns), such as a frame."""
+        """Append bytes that were on the line at this time (UTC, ns), such as a frame."""
         if line not in self._lines:
             self._declare(line)
-        self._append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
+        self.append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
 
     def append(self, packets: bytes) -> None:
-        """Append packets of the lines that were named at the beginning, in their order."""
-        self._append(packets)
+        """Append packets of the `lines`, whose order is that of the interfaces."""
+        with writing(self.path):
+            self._file.append(packets)
 
-    def heed(self, troubles: list[str]) -> None:
-        """A capture has all there is, trouble or not."""
+    def report(self, anomalies: list[str]) -> None:
+        """Do nothing: a capture has all packets anyway."""
 
     def _declare(self, line: str) -> None:
         self._lines[line] = len(self._lines)
         options = _options((_IF_NAME, line.encode()), (_IF_RESOLUTION, _NANOSECONDS))
-        self._append(_block(_INTERFACE, struct.pack("<HHI", EXPORTED_PDU, 0, 0) + options))
-
-    def _append(self, block: bytes) -> None:
-        try:
-            self._file.append(memoryview(block))
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path) from failure
+        self.append(_block(_INTERFACE, struct.pack("<HHI", EXPORTED_PDU, 0, 0) + options))
 
     def close(self) -> None:
         self._file.close()
 
-    def __enter__(self) -> CaptureWriter:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -111,7 +99,7 @@ def _tag(code: int, value: bytes) -> bytes:
 
 
 def _head(dissector: bytes, sender: tuple[bytes, int] | None, target: tuple[bytes, int]) -> bytes:
-    """What stands before a frame: who takes it apart, and who sent it."""
+    """Return the header of a frame: its dissector, sender and receiver."""
     tags = _tag(_DISSECTOR, dissector)
     if sender:
         tags += _tag(_IPV4_SOURCE, sender[0]) + _tag(_IPV4_TARGET, target[0])
@@ -125,7 +113,7 @@ _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
 _INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
-_PACKETS = {  # side: dissector of what is no text, sender, target, what is said of it
+_PACKETS = {  # side: dissector of a frame that is no text, sender, target, options
     Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
     Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
     Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),

@@ -19,6 +19,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     rows = convert(arguments.source, arguments.target)
-    tell_torn(arguments.source, rows, open_reader(arguments.source).torn)
+    tell_torn(arguments.source, rows, open_reader(arguments.source).truncated)
     say(f"{rows} rows in {arguments.target}")
     return 0

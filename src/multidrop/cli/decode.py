@@ -35,9 +35,9 @@ def run(arguments: argparse.Namespace) -> int:
             counts = _record(capture, plant, arguments.out)
         else:
             counts = dict(replay(capture, plant, as_json=arguments.json))
-        if capture.torn:
+        if capture.truncated:
             say(
-                f"multidrop: {capture.path} is cut: its last {capture.torn} bytes are no whole packet, "
+                f"multidrop: {capture.path} is cut: its last {capture.truncated} bytes are no whole packet, "
                 "and were left out",
                 file=sys.stderr,
             )

@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     from multidrop.report import load, plot, plot_page, png
 
     look = load(arguments.recording)
-    tell_torn(look.path, look.rows, look.torn)
+    tell_torn(look.path, look.rows, look.truncated)
     figure, left = plot(look, arguments.drive, arguments.register)
     if out.suffix.lower() == ".png":
         out.write_bytes(png(figure))

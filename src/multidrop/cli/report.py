@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     from multidrop.report import load, report_page
 
     look = load(arguments.recording)
-    tell_torn(look.path, look.rows, look.torn)
+    tell_torn(look.path, look.rows, look.truncated)
     out.write_text(report_page(look), "utf-8")
     say(out)
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from multidrop.cli.support.saying import say
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
-from multidrop.sim import HostileWire, Simulator, Wire, load_faults, serve, simulated
+from multidrop.sim import FaultyWire, Simulator, Wire, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 
 
@@ -42,7 +42,7 @@ def _wire(line: PlantLine, directory: Path, faults: Faults, unpaced: bool) -> Wi
     if link.is_symlink() or link.exists():
         raise ValueError(f"{link} is there already: remove it, or choose another directory with --ports")
     drives = [simulated(polled.drive) for polled in line.drives]
-    return HostileWire(drives, faults, name=line.name, port=str(link), unpaced=unpaced)
+    return FaultyWire(drives, faults, name=line.name, port=str(link), unpaced=unpaced)
 
 
 def _announce(simulator: Simulator) -> None:

@@ -6,9 +6,9 @@
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
 | `.parquet` | Parquet, needs pyarrow            | nothing can be read        |
 
-A crash is the process's: all of a batch whose `write` has returned is with the system, which has it
-on the disk within seconds; only a power cut in between takes it away. A file that was begun and not
-yet given its head is no recording.
+A crash means that of the process: once `write` has returned, the system has the whole batch and puts
+it on the disk within seconds; only a power cut in between loses it. A file without its head, which is
+written first, is no recording.
 
 All three have the same columns, and one row for every sample or miss:
 
@@ -22,18 +22,17 @@ All three have the same columns, and one row for every sample or miss:
 | `value`          | float64, or null   | in the register's unit                                     |
 | `status`         | utf8               | `ok`, or why there is no value: both others are then null  |
 
-In .csv a text that a spreadsheet would take for a formula, because it begins with `=`, `+`, `-`, `@`, a tab
-or the end of a line, has an apostrophe in front; so has one that begins with apostrophes and then one of
-these. The reader here takes one off.
+In .csv a text that a spreadsheet would evaluate as a formula, because it begins with `=`, `+`, `-`, `@`,
+a tab or the end of a line, has an apostrophe in front; so has one that begins with apostrophes and then
+one of these. The reader removes one apostrophe.
 
-The metadata is one JSON object. It lies in the schema's metadata under the key `multidrop` (.arrows,
-.parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file; `planned`,
-for each line's name what it should reach (multidrop.planning.forecast says how); and `drives`: for each
-drive's name its line, model, address, settings and framing, and `registers`, for each register's
-name its unit and step.
+The metadata is one JSON object: under the key `multidrop` of the schema's metadata (.arrows, .parquet) or
+in the file NAME.csv.json. `multidrop poll` writes `plant`, the plant file; `planned`, the prediction for
+each line by name (multidrop.planning.forecast); and `drives`: by name each drive's line, model, address,
+settings and framing, and `registers`, by name each register's unit and step.
 
-pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; a recording whose end is torn they
-refuse until `repair` has cut the torn end off. The reader here needs neither, and leaves it out.
+pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; they refuse a recording with a truncated
+end until `repair` has cut it off. The reader here needs neither library, and leaves such an end out.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix:
 
 
 def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> RecordingWriter:
-    """Begin a recording in a new file; what is in another one is never lost.
+    """Begin a recording in a new file; an existing one is never overwritten.
 
     Raises ValueError for another suffix or when there is a file at `path`, TypeError for metadata that
     JSON cannot hold, and RecordingError when the file cannot be written.
@@ -62,16 +61,16 @@ def open_writer(path: str | os.PathLike[str], metadata: Metadata) -> RecordingWr
 
 
 def open_reader(path: str | os.PathLike[str]) -> RecordingReader:
-    """Open a recording, finished or not. Raises ValueError for what is not one, and OSError."""
+    """Open a recording, finished or not. Raises ValueError for any other file, and OSError."""
     reader: RecordingReader = _format(Path(path)).reader(Path(path))
     return reader
 
 
 def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> int:
-    """Write the recording `source` anew as `target`, with all rows and metadata; the number of rows.
+    """Write all rows and metadata of the recording `source` to `target`; return the number of rows.
 
-    Needs memory for a few batches only. Raises as open_reader and open_writer do, and leaves no target
-    then.
+    Needs memory for a few batches only. Raises as open_reader and open_writer do, and then leaves no
+    target.
     """
     _format(Path(target))
     reader = open_reader(source)
@@ -89,15 +88,15 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> i
 
 
 def repair(path: str | os.PathLike[str]) -> int:
-    """Cut the torn end off a recording that nobody is writing; how many bytes that were."""
-    torn = open_reader(path).torn
-    if torn:
-        os.truncate(path, Path(path).stat().st_size - torn)
-    return torn
+    """Cut the truncated end off a recording that nobody is writing; return the number of bytes."""
+    truncated = open_reader(path).truncated
+    if truncated:
+        os.truncate(path, Path(path).stat().st_size - truncated)
+    return truncated
 
 
 def _format(path: Path) -> Any:
-    """The module that has a `writer` and a `reader`."""
+    """Return the module of the format, which has a `writer` and a `reader`."""
     module = FORMATS.get(path.suffix.lower())
     if not module:
         raise ValueError(f"{path}: a recording's name ends in {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""A file that grows by whole pieces: each in one write, and none by half. It is never another's."""
+"""A new file that grows by whole pieces: each in one write, none by half."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ def already_there(path: Path) -> ValueError:
 
 
 def new_file(path: Path) -> FileIO:
-    """Open a file that is not there yet: what is in another one may be months of data.
+    """Open a file that is not there yet: an existing one may hold months of data.
 
-    A device or a pipe is there, and has none to lose. Raises ValueError and OSError.
+    A device or a pipe exists and has no data to lose. Raises ValueError and OSError.
     """
     mode = "wb" if path.exists() and not path.is_file() else "xb"
     try:
@@ -23,23 +23,24 @@ def new_file(path: Path) -> FileIO:
         raise already_there(path) from None
 
 
-class WholeFile:
+class AppendFile:
     """A new file. Raises ValueError when there is one at this path, and OSError, as do its methods."""
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
         self._length = 0
-        self._is_torn = False  # a piece was begun and not finished
+        self._is_truncated = False  # a piece was begun and not finished
 
-    def append(self, piece: memoryview) -> None:
+    def append(self, piece: bytes | memoryview) -> None:
         """Give the piece to the system at once; when it does not fit, the file stays as it was.
 
-        So too when a signal's handler raises. What cannot be cut off at once is before the next piece.
+        The same holds when a signal handler raises. If the file cannot be cut back at once, that is
+        done before the next piece.
         """
-        if self._is_torn:
+        if self._is_truncated:
             self._cut()
-        self._is_torn = True
-        left = piece
+        self._is_truncated = True
+        left = memoryview(piece)
         try:
             while left:
                 left = left[self._file.write(left) :]
@@ -48,15 +49,15 @@ class WholeFile:
                 self._cut()
             raise
         self._length += len(piece)
-        self._is_torn = False
+        self._is_truncated = False
 
     def _cut(self) -> None:
         self._file.truncate(self._length)
         self._file.seek(self._length)
-        self._is_torn = False
+        self._is_truncated = False
 
     def close(self) -> None:
-        if self._is_torn and not self._file.closed:
+        if self._is_truncated and not self._file.closed:
             with suppress(OSError):
                 self._cut()
         self._file.close()

@@ -1,7 +1,7 @@
-"""Walks the messages of an Arrow IPC stream.
+"""The messages of an Arrow IPC stream.
 
-Nothing that stands in the file is trusted: a damaged file ends in a sentence, not in a crash. The
-numbers of fields below are those of Arrow's format/IpcMessage.fbs and format/Schema.fbs.
+No number in the file is trusted: a damaged file ends in an error, not in a crash. Fields have the
+numbers of Arrow's format/Message.fbs and format/Schema.fbs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SCHEMA, RECORD_BATCH = 1, 3  # IpcMessage.header_type
 
 
 class FlatTable:
-    """A flatbuffer's table; fields are found by their number, and one that is absent is 0 or empty."""
+    """A flatbuffer's table; fields are found by their number, and an absent one is 0 or empty."""
 
     def __init__(self, data: bytes, at: int) -> None:
         self._data = data
@@ -34,11 +34,10 @@ class FlatTable:
 
     def tables(self, field: int) -> list[FlatTable]:
         start, count = self._vector(field, 4)
-        places = range(start, start + 4 * count, 4)
-        return [FlatTable(self._data, at + self._read("<I", at)) for at in places]
+        return [FlatTable(self._data, at + self._read("<I", at)) for at in range(start, start + 4 * count, 4)]
 
     def pairs(self, field: int) -> list[tuple[int, int]]:
-        """A vector of structs of two int64."""
+        """Return a vector of structs of two int64."""
         start, count = self._vector(field, 16)
         return list(struct.iter_unpack("<qq", self._data[start : start + 16 * count]))
 
@@ -70,7 +69,7 @@ class FlatTable:
 
 @dataclass(frozen=True)
 class IpcMessage:
-    """One whole message: its header, and where in the file its body lies and ends."""
+    """One whole message: its header, and the places in the file where its body begins and ends."""
 
     kind: int
     header: FlatTable | None
@@ -79,7 +78,7 @@ class IpcMessage:
 
 
 def messages(file: BinaryIO, size: int) -> Iterator[IpcMessage]:
-    """The whole messages within the first `size` bytes, up to the first that is torn or senseless."""
+    """Yield the messages in the first `size` bytes, up to the first that is truncated or invalid."""
     end = 0
     while message := _message(file, end, size):
         yield message

@@ -15,21 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.polling.batch import Rows, assemble, schema
-from multidrop.recording.append_file import WholeFile
 from multidrop.recording.arrow_ipc import RECORD_BATCH, SCHEMA, FlatTable, IpcMessage, messages
 from multidrop.recording.format import (
+    METADATA_KEY,
+    AppendingWriter,
     Metadata,
     RecordingError,
     RecordingReader,
-    RecordingWriter,
     damaged,
     dump_metadata,
     load_metadata,
     not_a_recording,
 )
-from multidrop.recording.rows import Recorded
-
-KEY = "multidrop"  # of the schema's metadata
+from multidrop.recording.rows import RecordedRows
 
 INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
 COLUMNS = [  # name, type, and the first field of the type: bits, precision (double) or unit (ns)
@@ -44,49 +42,39 @@ COLUMNS = [  # name, type, and the first field of the type: bits, precision (dou
 BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
 
 
-class ArrowsWriter(RecordingWriter):
-    """Writes each batch as one message, in one call of the system."""
+class ArrowsWriter(AppendingWriter):
+    """Write each batch as one message."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
-        super().__init__(path)
         from nanoarrow.c_array_stream import CArrayStream
         from nanoarrow.ipc import StreamWriter
 
-        described = schema().modify(metadata={KEY: dump_metadata(metadata)})
+        described = schema().modify(metadata={METADATA_KEY: dump_metadata(metadata)})
         self._message = BytesIO()
         self._encoder = StreamWriter.from_writable(self._message)
+        super().__init__(path)
         try:
-            self._file = WholeFile(path)
-        except OSError as failure:
-            raise RecordingError.of(failure, path) from failure
-        try:
-            self._append(CArrayStream.from_c_arrays([], described))
+            self._append_message(CArrayStream.from_c_arrays([], described))
         except RecordingError:
             self.discard()
             raise
 
     def write(self, batch: Rows) -> None:
-        self._append(batch.arrow())
+        self._append_message(batch.arrow())
         self.rows += len(batch)
 
-    def _append(self, source: Any) -> None:
+    def _append_message(self, source: Any) -> None:
         self._message.seek(0)
         self._encoder.write_stream(source)
-        try:
-            self._file.append(self._message.getbuffer()[: self._message.tell()])
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path, self.rows) from failure
+        self._append(self._message.getbuffer()[: self._message.tell()])
 
     def close(self) -> None:
         self._encoder.release()
-        try:
-            self._file.close()
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path, self.rows) from failure
+        super().close()
 
 
 class ArrowsReader(RecordingReader):
-    """Reads every whole message; a torn one at the end is left out."""
+    """Read every whole message; a truncated one at the end is left out."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -99,7 +87,7 @@ class ArrowsReader(RecordingReader):
                 self._whole = message.end
         if not self._whole:
             raise not_a_recording(path, "it does not begin like an Arrow stream")
-        self.torn = size - self._whole
+        self.truncated = size - self._whole
 
     def __iter__(self) -> Iterator[Rows]:
         rows = 0
@@ -111,8 +99,8 @@ class ArrowsReader(RecordingReader):
                 body = memoryview(file.read(message.end - message.body))
                 try:
                     batch = _decode(message, message.header, body)
-                except (struct.error, RuntimeError, ValueError) as mistake:
-                    raise damaged(self.path, rows, mistake) from mistake
+                except (struct.error, RuntimeError, ValueError) as error:
+                    raise damaged(self.path, rows, error) from error
                 yield batch
                 rows += len(batch)
 
@@ -122,9 +110,9 @@ class ArrowsReader(RecordingReader):
             if not head or [_column(field) for field in head.tables(1)] != COLUMNS:
                 raise not_a_recording(self.path, "it is an Arrow stream with other columns")
             entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
-        except struct.error as mistake:
-            raise not_a_recording(self.path, "it does not begin like an Arrow stream") from mistake
-        return load_metadata(entries.get(KEY.encode(), b"{}"), self.path)
+        except struct.error as error:
+            raise not_a_recording(self.path, "it does not begin like an Arrow stream") from error
+        return load_metadata(entries.get(METADATA_KEY.encode(), b"{}"), self.path)
 
 
 def _column(field: FlatTable) -> tuple[bytes, int, int]:
@@ -133,7 +121,7 @@ def _column(field: FlatTable) -> tuple[bytes, int, int]:
 
 
 def _check_text(offsets: memoryview, text: memoryview) -> None:
-    """Raises ValueError unless each row's text is UTF-8, on which libraries that take the batch rely."""
+    """Raise ValueError unless each row's text is UTF-8: libraries that take the batch rely on it."""
     if str(text, "utf-8").isascii():
         return
     for at in offsets[: len(offsets) // 4 * 4].cast("i"):
@@ -141,13 +129,13 @@ def _check_text(offsets: memoryview, text: memoryview) -> None:
             raise ValueError("its text is not UTF-8")
 
 
-def _decode(message: IpcMessage, batch: FlatTable, body: memoryview) -> Recorded:
+def _decode(message: IpcMessage, batch: FlatTable, body: memoryview) -> RecordedRows:
     if message.kind != RECORD_BATCH:
         raise ValueError("there is a message that is not a batch of rows")
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
-    if not 0 <= rows <= len(body):  # what it is reckoned with must not wrap around
+    if not 0 <= rows <= len(body):  # sums with it must not wrap around
         raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
     if len(places) != sum(BUFFERS[kind] for _, kind, _ in COLUMNS):
         raise ValueError(f"there is a batch of {len(places)} buffers")
@@ -158,7 +146,7 @@ def _decode(message: IpcMessage, batch: FlatTable, body: memoryview) -> Recorded
         if kind == UTF8:
             _check_text(*data)
         columns.append((valid or None, *data))
-    return Recorded(assemble(rows, *columns))
+    return RecordedRows(assemble(rows, *columns))
 
 
 writer, reader = ArrowsWriter, ArrowsReader

@@ -7,79 +7,59 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
-from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
+from multidrop.iso_time import format_time, parse_time
 from multidrop.polling.batch import Row, Rows
-from multidrop.recording.append_file import WholeFile
 from multidrop.recording.format import (
+    AppendingWriter,
     Metadata,
-    RecordingError,
     RecordingReader,
-    RecordingWriter,
     dump_metadata,
     load_metadata,
     not_a_recording,
+    writing,
 )
 from multidrop.recording.rows import from_rows
 
 HEADER = ",".join(Row._fields) + "\n"
-# A spreadsheet carries out a text that begins like this, but not with an apostrophe in front.
-FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
-SPARED = re.compile(r"'+[=+\-@\t\r\n]")
+FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # a spreadsheet evaluates it unless an apostrophe is in front
+ESCAPED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
 BATCH_ROWS = 1 << 14
-SECOND = 1_000_000_000
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def beside(path: Path) -> Path:
-    """Where the metadata of a .csv lies."""
+def metadata_path(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-class CsvWriter(RecordingWriter):
-    """Writes each batch's lines in one call of the system."""
+class CsvWriter(AppendingWriter):
+    """Write each batch's lines in one call of the system."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
-        super().__init__(path)
         described = dump_metadata(metadata)
+        super().__init__(path)
         try:
-            self._file = WholeFile(path)
-        except OSError as failure:
-            raise RecordingError.of(failure, path) from failure
-        try:
-            _put(beside(path), described + "\n")
-            self._append(HEADER)  # last: what begins with it is a recording, and has its metadata
-        except OSError as failure:
+            with writing(path):
+                _write_whole(metadata_path(path), described + "\n")
+            self._append(HEADER.encode())  # last: a file with a header has its metadata
+        except OSError:
             self.discard()
-            raise RecordingError.of(failure, path) from failure
+            raise
 
     def write(self, batch: Rows) -> None:
-        try:
-            self._append("".join(map(_line, batch)))
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path, self.rows) from failure
+        self._append("".join(map(_line, batch)).encode())
         self.rows += len(batch)
-
-    def _append(self, text: str) -> None:
-        self._file.append(memoryview(text.encode()))
-
-    def close(self) -> None:
-        try:
-            self._file.close()
-        except OSError as failure:
-            raise RecordingError.of(failure, self.path, self.rows) from failure
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return self.path, beside(self.path)
+        return self.path, metadata_path(self.path)
 
 
-def _put(path: Path, text: str) -> None:
+def _write_whole(path: Path, text: str) -> None:
     """Make the file at once: at no time is there half of it."""
     part = path.with_name(path.name + ".part")
     try:
@@ -92,7 +72,7 @@ def _put(path: Path, text: str) -> None:
 
 
 class CsvReader(RecordingReader):
-    """Reads every whole line; without the .csv.json beside it the metadata is empty."""
+    """Read every whole line; without its .csv.json the metadata is empty."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -101,12 +81,12 @@ class CsvReader(RecordingReader):
                 raise not_a_recording(path, f"its first line is not {HEADER.strip()}")
             size = file.seek(0, os.SEEK_END)
             self._whole = _whole_lines(file, size)
-        self.torn = size - self._whole
+        self.truncated = size - self._whole
         try:
-            described = beside(path).read_bytes()
+            described = metadata_path(path).read_bytes()
         except FileNotFoundError:
             described = b"{}"
-        self.metadata = load_metadata(described, beside(path))
+        self.metadata = load_metadata(described, metadata_path(path))
 
     def __iter__(self) -> Iterator[Rows]:
         with self.path.open("rb") as file:
@@ -115,13 +95,13 @@ class CsvReader(RecordingReader):
             try:
                 while some := list(islice(rows, BATCH_ROWS)):
                     yield from_rows(some)
-            except (csv.Error, ValueError, OverflowError) as mistake:
+            except (csv.Error, ValueError, OverflowError) as error:
                 place = f"{self.path}, line {lines.line_num}"
-                raise ValueError(f"{place}: not a row of a recording: one is like {EXAMPLE}") from mistake
+                raise ValueError(f"{place}: not a row of a recording: one is like {EXAMPLE}") from error
 
 
 def _whole_lines(file: BinaryIO, size: int) -> int:
-    """The length of the file up to the end of its last whole line."""
+    """Return the length of the file up to the end of its last whole line."""
     end = size
     while True:
         start = max(0, end - (1 << 16))
@@ -142,13 +122,13 @@ def _parse(cells: list[str]) -> Row:
         raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells
     return Row(
-        _read(time),
+        parse_time(time),
         int(monotonic_ns),
         int(uncertainty_ns) if uncertainty_ns else None,
-        _text(drive),
-        _text(register),
+        _unquote(drive),
+        _unquote(register),
         float(value) if value else None,
-        _text(status),
+        _unquote(status),
     )
 
 
@@ -157,12 +137,12 @@ def _line(row: Row) -> str:
     uncertainty = "" if uncertainty_ns is None else uncertainty_ns
     number = "" if value is None else repr(value)
     names = f"{_quote(drive)},{_quote(register)}"
-    return f"{_spell(time)},{monotonic_ns},{uncertainty},{names},{number},{_quote(status)}\n"
+    return f"{format_time(time)},{monotonic_ns},{uncertainty},{names},{number},{_quote(status)}\n"
 
 
 @lru_cache(maxsize=4096)
 def _quote(text: str) -> str:
-    """As RFC 4180 has it: what holds a comma, a quote or the end of a line stands between quotes.
+    """Put a text with a comma, a quote or the end of a line between quotes (RFC 4180).
 
     A text that could be a formula gets an apostrophe in front, and so does one that has it already.
     """
@@ -172,31 +152,9 @@ def _quote(text: str) -> str:
 
 
 @lru_cache(maxsize=4096)
-def _text(cell: str) -> str:
-    """The text that `_quote` was given."""
-    return cell[1:] if SPARED.match(cell) else cell
-
-
-def _spell(time_ns: int) -> str:
-    second, rest = divmod(time_ns, SECOND)
-    return f"{_spell_second(second)}.{rest:09d}Z"
-
-
-def _read(time: str) -> int:
-    second, dot, rest = time.partition(".")
-    if not dot or len(rest) != 10 or rest[-1] != "Z":
-        raise ValueError(time)
-    return _read_second(second) * SECOND + int(rest[:-1])
-
-
-@lru_cache(maxsize=1024)
-def _spell_second(second: int) -> str:
-    return (EPOCH + timedelta(seconds=second)).replace(tzinfo=None).isoformat()
-
-
-@lru_cache(maxsize=1024)
-def _read_second(text: str) -> int:
-    return (datetime.fromisoformat(text).replace(tzinfo=UTC) - EPOCH) // timedelta(seconds=1)
+def _unquote(cell: str) -> str:
+    """Return the text that `_quote` was given."""
+    return cell[1:] if ESCAPED.match(cell) else cell
 
 
 writer, reader = CsvWriter, CsvReader

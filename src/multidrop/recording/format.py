@@ -1,4 +1,4 @@
-"""What the writer and the reader of every format offer, and how they fail."""
+"""The interface of the writer and the reader of every format, and their failures."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import json
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from multidrop.polling.batch import Rows
+from multidrop.recording.append_file import AppendFile
 
 Metadata = Mapping[str, Any]
+METADATA_KEY = "multidrop"  # of an Arrow schema's metadata
 
 
 class RecordingError(OSError):
@@ -29,9 +30,14 @@ class RecordingError(OSError):
         self.reason = reason
         self.rows = rows
 
-    @classmethod
-    def of(cls, failure: OSError, path: Path, rows: int = 0) -> RecordingError:
-        return cls(path, f"cannot be written: {failure.strerror or failure}", rows)
+
+@contextmanager
+def writing(path: Path, rows: int = 0) -> Iterator[None]:
+    """Raise an OSError of the block as the RecordingError of a file that holds so many rows."""
+    try:
+        yield
+    except OSError as failure:
+        raise RecordingError(path, f"cannot be written: {failure.strerror or failure}", rows) from failure
 
 
 class RecordingWriter(ABC):
@@ -47,79 +53,91 @@ class RecordingWriter(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Nothing can be written any more. Raises RecordingError."""
+        """End the recording. Raises RecordingError."""
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All that the recording lies in."""
+        """All files of the recording."""
         return (self.path,)
 
     def discard(self) -> None:
-        """Close it, and leave nothing of it."""
+        """Close the recording and remove its files."""
         with suppress(OSError):
             self.close()
         for path in filter(Path.is_file, self.files):  # a device is not ours to remove
             with suppress(OSError):
                 path.unlink()
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
+
+
+class AppendingWriter(RecordingWriter):
+    """A recording that grows by one write to the system a batch."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        with writing(path):
+            self._file = AppendFile(path)
+
+    def _append(self, piece: bytes | memoryview) -> None:
+        with writing(self.path, self.rows):
+            self._file.append(piece)
+
+    def close(self) -> None:
+        with writing(self.path, self.rows):
+            self._file.close()
 
 
 class RecordingReader(ABC):
     """A recording as it was when it was opened; may be iterated over more than once.
 
-    `torn` is how many bytes at its end are left out: their writer was killed, or the disk was full,
-    before they were whole.
+    `truncated` is the number of bytes at its end that are left out: the writer was killed, or the disk
+    was full, before their batch was whole.
     """
 
     path: Path
     metadata: Metadata
-    torn: int
+    truncated: int
 
     @abstractmethod
     def __iter__(self) -> Iterator[Rows]:
-        """The rows, some thousands at a time. Raises ValueError where the file is damaged."""
+        """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
 
 
 def dump_metadata(metadata: Metadata) -> str:
-    """The metadata as it stands in a recording."""
+    """Return the metadata as a recording holds it. Raises TypeError for what JSON cannot hold."""
     return json.dumps(metadata, ensure_ascii=False)
 
 
 def load_metadata(text: str | bytes, path: Path) -> Metadata:
-    """Metadata out of a recording; ValueError when it is not what `dump` makes."""
+    """Return the metadata of a recording. Raises ValueError unless it is a JSON object."""
     try:
         metadata = json.loads(text)
-    except ValueError as mistake:
-        raise not_a_recording(path, f"its metadata is not JSON: {mistake}") from mistake
-    except RecursionError as mistake:
-        raise not_a_recording(path, "its metadata is nested too deeply") from mistake
+    except ValueError as error:
+        raise not_a_recording(path, f"its metadata is not JSON: {error}") from error
+    except RecursionError as error:
+        raise not_a_recording(path, "its metadata is nested too deeply") from error
     if not isinstance(metadata, dict):
         raise not_a_recording(path, "its metadata is not a JSON object")
     return metadata
 
 
-_IN_OUR_WORDS = {  # a library's are about its own insides
+_REASONS = {  # a library's own sentence is about its internals
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "its lengths do not fit together",
     RuntimeError: "its lengths do not fit together",  # nanoarrow's
 }
 
 
-def damaged(path: Path, rows: int, mistake: Exception) -> ValueError:
-    """What says that so many rows can be read, and why no more."""
-    why = next((words for kind, words in _IN_OUR_WORDS.items() if isinstance(mistake, kind)), mistake)
-    return ValueError(f"{path} is damaged after row {rows}: {why}")
+def damaged(path: Path, rows: int, error: Exception) -> ValueError:
+    """Return the error that says how many rows can be read, and why no more."""
+    reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
+    return ValueError(f"{path} is damaged after row {rows}: {reason}")
 
 
-def not_a_recording(path: Path, why: str) -> ValueError:
-    return ValueError(f"{path} is not a recording: {why}")
+def not_a_recording(path: Path, reason: str) -> ValueError:
+    return ValueError(f"{path} is not a recording: {reason}")

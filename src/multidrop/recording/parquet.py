@@ -1,7 +1,7 @@
 """Recordings as Parquet (.parquet), the smallest for keeping; needs pyarrow.
 
-A Parquet file is readable only once it is closed: after a crash nothing of it is. Record into
-.arrows, and convert.
+A Parquet file can be read only once it is closed, and not at all after a crash: record into .arrows,
+and convert.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from multidrop.polling.batch import Rows, schema
 from multidrop.recording.append_file import new_file
 from multidrop.recording.format import (
+    METADATA_KEY,
     Metadata,
     RecordingError,
     RecordingReader,
@@ -23,11 +24,11 @@ from multidrop.recording.format import (
     dump_metadata,
     load_metadata,
     not_a_recording,
+    writing,
 )
-from multidrop.recording.rows import Recorded
+from multidrop.recording.rows import RecordedRows
 
-KEY = b"multidrop"  # of the schema's metadata
-GROUP_ROWS = 1 << 17  # rows wait in memory until there are so many
+GROUP_ROWS = 1 << 17  # that wait in memory
 UNREADABLE = "nothing of it can be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
@@ -46,17 +47,15 @@ def _pyarrow(path: Path) -> Any:
 
 
 class ParquetWriter(RecordingWriter):
-    """Gathers rows, and writes them in large groups."""
+    """Gather rows, and write them in large groups."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
         self._arrow = _pyarrow(path)
-        described = self._arrow.schema(schema()).with_metadata({KEY: dump_metadata(metadata)})
+        described = self._arrow.schema(schema()).with_metadata({METADATA_KEY: dump_metadata(metadata)})
         self._waiting: list[Any] = []
-        try:
+        with writing(path):
             self._file = BufferedWriter(new_file(path))
-        except OSError as failure:
-            raise RecordingError.of(failure, path) from failure
         self._encoder = self._arrow.parquet.ParquetWriter(self._file, described, **ENCODING)
 
     def write(self, batch: Rows) -> None:
@@ -92,9 +91,9 @@ class ParquetWriter(RecordingWriter):
 
 
 class ParquetReader(RecordingReader):
-    """Reads one group of rows at a time."""
+    """Read one group of rows at a time."""
 
-    torn = 0
+    truncated = 0
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -104,7 +103,7 @@ class ParquetReader(RecordingReader):
         wanted = self._arrow.schema(schema())
         if (found.names, found.types) != (wanted.names, wanted.types):
             raise not_a_recording(path, "it is a Parquet file with other columns")
-        self.metadata = load_metadata((found.metadata or {}).get(KEY, b"{}"), path)
+        self.metadata = load_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"), path)
 
     def __iter__(self) -> Iterator[Rows]:
         from nanoarrow import c_array
@@ -113,7 +112,7 @@ class ParquetReader(RecordingReader):
         with self._open() as file:
             for group in range(file.num_row_groups):
                 for batch in self._read_group(file, group, rows):
-                    yield Recorded(c_array(batch))
+                    yield RecordedRows(c_array(batch))
                     rows += len(batch)
 
     @contextmanager
@@ -130,8 +129,8 @@ class ParquetReader(RecordingReader):
             table = file.read_row_group(group).combine_chunks()
             table.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
-            why = ValueError("what follows cannot be unpacked")
-            raise damaged(self.path, rows, why) from failure
+            reason = ValueError("what follows cannot be unpacked")
+            raise damaged(self.path, rows, reason) from failure
         return table.replace_schema_metadata().to_batches()
 
 

@@ -1,4 +1,4 @@
-"""Rows that come out of a recording, in Arrow's layout."""
+"""Rows read from a recording, in Arrow's layout."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from multidrop.polling.batch import Row, Rows, assemble
 
 
-class Recorded(Rows):
+class RecordedRows(Rows):
     """Rows held by a nanoarrow array of the schema."""
 
     def __init__(self, rows: Any) -> None:
@@ -31,7 +31,7 @@ class Recorded(Rows):
 
 
 def _values(column: Any) -> Iterable[Any]:
-    """Each row's value of a column, None where it has none."""
+    """Return each row's value of a column, None where it has none."""
     if column.n_buffers == 3:
         return _texts(column)
     numbers = memoryview(column.buffer(1))[: column.length]
@@ -46,29 +46,33 @@ def _texts(column: Any) -> Iterator[str]:
     return (text[ends[at] : ends[at + 1]].decode(errors="replace") for at in range(column.length))
 
 
-def from_rows(rows: Sequence[Row]) -> Recorded:
-    """The same rows in Arrow's layout."""
+def from_rows(rows: Sequence[Row]) -> RecordedRows:
+    """Return the same rows in Arrow's layout."""
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = zip(*rows, strict=True)
-    return Recorded(
+    return RecordedRows(
         assemble(
             len(rows),
             (None, array("q", time)),
             (None, array("q", monotonic_ns)),
-            (_bitmap(uncertainty_ns), array("q", [0 if it is None else it for it in uncertainty_ns])),
-            (None, *_spelt(drive)),
-            (None, *_spelt(register)),
-            (_bitmap(value), array("d", [0 if it is None else it for it in value])),
-            (None, *_spelt(status)),
+            (_bitmap(uncertainty_ns), array("q", _filled(uncertainty_ns))),
+            (None, *_encoded(drive)),
+            (None, *_encoded(register)),
+            (_bitmap(value), array("d", _filled(value))),
+            (None, *_encoded(status)),
         )
     )
 
 
+def _filled(values: Sequence[Any]) -> list[Any]:
+    return [0 if value is None else value for value in values]
+
+
 def _bitmap(values: Sequence[object]) -> bytes:
-    """One bit a value, least significant first: is it there?"""
+    """Return a bit for each value, least significant first: 1 where there is one."""
     bits = "".join("0" if value is None else "1" for value in reversed(values))
     return int(bits, 2).to_bytes((len(values) + 7) // 8, "little")
 
 
-def _spelt(texts: Sequence[str]) -> tuple[array[int], bytes]:
+def _encoded(texts: Sequence[str]) -> tuple[array[int], bytes]:
     encoded = [text.encode() for text in texts]
     return array("i", [0, *accumulate(map(len, encoded))]), b"".join(encoded)

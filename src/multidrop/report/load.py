@@ -123,7 +123,7 @@ class Selection:
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
-    torn: int  # bytes at the recording's end that were left out
+    truncated: int  # bytes at the recording's end that were left out
 
     @property
     def rows(self) -> int:
@@ -204,7 +204,7 @@ def load(path: str | Path) -> Selection:
                 meaning,
             )
         )
-    return Selection(Path(path), metadata, tuple(series), reader.torn)
+    return Selection(Path(path), metadata, tuple(series), reader.truncated)
 
 
 def _described(drives: object) -> dict[str, Any]:

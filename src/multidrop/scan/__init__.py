@@ -1,9 +1,9 @@
-"""Finding the drives on a line whose settings nobody knows, by reading and nothing else."""
+"""Find the drives on a line whose settings nobody knows, by reading only."""
 
 from multidrop.scan.plant_writer import plant_text
 from multidrop.scan.results import Crowd, Finding, Found, Noise, Progress, Untried
 from multidrop.scan.scanner import scan
-from multidrop.scan.sweep import ADDRESSES, Question, Sweep, one_of_each_framing, sweeps
+from multidrop.scan.sweep import ADDRESSES, ScanRequest, Sweep, one_of_each_framing, sweeps
 
 __all__ = [
     "ADDRESSES",
@@ -12,7 +12,7 @@ __all__ = [
     "Found",
     "Noise",
     "Progress",
-    "Question",
+    "ScanRequest",
     "Sweep",
     "Untried",
     "one_of_each_framing",

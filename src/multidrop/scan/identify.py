@@ -1,42 +1,42 @@
-"""Which family an answering drive is of: its readings are asked for what each family's document says.
+"""Identify the family of a drive that answers: read what each family's document says it must have.
 
-Only reads are sent. Families without a look of their own are the likelier the more of the documented
-readings are there.
+Only reads are sent. A family without an `identify` script must answer its first readings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop.core import Framing, Message, raw_value
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Read, Script
+from multidrop.drive.script import Read, Script, Step, carry_out
 from multidrop.drive.timing import Settings
 from multidrop.errors import BusError, Refused
 from multidrop.planning.blocks import blocks
 from multidrop.scan.results import GUESS
 from multidrop.scan.sweep import Sweep
 
-Ask = Callable[[Drive, Message], Message]  # raises BusError where nothing good comes
+R = TypeVar("R")
+Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError without a good reply
 
-MOST_READINGS = 3  # that are looked at where a family has no look of its own
+MOST_READINGS = 3  # that a family without an `identify` script must answer
 
 
-def recognise(
+def identify(
     sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask
 ) -> tuple[list[Drive], str]:
-    """Drives of the families that fit best, and what is to be doubted.
+    """Return drives of the families that fit best, and the doubt that is left.
 
-    There are several where they fit alike, and none where none fits.
+    There are several where they fit equally well, and none where none fits.
     """
     found = [candidate(family, sweep.settings, sweep.framing, address) for family in families]
     drives = [drive for drive in found if drive is not None]
     scores: list[tuple[int, Drive]] = []
     for drive in drives:
-        with suppress(BusError, ValueError):  # what it must have is not there
+        with suppress(BusError, ValueError):  # a register that it must have is missing
             scores.append((_score(drive, ask), drive))
     if scores:
         best = max(score for score, _ in scores)
@@ -46,10 +46,10 @@ def recognise(
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
-    """A drive of the family that would answer so; None where its document does not allow it.
+    """Return a drive of the family with these settings; None where its document does not allow them.
 
-    A drive with two stop bits, or with a parity that a pseudo-terminal does not show, answers in the
-    format of the sweep too: then it has the family's usual one.
+    A drive with two stop bits, or on a pseudo-terminal with another parity, answers in the sweep's
+    format too: it is given the family's usual one.
     """
     if framing not in family.framings or address not in family.addresses:
         return None
@@ -60,10 +60,10 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """How much speaks for the family; raises where something speaks against it."""
+    """Return the number of checks that speak for the family. Raises where one speaks against it."""
     score = 0
     if type(drive).identify is not Drive.identify:
-        _perform(drive, drive.identify.script(), ask)
+        _run(drive, drive.identify.script(), ask)
         score += 1
     else:
         for register in drive.readings()[:MOST_READINGS]:
@@ -82,25 +82,19 @@ def _score(drive: Drive, ask: Ask) -> int:
 
 def _resembles(drive: Drive, ask: Ask) -> bool:
     with suppress(BusError, ValueError):
-        return bool(_perform(drive, drive.resembles(), ask))
+        return bool(_run(drive, drive.resembles(), ask))
     return False
 
 
-def _perform(drive: Drive, script: Script[Any], ask: Ask) -> Any:
-    """Carry a look out, which only reads; what it says."""
-    try:
-        step = next(script)
-        while True:
-            if not isinstance(step, Read):
-                raise Refused(f"the look at {drive.title} does more than read")
-            try:
-                value = _read(drive, step.register, ask)
-            except BusError as failure:
-                step = script.throw(failure)
-            else:
-                step = script.send(value)
-    except StopIteration as end:
-        return end.value
+def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
+    """Carry a script out that only reads; return its result. Raises Refused for any other step."""
+
+    def do(step: Step) -> Any:
+        if not isinstance(step, Read):
+            raise Refused(f"the look at {drive.title} does more than read")
+        return _read(drive, step.register, ask)
+
+    return carry_out(script, do)
 
 
 def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:

@@ -1,24 +1,23 @@
-"""A closer look at one address from which something came."""
+"""Probe one address from which bytes came."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Protocol
 
-from multidrop.bus import LEAST_TIMEOUT
-from multidrop.core import STATUSES, Completion, Failure, Message, Peer
+from multidrop.core import Completion, Message, Peer
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, DriveRefused, NoReply
-from multidrop.scan.identify import recognise
+from multidrop.scan.identify import identify
 from multidrop.scan.results import Found
 from multidrop.scan.sweep import Sweep
+from multidrop.transport.exchange import LEAST_TIMEOUT, Exchanges
 
 MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
 TRIES = 3
 
 
 class Scan(Protocol):
-    """What it needs of the scan."""
+    """The part of a scan that a probe needs."""
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion: ...
 
@@ -26,7 +25,7 @@ class Scan(Protocol):
 
 
 class Probe:
-    """A closer look at an address from which something came: does it answer, how, and is it alone?"""
+    """Find out whether a drive answers at an address, which one, and whether it is alone."""
 
     def __init__(self, scan: Scan, sweep: Sweep, address: int) -> None:
         self._scan = scan
@@ -35,9 +34,9 @@ class Probe:
         self._peer = scan.peer(LEAST_TIMEOUT, MOST_TIMEOUT)
         self.answers = self.damaged = self.followed = 0
         self.excess = 0.0
-        self._answered = False  # the last time
+        self._answered = False  # the last request
         for _ in range(TRIES):
-            self._ask(sweep.question.to(address))
+            self._ask(sweep.request.to(address))
         self.response_delay = self._peer.response_delay
 
     def _ask(self, request: Message) -> Completion:
@@ -49,13 +48,14 @@ class Probe:
         return completion
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
-        """What is there, as far as it can be told by reading."""
-        # What it does not answer is known soon: how long it takes to answer has been seen.
+        """Identify the drive, as far as reading can."""
+        # Its response delay is known by now: a short time-out shows what it does not answer.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         self._peer = self._scan.peer(min(LEAST_TIMEOUT, known), known)
         self._answered = False
-        drives, guess = recognise(self._sweep, self._address, families, self._reply)
-        self.excess = self.response_delay - max((it.response_delay for it in drives), default=LEAST_TIMEOUT)
+        drives, guess = identify(self._sweep, self._address, families, self._reply)
+        documented = max((drive.response_delay for drive in drives), default=LEAST_TIMEOUT)
+        self.excess = self.response_delay - documented
         return Found(
             self._address,
             drives[0].settings if drives else self._sweep.settings,
@@ -70,14 +70,7 @@ class Probe:
             completion = self._ask(request)
             if completion.result > 0:
                 break
-        if completion.result == Failure.NO_REPLY:
-            raise NoReply(drive.name)
-        if completion.result <= 0:
-            raise BadReply(drive.name, STATUSES[-completion.result], completion.raw)
-        code = completion.reply.exception
-        if code:
-            raise DriveRefused(drive.name, code, drive.exception(code))
-        return completion.reply
+        return Exchanges.reply(drive, completion)
 
     def _doubt(self) -> str:
         if self.damaged:

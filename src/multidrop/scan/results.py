@@ -1,4 +1,4 @@
-"""What a scan tells: drives, addresses and settings where something is amiss, and how far it is."""
+"""Findings of a scan: drives, addresses and settings with problems, and its progress."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ GUESS = "it only reads like one: look at its name plate"
 
 @dataclass(frozen=True)
 class Found:
-    """A drive that answers: `models` fit alike, and there is none where no family fits.
+    """A drive that answers: `models` fit equally well, and there is none where no family fits.
 
-    The settings are those of the first of these families that were heard: a drive with another
-    number of stop bits answers too.
+    The settings are the first of these families' at which it answered: a drive with another number of
+    stop bits answers too.
     """
 
     address: int
@@ -28,7 +28,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Crowd:
-    """An address from which garbage came again and again, where others bring a reply or nothing."""
+    """An address that answers with garbage every time: several drives seem to have it."""
 
     address: int
     settings: Settings
@@ -37,7 +37,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class Noise:
-    """A setting at which so many addresses bring garbage that it says nothing of drives."""
+    """A setting at which so many addresses bring garbage that none of it can be a drive's."""
 
     settings: Settings
     framing: Framing
@@ -47,7 +47,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Untried:
-    """A setting at which nothing was asked: the port did not take it."""
+    """A setting that the port did not take: nothing was sent."""
 
     settings: Settings
     framing: Framing
@@ -56,7 +56,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address was asked; `left` is in s, where nobody answers any more."""
+    """One more address is done; `left` is the time in s until the end if nothing else answers."""
 
     settings: Settings
     framing: Framing

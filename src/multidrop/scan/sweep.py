@@ -1,6 +1,6 @@
-"""What a scan asks, where, and in which order: worked out before anything is sent. Pure.
+"""Plan a scan: its requests and their order, before anything is sent. Pure.
 
-A sweep asks one question of many addresses at one setting.
+A sweep sends one request to many addresses at one setting.
 """
 
 from __future__ import annotations
@@ -10,24 +10,24 @@ from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.timing import Settings
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
+from multidrop.transport.exchange import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
 ADDRESSES = range(1, 32)  # asked unless the caller says otherwise
 _ILLEGAL_ADDRESS = 2  # the exception code
-# A reply of 0 is a copy of its request there, as an echo is; an address is never 0.
+# A reply with the value 0 looks like an echo of its request there; an address is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
 @dataclass(frozen=True)
-class Question:
+class ScanRequest:
     """A read, without the address that it goes to."""
 
     function: int
@@ -41,25 +41,25 @@ class Question:
 
 @dataclass(frozen=True)
 class Sweep:
-    """One question to many addresses; `patience` s are waited for a reply's beginning."""
+    """One request to many addresses, each with `patience` s for the beginning of its reply."""
 
     settings: Settings
     framing: Framing
-    families: tuple[type[Drive], ...]  # whose documents make the question harmless, and answered
-    question: Question
+    families: tuple[type[Drive], ...]  # whose documents say that they answer
+    request: ScanRequest
     addresses: tuple[int, ...]
     silence: float
     patience: float
 
     @property
     def each(self) -> float:
-        """Seconds for an address where nobody answers: silence, request, time-out."""
-        request = len(build_request(self.framing, self.question.to(1)))
+        """Seconds for a silent address: silence, request, time-out."""
+        request = len(build_request(self.framing, self.request.to(1)))
         return self.silence + request * self.settings.character + self.patience
 
     @property
     def needed(self) -> float:
-        """Seconds where nobody answers at all."""
+        """Seconds if nothing answers."""
         return len(self.addresses) * self.each
 
 
@@ -70,35 +70,35 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """All that these families' documents make possible, most likelihood in the least time first.
+    """Return the sweeps of all settings in these families' documents, most likely in least time first.
 
-    Every setting is swept with the patience that usual response delays need, and then again with all
-    that the documents allow. Baud rates and formats: those given, or all that the documents have.
-    Raises ValueError for one that they do not have, and where nothing is left to be asked.
+    Every setting is swept with the patience that usual response delays need, and then again with the
+    longest that the documents allow. Without baud rates and formats, all of the documents are used.
+    Raises ValueError for one that no document has, and where no sweep is left.
     """
     settings = _settings(families)
-    _check("baud rate", baudrates, {it.baudrate for it, _ in settings})
-    _check("format", formats, {it.format for it, _ in settings})
+    _check("baud rate", baudrates, {setting.baudrate for setting, _ in settings})
+    _check("format", formats, {setting.format for setting, _ in settings})
     found = [
         likely
         for setting, weights in settings.items()
         if (not baudrates or setting[0].baudrate in baudrates)
         and (not formats or setting[0].format in formats)
-        for likely in _questions(setting, weights, addresses)
+        for likely in _sweeps(setting, weights, addresses)
     ]
     if not found:
         raise ValueError("no family has such an address together with this baud rate and format")
-    found.sort(key=lambda it: -it[0] / it[1].needed)
+    found.sort(key=lambda weighted: -weighted[0] / weighted[1].needed)
     brisk = [sweep for _, sweep in found]
-    return brisk + [replace(it, patience=max(_patience(it), it.patience)) for it in brisk]
+    return brisk + [_patient(sweep) for sweep in brisk]
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """For a port whose format is its own: what would be the same bytes again is left out."""
-    brisk: dict[tuple[Framing, Question], Sweep] = {}
-    patient: dict[tuple[Framing, Question], Sweep] = {}
+    """Leave out sweeps of the same bytes: a port with a fixed format sends them the same way again."""
+    brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
+    patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:
-        key = sweep.framing, sweep.question
+        key = sweep.framing, sweep.request
         brisk.setdefault(key, sweep)
         if key not in patient or sweep.patience > patient[key].patience:
             patient[key] = sweep
@@ -112,12 +112,13 @@ def _check(what: str, given: Collection[Any], known: set[Any]) -> None:
             raise ValueError(f"{what} {one} is none that these families have: {choices}")
 
 
-def _patience(sweep: Sweep) -> float:
-    return max(family.response_timeout for family in sweep.families)
+def _patient(sweep: Sweep) -> Sweep:
+    timeouts = (family.response_timeout for family in sweep.families)
+    return replace(sweep, patience=max(sweep.patience, *timeouts))
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Who may be there at each setting, and how likely: documents name the usual one first."""
+    """Return each setting's families and their likelihood: documents name the usual setting first."""
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:
@@ -128,10 +129,10 @@ def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive]
     return found
 
 
-def _questions(
+def _sweeps(
     setting: Setting, weights: dict[type[Drive], float], addresses: Sequence[int]
 ) -> Iterator[tuple[float, Sweep]]:
-    """As few questions as reach every family at this setting, each with its likelihood."""
+    """Yield as few sweeps as reach every family at this setting, each with its likelihood."""
     left = dict(weights)
     while left:
         register = _best(left)
@@ -139,22 +140,22 @@ def _questions(
             return
         reached = tuple(family for family in left if _answers(family, register))
         weight = sum(left.pop(family) for family in reached)
-        asked = tuple(it for it in addresses if any(it in family.addresses for family in reached))
+        asked = tuple(one for one in addresses if any(one in family.addresses for family in reached))
         if asked:
             yield weight, _sweep(setting, reached, register, asked)
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """What most of them answer, and most of these with a value that they have."""
-    registers = (it for family in families for it in family.registers.values() if it.readable)
+    """Return the register that most families answer to, and most of these with a value of their own."""
+    registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,
-        key=lambda it: (
-            sum(_answers(family, it) for family in families),
-            sum(_has(family, it) for family in families),
-            it.table.carrier not in _ECHOED or it.name == "address_setting",
-            it.access is Access.READING,
-            -it.address,
+        key=lambda one: (
+            sum(_answers(family, one) for family in families),
+            sum(_has(family, one) for family in families),
+            one.table.carrier not in _ECHOED or one.name == "address_setting",
+            one.access is Access.READING,
+            -one.address,
         ),
         default=None,
     )
@@ -164,7 +165,7 @@ _known: WeakKeyDictionary[type[Drive], Mapping[Table, Collection[int]]] = WeakKe
 
 
 def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
-    """The addresses that can be read of each table, found once for each family."""
+    """Return the readable addresses of each table, found once for each family."""
     if family not in _known:
         found: dict[Table, set[int]] = {}
         for register in family.registers.values():
@@ -179,7 +180,7 @@ def _has(family: type[Drive], register: Register[Any]) -> bool:
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
-    """It has this register, or its own document has an exception for a register that it lacks."""
+    """Tell whether the family has this register, or a documented exception for one that it lacks."""
     if _has(family, register):
         return True
     reads = register.table in _addresses(family)
@@ -200,7 +201,7 @@ def _sweep(
         settings,
         framing,
         families,
-        Question(request.function, request.start, request.count, request.data),
+        ScanRequest(request.function, request.start, request.count, request.data),
         addresses,
         silence=max(map(silence, drives)),
         patience=LEAST_TIMEOUT + 2 * max(drive.response_delay for drive in drives),

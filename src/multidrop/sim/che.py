@@ -5,7 +5,7 @@ from __future__ import annotations
 from multidrop.core import Message
 from multidrop.drive.register import HOLDING
 from multidrop.sim.memory import MemoryCell
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason, Refusal
 
 CONTROL, SETPOINT = 0x1000, 0x2000
@@ -19,7 +19,7 @@ def _signed(raw: int) -> int:
     return raw - 0x10000 if raw & 0x8000 else raw
 
 
-class SimulatedCHE(PoweredDrive):
+class SimulatedCHE(MotorDrive):
     """The setpoint is a percentage of P0.04, which is the drive's option `maximum_frequency`.
 
     `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or the

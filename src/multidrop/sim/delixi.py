@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop.core import Message
 from multidrop.sim.memory import MemoryCell
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import COMMAND, QUERY, SET, STATE, STORE, Reason, Refusal
 
 MOST_GAP = 10e-3  # s between two bytes; of part 3, for want of another
@@ -19,7 +19,7 @@ BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
 RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 
 
-class SimulatedDelixi(PoweredDrive):
+class SimulatedDelixi(MotorDrive):
     """Standard Modbus: the document has no exceptions, so what cannot be done is not answered.
 
     Not in the document: a run command is confirmed and has no effect in a fault and where P00.00 is not 2,
@@ -57,7 +57,7 @@ class SimulatedDelixi(PoweredDrive):
     }
 
 
-class SimulatedDelixiNative(PoweredDrive):
+class SimulatedDelixiNative(MotorDrive):
     """Delixi's own protocol: a set is answered with its copy, a query with what was asked for.
 
     While `locked` is set, no parameter may be written: FEH. A run command cannot be executed (F0H) in a

@@ -15,7 +15,7 @@ from multidrop.core import Framing, Message, raw_value
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Kept
 from multidrop.sim.memory import Memory, MemoryCell, decode, pack
-from multidrop.sim.protocol import DIALECTS, Reason, Refusal
+from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
@@ -34,7 +34,7 @@ class Written(NamedTuple):
 
 
 @dataclass
-class Counters:
+class DriveCounters:
     """What a drive has seen since it was made."""
 
     requests: int = 0  # addressed to it alone
@@ -71,10 +71,10 @@ class SimulatedDrive:
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
-        self.dialect = DIALECTS[drive.framing]
+        self.protocol = PROTOCOLS[drive.framing]
         self.response_delay = drive.response_delay if response_delay is None else response_delay
         self.memory = Memory(type(drive), drive.framing)
-        self.counters = Counters()
+        self.counters = DriveCounters()
         self.now = 0.0  # of the last request
         self.deaf_until = 0.0  # it hears nothing before; inf: a dead drive
         self.most = _most_cells(drive)
@@ -158,18 +158,18 @@ class SimulatedDrive:
         return None  # of a length that its function does not have
 
     def _knows(self, function: int) -> bool:
-        return function in (self.dialect.answers if self.functions is None else self.functions)
+        return function in (self.protocol.answers if self.functions is None else self.functions)
 
     def _answer_damaged(self, frame: Frame) -> Message | None:
         """The few that have a code for a wrong checksum answer what looks like a request of theirs."""
         code = self._code(Reason.DAMAGED)
-        whole = len(frame.body) == self.dialect.octets and self._knows(frame.function)
+        whole = len(frame.body) == self.protocol.octets and self._knows(frame.function)
         if code is None or not whole or not frame.address:
             return None
         return self.refused(Message(frame.address, frame.function), code)
 
     def _code(self, reason: Reason) -> int | None:
-        return (self.dialect.codes if self.codes is None else self.codes).get(reason)
+        return (self.protocol.codes if self.codes is None else self.codes).get(reason)
 
     def answer(self, request: Message, now: float) -> Message | None:
         """Carry out a request; its reply, or None where the drive keeps silent."""
@@ -206,12 +206,12 @@ class SimulatedDrive:
             self.counters.refusals += 1
 
     def refused(self, request: Message, code: int) -> Message:
-        return Message(request.address, request.function, data=self.dialect.nothing, exception=code)
+        return Message(request.address, request.function, data=self.protocol.nothing, exception=code)
 
     def _carry_out(self, request: Message) -> Message:
         if not self._knows(request.function):
             raise Refusal(Reason.FUNCTION)
-        return self.dialect.answers[request.function](self, request)
+        return self.protocol.answers[request.function](self, request)
 
     # ---- the dialect's side ----
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from multidrop.core import Message
 from multidrop.drive.register import COIL
 from multidrop.sim.motor import Phase
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason
 
 COILS = range(13)  # 3 to 8 and 10 to 12 are reserved; a library keeps away from them, the drive does not
@@ -15,7 +15,7 @@ OVERLOADED = 1 << 5  # in the state
 _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
 
 
-class SimulatedERMAN(PoweredDrive):
+class SimulatedERMAN(MotorDrive):
     """Coils keep what is written; START acts when it is written while neither stop is on.
 
     The manual does not say whether a coil is a level or a pulse. Here clearing START stops as

@@ -1,4 +1,4 @@
-"""HostileWire: a wire between whose client and drives every byte is at the mercy of faults.
+"""FaultyWire: a wire between whose client and drives every byte is at the mercy of faults.
 
 Bytes and times come in, bytes and times come out; chance comes from one seed.
 """
@@ -13,9 +13,9 @@ from pathlib import Path
 
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.faults import Faults
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.receiver import Frame
-from multidrop.sim.wire import Ears, Transmission, Wire
+from multidrop.sim.wire import ReceiverGroup, Transmission, Wire
 
 DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "drop": lambda frame, at, bit: frame[:at] + frame[at + 1 :],
@@ -24,7 +24,7 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
 }
 
 
-class HostileWire(Wire):
+class FaultyWire(Wire):
     """A wire with `faults`, which may be changed at any time; `struck` counts what they did.
 
     To hang up, its port must be a link or a TCP port: a bare pty cannot come back under its name.
@@ -78,7 +78,7 @@ class HostileWire(Wire):
             self._beside.append(Transmission(chunk, now, character))
         super().receive(self._damaged(chunk), now, baudrate)
 
-    def _deliver(self, ears: Ears, frames: Sequence[Frame]) -> None:
+    def _deliver(self, ears: ReceiverGroup, frames: Sequence[Frame]) -> None:
         if not frames:
             return
         before = self._running()
@@ -87,7 +87,7 @@ class HostileWire(Wire):
             self._make_noise(frames[-1].end, ears.receiver.character)
 
     def _running(self) -> set[SimulatedDrive]:
-        return {it for it in self.drives if isinstance(it, PoweredDrive) and it.motor.energised}
+        return {it for it in self.drives if isinstance(it, MotorDrive) and it.motor.energised}
 
     def _make_noise(self, begin: float, character: float) -> None:
         """On both ends of the line."""

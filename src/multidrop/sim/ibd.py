@@ -5,7 +5,7 @@ from __future__ import annotations
 from multidrop.core import Framing
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 
 CONTROL, SETPOINT = 0x2000, 0x2001
 STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .02
@@ -19,7 +19,7 @@ BAUDRATES = (4800, 9600, 19200, 38400)
 FORMATS = ("8N1", "8E1", "8O1")
 
 
-class SimulatedIBD(PoweredDrive):
+class SimulatedIBD(MotorDrive):
     """Set up for RS-485 (Prb.01 = 5, Prb.02 = 2), its outputs programmed as the manual's example.
 
     The manual has no exceptions: what cannot be done is not answered. A value above the largest

@@ -1,4 +1,4 @@
-"""PoweredDrive: a simulated drive with a motor behind its registers.
+"""MotorDrive: a simulated drive with a motor behind its registers.
 
 Settings of common names set the motor up, monitors of common names show what it does. What a
 family has of its own stands in two tables: `obeys`, what a write commands, and `shows`, what a
@@ -20,7 +20,7 @@ from multidrop.sim.protocol import Reason, Refusal
 _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
-class PoweredDrive(SimulatedDrive):
+class MotorDrive(SimulatedDrive):
     """A drive with a motor. A monitor that is set from outside stays at that value."""
 
     obeys: ClassVar[Mapping[tuple[int, int], Callable[[Any, int], None]]] = {}

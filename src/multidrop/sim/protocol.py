@@ -42,7 +42,7 @@ class Refusal(Exception):
 
 
 @dataclass(frozen=True)
-class Dialect:
+class DriveProtocol:
     """A protocol's function codes, and its usual codes of refusal; without a code it keeps silent."""
 
     answers: Mapping[int, Callable[[SimulatedDrive, Message], Message]]
@@ -119,7 +119,7 @@ def _query(sim: SimulatedDrive, request: Message) -> Message:
     return Message(request.address, QUERY, request.start, data=raw.to_bytes(4))
 
 
-MODBUS = Dialect(
+MODBUS = DriveProtocol(
     {
         0x01: _read_bits,
         0x02: _read_bits,
@@ -143,7 +143,7 @@ MODBUS = Dialect(
     },
     octets=6,
 )
-DELIXI = Dialect(
+DELIXI = DriveProtocol(
     {
         COMMAND: _command,
         STATE: _state,
@@ -164,4 +164,4 @@ DELIXI = Dialect(
     octets=8,
     nothing=NOTHING,
 )
-DIALECTS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.DELIXI: DELIXI}
+PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.DELIXI: DELIXI}

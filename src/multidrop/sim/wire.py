@@ -51,7 +51,7 @@ class Transmission:
         return taken
 
 
-class Ears:
+class ReceiverGroup:
     """Drives that hear alike: of one framing and baud rate, with one idea of a frame's end."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
@@ -92,8 +92,8 @@ class Wire:
         self._quiet_since = -math.inf  # the end of the last reply
         self._baudrate: int | None = None
 
-    def _group(self) -> list[Ears]:
-        groups: dict[tuple[Framing, Settings, float], Ears] = {}
+    def _group(self) -> list[ReceiverGroup]:
+        groups: dict[tuple[Framing, Settings, float], ReceiverGroup] = {}
         taken: dict[tuple[int, Framing, int], SimulatedDrive] = {}
         for it in self.drives:
             drive = it.drive
@@ -104,7 +104,7 @@ class Wire:
             if key not in groups:
                 gap = it.most_gap if self._pace else UNPACED_GAP
                 character = drive.settings.character * self._pace
-                groups[key] = Ears(Receiver(drive.framing, character, gap), drive.settings)
+                groups[key] = ReceiverGroup(Receiver(drive.framing, character, gap), drive.settings)
             groups[key].drives[drive.address] = it
         return list(groups.values())
 
@@ -150,7 +150,7 @@ class Wire:
         """What becomes of a reply on its way; a test of noise replaces it."""
         return reply
 
-    def _deliver(self, ears: Ears, frames: Sequence[Frame]) -> None:
+    def _deliver(self, ears: ReceiverGroup, frames: Sequence[Frame]) -> None:
         for frame in frames:
             for it in ears.listeners(frame):
                 if self._may_hear(it, frame) and (reply := it.hear(frame)) is not None:

@@ -7,7 +7,7 @@ import math
 from multidrop.core import Message
 from multidrop.drive.register import HOLDING
 from multidrop.sim.memory import MemoryCell, decode
-from multidrop.sim.motor_drive import PoweredDrive
+from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason, Refusal
 
 CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY = 0x1000, 0x1001, 0x1002
@@ -24,7 +24,7 @@ EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
 HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
 
 
-class SimulatedYD1000(PoweredDrive):
+class SimulatedYD1000(MotorDrive):
     """Without bit 15 the panel is in command: it runs the motor when `panel_runs` says so.
 
     A value outside its limits in section 6 is refused, also where such a limit is another parameter. What

@@ -252,7 +252,8 @@ class Exchanges:
         sleep(max(0, late_until_ns - now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
 
-    def reply(self, drive: Drive, completion: Completion) -> Message:
+    @staticmethod
+    def reply(drive: Drive, completion: Completion) -> Message:
         """The good reply; raises NoReply, BadReply or DriveRefused."""
         if completion.result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
             raise NoReply(drive.name)

@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 
 from multidrop.capture import Capture, CaptureWriter, Pairing, Side, Sniffed
-from multidrop.capture.lookup import Meanings, line_of
-from multidrop.capture.text import EchoProbe
+from multidrop.capture.lookup import RegisterLookup, line_of
+from multidrop.capture.text import ExchangeFormatter
 from multidrop.cli.support.saying import say
 from multidrop.core import FrameSpan, Kind, Splitter, Stream
 from multidrop.plant.model import Plant, PlantLine
@@ -32,7 +32,7 @@ class Ear:
         self.name = name
         self.pairing = Pairing()
         self._splitter = Splitter()
-        self._echo_probe = EchoProbe(Meanings(line))
+        self._formatter = ExchangeFormatter(RegisterLookup(line))
         self._as_json = as_json
         self._out = out
 
@@ -45,7 +45,7 @@ class Ear:
 
     def rest(self) -> None:
         """Nothing more is to be waited for."""
-        self._print(self.pairing.rest())
+        self._print(self.pairing.flush())
 
     def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
         for span in spans:
@@ -54,9 +54,9 @@ class Ear:
     def _print(self, told: Iterable[Sniffed]) -> None:
         for it in told:
             if self._as_json:
-                say(json.dumps({"line": self.name} | self._echo_probe.json(it)))
+                say(json.dumps({"line": self.name} | self._formatter.json(it)))
             else:
-                say(self._echo_probe.text(it))
+                say(self._formatter.text(it))
         sys.stdout.flush()
 
 
