@@ -21,6 +21,7 @@ from multidrop.drive.register import Kept, Register
 from multidrop.drive.request import write_request
 from multidrop.drive.script import Step, Wait, Write, carry_out
 from multidrop.errors import (
+    Advice,
     BadReply,
     BusError,
     DriveRefused,
@@ -193,10 +194,11 @@ class Writer:
         least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
         why = self._ledger.at(self._exchanges.line.identity).enter(cell, utc_ns() / 1e9, least)
         if why:
-            way = "write it less often, or take a setpoint that is kept in RAM"
+            way, advice = "write it less often, or take a setpoint that is kept in RAM", None
             if kept is Kept.UNKNOWN:
-                way = f'if you know that this drive keeps it in RAM, declare ram = ["{register.name}"]'
-            raise refused(drive, register, f"{why}; {way}")
+                advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
+                way = f"if you know that this drive keeps it in RAM, {advice.program}"
+            raise refused(drive, register, f"{why}; {way}", advice)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
         line = self._exchanges.line
