@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_cli import Run, run
-from test_line_ports import SerialServer, pyserials_own, vanishing_pty
+from commands import Run
+from serial_server import SerialServer, pyserials_own, vanishing_pty
 
 from multidrop.cli.doctor.adapter import (
     RS485_ENABLED,
@@ -40,8 +40,6 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import Simulator, Wire, simulated
-
-__all__ = ["run"]  # a fixture
 
 USUAL = Settings(9600, "8N1")
 SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")

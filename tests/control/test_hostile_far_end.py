@@ -20,8 +20,8 @@ import pytest
 from far_drives import KINDS, FarDrive
 from far_end import FarEnd, FarLine
 from lines import line, plant, polled, rows_of, until
-from test_mixed_line import REASONS
-from test_stop_wins import quick
+from motors import quick
+from variants import REASONS
 
 from multidrop.drive import Drive
 from multidrop.errors import BusError

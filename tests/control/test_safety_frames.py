@@ -15,7 +15,7 @@ import pytest
 from halls import Hall, is_write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_safety_bus import MAKE, STARTS
+from motors import MAKE, STARTS
 
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message

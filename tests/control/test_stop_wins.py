@@ -34,12 +34,11 @@ from hypothesis.stateful import (
 )
 from lines import line as declared_line
 from lines import plant, polled
-from own_fan import Fan
+from motors import quick
 
 from multidrop.bus import Bus
 from multidrop.control.ramp import start_staggered
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
 from multidrop.errors import BusError
 from multidrop.poller import Poller
 
@@ -47,16 +46,6 @@ EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
 EXPIRY = 60.0  # s: a busy machine is slow, and nothing is wrong with it
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
-
-
-def quick(kind: str) -> type[Drive]:
-    """The family without the silences that it asks for, which the far end does not need."""
-    family = FAMILIES[kind]
-    without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
-    return type(family.__name__, (family,), without)
 
 
 class Signalled(Exception):
