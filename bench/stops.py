@@ -20,7 +20,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 import tables
-from far_drives import KINDS
+from responder_drives import KINDS
 from stops_network import cut_networks
 from stops_victim import Counters, Victim, victim
 

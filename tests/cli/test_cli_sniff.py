@@ -121,7 +121,7 @@ def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> Non
 # ---- behind a network ----
 
 
-class FarLine:
+class ResponderLine:
     """A line at the far end of a connection: says the same again and again, and keeps what it is told."""
 
     def __init__(self, said: bytes) -> None:
@@ -154,7 +154,7 @@ class FarLine:
 @pytest.mark.parametrize("kind", ["socket", "rfc2217"])
 @pyserials_own
 def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:
-    far = FarLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
+    far = ResponderLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
     server = SerialServer(far.url) if kind == "rfc2217" else None
     url = server.url if server else far.url
     status, out, err = run("sniff", url, "--baudrate", 19200, "--format", "8E1", "--seconds", 2, "--json")
@@ -172,7 +172,7 @@ def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) 
 
 
 def test_a_url_s_port_has_no_write() -> None:
-    far = FarLine(b"")
+    far = ResponderLine(b"")
     with Listener(far.url, Settings(9600, "8N1")) as listener:
         (port,) = (it for it in vars(listener._source).values() if hasattr(it, "write"))
         with pytest.raises(OSError, match="only listened to: 01 is not sent"):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from delixi_tables import MONITORS
-from halls import one
 from scripts import Wire, frame, rows, typed
+from simulated_bus import one
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported

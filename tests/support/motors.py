@@ -37,7 +37,7 @@ DELIXI_WRITES = (2, 4, 5, 6)
 
 
 def quick(kind: str) -> type[Drive]:
-    """The family without the silences that it asks for, which the far end does not need."""
+    """Return the family without its silences, which a responder does not need."""
     family = FAMILIES[kind]
     without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
     return type(family.__name__, (family,), without)
