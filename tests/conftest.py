@@ -5,8 +5,10 @@ import signal
 from pathlib import Path
 
 import pytest
+from commands import Run
 from hypothesis import HealthCheck, settings
 
+from multidrop.cli import main
 from multidrop.core import Peer
 from multidrop.transport import exchange as exchanges
 
@@ -43,3 +45,14 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def _own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     state: Path = tmp_path_factory.mktemp("state")
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Status, output and errors of a command."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        status = main([str(word) for word in words])
+        return status, *capsys.readouterr()
+
+    return run

@@ -13,8 +13,8 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from far_drives import KINDS
 from own_fan import Fan
+from responder_drives import KINDS
 
 from multidrop.bus import Bus
 from multidrop.drive import Drive

@@ -15,8 +15,8 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from far_drives import KINDS, FarDrive
-from far_end import FarEnd, FarLine
+from responder import Responder, ResponderLine
+from responder_drives import KINDS, ResponderDrive
 
 from bench.players.stop_victim import Counters, Victim, victim
 
@@ -110,15 +110,20 @@ def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         for _ in range(rounds):
             for telnet in (False, True):
                 kind = chance.choice(list(KINDS))
-                line = FarLine([FarDrive(KINDS[kind], 1)])
-                far = FarEnd([line], listening=[made.listen()], telnet=telnet)
+                line = ResponderLine([ResponderDrive(KINDS[kind], 1)])
+                far = Responder([line], listening=[made.listen()], telnet=telnet)
                 with victim([[(kind, 1)]], sets=True, far=far) as client:
                     _cut_one(chance, client, line, made, counters, is_long)
     return counters
 
 
 def _cut_one(
-    chance: random.Random, client: Victim, line: FarLine, made: Network, counters: Counters, is_long: bool
+    chance: random.Random,
+    client: Victim,
+    line: ResponderLine,
+    made: Network,
+    counters: Counters,
+    is_long: bool,
 ) -> None:
     """Start twice whole, the second time to learn how many looks there are, and a third time cut."""
     looks = 0

@@ -16,8 +16,8 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from far_drives import KINDS, FarDrive
-from far_end import FarEnd, FarLine, Heard
+from responder import Heard, Responder, ResponderLine
+from responder_drives import KINDS, ResponderDrive
 
 CLIENT = "bench.players.stop_client"
 PATIENCE = 150.0  # s, for a client to end by itself
@@ -44,13 +44,13 @@ class Counters:
 class Victim:
     """A client process, its responders, and the time when it was asked to stop."""
 
-    def __init__(self, far: FarEnd, process: subprocess.Popen[str], errors: Path) -> None:
+    def __init__(self, far: Responder, process: subprocess.Popen[str], errors: Path) -> None:
         self.far = far
         self.lines = far.lines
         self.process = process
         self.asked_ns = 0
         self._errors = errors
-        self._begun: dict[FarLine, int] = {}
+        self._begun: dict[ResponderLine, int] = {}
 
     def ask(self, **command: Any) -> None:
         assert self.process.stdin is not None
@@ -102,7 +102,7 @@ class Victim:
     def release(self) -> None:
         self.far.release(self.lines[0])
 
-    def heard(self, line: FarLine, address: int, what: str) -> list[Heard]:
+    def heard(self, line: ResponderLine, address: int, what: str) -> list[Heard]:
         """In this episode."""
         return [
             it
@@ -140,14 +140,17 @@ def victim(
     sets: bool = False,
     polls: bool = False,
     ramp: float = 0.0,
-    far: FarEnd | None = None,
+    far: Responder | None = None,
 ) -> Iterator[Victim]:
     """A client that is ready, with a line for each list of kinds and addresses."""
     with TemporaryDirectory(prefix="multidrop-stops-") as name:
         directory = Path(name)
         if far is None:
-            lines = [FarLine([FarDrive(KINDS[kind], at, ramp) for kind, at in drives]) for drives in plant]
-            far = FarEnd(lines, directory)
+            lines = [
+                ResponderLine([ResponderDrive(KINDS[kind], at, ramp) for kind, at in drives])
+                for drives in plant
+            ]
+            far = Responder(lines, directory)
         given = {"ports": far.ports, "drives": plant, "on_exit": on_exit, "sets": sets, "polls": polls}
         errors = directory / "errors"
         with (

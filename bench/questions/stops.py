@@ -19,7 +19,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from far_drives import KINDS
+from responder_drives import KINDS
 
 from bench.players.stop_network import cut_networks
 from bench.players.stop_victim import Counters, Victim, victim

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import checksums
 import pytest
+from captures import BEGIN, STEP, decimal, tshark, write
 from disks import full_at
-from frames import PRINTED, Printed
+from frames import PRINTED
 from peers import require_program
 
 from multidrop.capture import Capture, CaptureError, CaptureWriter, Decoding, Side
@@ -38,18 +39,6 @@ RTU = [
 ]
 READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 TEXT = [it for it in PRINTED if it.request is not None and it.framing is not Framing.RTU]
-BEGIN = 1_700_000_000_123_456_789
-STEP = 5_000_001  # ns between two frames
-
-
-def write(path: Path, exchanges: Iterable[Printed], line: str = "hall-1") -> Path:
-    with CaptureWriter(path) as capture:
-        time = BEGIN
-        for it in exchanges:
-            capture.write(it.request_frame, Side.ASKING, time, line)
-            capture.write(it.frame, Side.ANSWERING, time + STEP, line)
-            time += 2 * STEP
-    return path
 
 
 def spans(path: Path) -> dict[str, list[FrameSpan]]:
@@ -70,29 +59,6 @@ def rows(path: Path, plant: Plant | None = None) -> list[Row]:
 
 
 # ---- Wireshark reads ours ----
-
-FIELDS = (
-    *("frame.interface_name", "frame.time_epoch", "frame.packet_flags_direction"),
-    *("mbrtu.unit_id", "modbus.func_code", "modbus.exception_code", "modbus.reference_num"),
-    *("modbus.word_cnt", "modbus.bit_cnt", "modbus.regval_uint16", "modbus.data", "mbrtu.crc16.status"),
-    *("modbus.request_frame", "data.data"),
-)
-
-
-def tshark(path: Path) -> list[dict[str, str]]:
-    options = ["-o", "mbrtu.tcp.port:502", "-o", "mbrtu.crc_verification:TRUE"]
-    fields = [word for field in FIELDS for word in ("-e", field)]
-    done = subprocess.run(
-        [require_program("tshark"), "-n", "-r", path, *options, "-T", "fields", "-E", "separator=|", *fields],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return [dict(zip(FIELDS, line.split("|"), strict=True)) for line in done.stdout.splitlines()]
-
-
-def decimal(text: str) -> list[int]:
-    return [int(number) for number in text.split(",")]
 
 
 def registers(data: bytes) -> list[int]:

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from captures import decimal, tshark
+from commands import Run
 from line_driver import MS, LineDriver
 from lines import PATIENCE, Faulty, LateWire, line, plant, polled, rows_of, served
-from test_capture import decimal, tshark
-from test_cli import Run, run
-from test_cli_poll import recorded
-from test_mixed_line import LATEST, fast_drives, real_drives, real_wires
+from recordings import recorded
+from variants import LATEST, fast_drives, real_drives, real_wires
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped
 from multidrop.capture import flight_recorder as flight
@@ -31,8 +31,6 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError
 from multidrop.sim import EncodedDrive, Simulator, Wire
-
-__all__ = ["run"]  # a fixture
 
 FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 5, "reply cut short": 5})
 NEVER_ON_THE_LINE = {str(it) for it in (Status.NOT_ASKED, Status.LATE_ANSWER_DUE, Status.EXPIRED)}

@@ -7,36 +7,16 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from commands import TOY, Run
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.support.signals import Interruption
 from multidrop.drive import Advice, Refused, carry_out
-from multidrop.drives import MODELS
-from multidrop.drives.erman_er_g_220 import ErmanERG220
-from multidrop.drives.innovert_ibd import InnovertIBD
-from multidrop.drives.invt_che import InvtCHE
-from multidrop.drives.registry import find_model
-
-TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
-find_model(TOY)  # is told when its file is run, which is once a process
-
-Run = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Status, output and errors of a command."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        status = main([str(word) for word in words])
-        return status, *capsys.readouterr()
-
-    return run
+from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 
 
 def test_help_lists_every_command(run: Run) -> None:

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from commands import TOY, Run
 from lines import Faulty, until
 from motors import Heard
-from test_cli import TOY, Run, run
 from toy import Status, Toy
 
 from multidrop.control import eeprom_ledger as ledger
@@ -27,8 +27,6 @@ from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.simulator import Simulator
 from multidrop.sim.wire import Wire
-
-__all__ = ["run"]  # a fixture
 
 DOG = "watchdog: The document names no watchdog: the motor runs on when the client dies."
 

@@ -7,10 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from test_cli import TOY, Run, run
-from test_cli_poll import multidrop, plant
-
-__all__ = ["plant", "run"]  # fixtures
+from commands import TOY, Run, multidrop
 
 LINE = '[[line]]\nname = "{}"\nport = "/dev/there-is-no-such-port-{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import resource
 import signal
-import subprocess
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import pytest
 from batches import METADATA, counting
+from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
 from lines import Faulty, line, polled
-from terminals import MULTIDROP, on_terminal
-from test_cli import TOY, Run, run
+from recordings import recorded
+from terminals import on_terminal
 from toy import Toy
 
 from multidrop.bus import Bus
@@ -24,59 +20,8 @@ from multidrop.capture import Capture, Decoding
 from multidrop.cli.demo import DRIVES, _start_motors
 from multidrop.core import Status
 from multidrop.errors import NoReply
-from multidrop.polling.batch import Row
 from multidrop.recording import open_reader, open_writer
 from multidrop.sim import Simulator, simulated
-
-__all__ = ["run"]  # a fixture
-
-TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a model of one's own is a program\n"
-
-
-def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
-    """A command to its end; `most_bytes`: as if the disk had only so much room."""
-
-    def limit() -> None:
-        if most_bytes is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-
-    done = subprocess.run(
-        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=180, preexec_fn=limit
-    )
-    done.stderr = done.stderr.replace(TOY_IS_RUN, "", 1)
-    return done
-
-
-@contextmanager
-def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
-    """A command under way, and what it prints."""
-    with subprocess.Popen([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield process, process.stdout
-        finally:
-            process.kill()
-
-
-def plant_file(directory: Path, *, dead: bool = False) -> Path:
-    """One line with a living drive, and one that nobody simulates."""
-    line = f'[[line]]\nname = "hall-1"\nport = "{directory}/ports/hall-1"\n'
-    drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
-    path = directory / f"{'with-dead' if dead else 'living'}.toml"
-    path.write_text(line + drive.format("pump-1", TOY, 1) + (drive.format("pump-9", TOY, 9) if dead else ""))
-    return path
-
-
-@pytest.fixture
-def plant(tmp_path: Path) -> Iterator[Path]:
-    """A plant file whose port is there, with one of its two drives."""
-    with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports", "--unpaced") as (_, out):
-        assert out.readline() == f"ready hall-1 {tmp_path}/ports/hall-1\n"
-        yield plant_file(tmp_path, dead=True)
-
-
-def recorded(path: Path) -> list[Row]:
-    return [row for rows in open_reader(path) for row in rows]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

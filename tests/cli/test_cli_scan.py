@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from commands import TOY, Run
 from disks import read_only_directory
 from terminals import on_terminal
-from test_cli import TOY, Run, run
 from toy import Toy
 
 import multidrop.cli.scan
@@ -22,8 +22,6 @@ from multidrop.drives.invt_che import InvtCHE
 from multidrop.plant.loader import load_plant
 from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
-
-__all__ = ["run"]  # a fixture
 
 USUAL = Settings(9600, "8N1")
 BRISKLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3", "--quick")

@@ -6,22 +6,21 @@ import fcntl
 import json
 import os
 import pty
-import signal
 import socket
-import subprocess
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import Run, multidrop
 from frames import PRINTED
 from lines import PATIENCE, until
+from recordings import recorded
+from serial_server import SerialServer, pyserials_own
+from sniffing import sniffing
 from taps import tapped
-from test_cli import Run, run
-from test_cli_poll import MULTIDROP, multidrop, recorded
-from test_line_ports import SerialServer, pyserials_own
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.capture.pairing import Pairing
@@ -32,8 +31,6 @@ from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire
-
-__all__ = ["run"]  # a fixture
 
 DRIVES = (InnovertIBD(1), InvtCHE(2), InnovertIBD(3, framing="ascii"), DelixiNative(4))
 PLANT = """
@@ -76,42 +73,6 @@ def plant(directory: Path, port: str) -> Path:
     path = directory / "plant.toml"
     path.write_text(PLANT.format(port=port))
     return path
-
-
-class Sniffer:
-    """`multidrop sniff` under way; its objects are there when the block is left."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.told: list[dict[str, Any]] = []
-        self.process = process
-
-    @property
-    def exchanges(self) -> list[dict[str, Any]]:
-        return [it for it in self.told if it.get("result") == "ok"]
-
-    @property
-    def summary(self) -> dict[str, int]:
-        return dict(self.told[-1]["summary"])
-
-
-@contextmanager
-def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
-    command = [*MULTIDROP, "sniff", port, "--json", *map(str, words)]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert process.stderr.readline() == f"listening on {port}, Ctrl-C ends\n"
-        sniffer = Sniffer(process)
-        out = process.stdout
-        reader = threading.Thread(target=lambda: sniffer.told.extend(map(json.loads, out)))
-        reader.start()
-        try:
-            yield sniffer
-        finally:
-            process.send_signal(signal.SIGINT)
-            reader.join(timeout=20)
-            process.kill()
 
 
 def test_a_poll_s_values_are_heard_captured_and_decoded(
@@ -160,7 +121,7 @@ def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> Non
 # ---- behind a network ----
 
 
-class FarLine:
+class ResponderLine:
     """A line at the far end of a connection: says the same again and again, and keeps what it is told."""
 
     def __init__(self, said: bytes) -> None:
@@ -193,7 +154,7 @@ class FarLine:
 @pytest.mark.parametrize("kind", ["socket", "rfc2217"])
 @pyserials_own
 def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) -> None:
-    far = FarLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
+    far = ResponderLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
     server = SerialServer(far.url) if kind == "rfc2217" else None
     url = server.url if server else far.url
     status, out, err = run("sniff", url, "--baudrate", 19200, "--format", "8E1", "--seconds", 2, "--json")
@@ -211,7 +172,7 @@ def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) 
 
 
 def test_a_url_s_port_has_no_write() -> None:
-    far = FarLine(b"")
+    far = ResponderLine(b"")
     with Listener(far.url, Settings(9600, "8N1")) as listener:
         (port,) = (it for it in vars(listener._source).values() if hasattr(it, "write"))
         with pytest.raises(OSError, match="only listened to: 01 is not sent"):

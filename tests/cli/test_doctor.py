@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_cli import Run, run
-from test_line_ports import SerialServer, pyserials_own, vanishing_pty
+from commands import Run
+from serial_server import SerialServer, pyserials_own, vanishing_pty
 
 from multidrop.cli.doctor.adapter import (
     RS485_ENABLED,
@@ -40,8 +40,6 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import Simulator, Wire, simulated
-
-__all__ = ["run"]  # a fixture
 
 USUAL = Settings(9600, "8N1")
 SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
@@ -301,7 +299,7 @@ def test_an_echo_is_looked_for_with_the_line_s_settings(run: Run, port: str) -> 
     assert "none at 19200 8E1: nothing came back" in out
 
 
-class FarEnd:
+class Responder:
     """A line of which every request is noted, and answered or not."""
 
     def __init__(self, answer: Callable[[bytes], bytes]) -> None:
@@ -331,11 +329,11 @@ class FarEnd:
 
 
 @pytest.fixture
-def far_end() -> Iterator[Callable[[Callable[[bytes], bytes]], FarEnd]]:
-    made: list[FarEnd] = []
+def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
+    made: list[Responder] = []
 
-    def make(answer: Callable[[bytes], bytes]) -> FarEnd:
-        made.append(FarEnd(answer))
+    def make(answer: Callable[[bytes], bytes]) -> Responder:
+        made.append(Responder(answer))
         return made[-1]
 
     yield make
@@ -343,17 +341,17 @@ def far_end() -> Iterator[Callable[[Callable[[bytes], bytes]], FarEnd]]:
         one.close()
 
 
-def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, far_end: Any) -> None:
+def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, responder: Any) -> None:
     """As a server does that answers for every address."""
-    end = far_end(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
+    end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = " ".join(run("doctor", end.path)[1].split())
     assert "answers with exception 04" in told
     assert "came unasked" not in told
 
 
-def test_only_what_was_sent_is_counted(run: Run, far_end: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
-    end = far_end(lambda request: b"")
+    end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import Run, plant_file
 from lines import PATIENCE
 from rich.console import Console
 from terminals import on_terminal
-from test_cli import Run, run
-from test_cli_poll import plant, plant_file
 
 import multidrop.cli.support.extra
 from multidrop.cli.monitor import PAGE, _Monitor
@@ -30,8 +29,6 @@ from multidrop.polling.batch import Row
 from multidrop.recording import open_reader
 from multidrop.recording.rows import from_rows
 from multidrop.transport.statistics import LineStatistics, look
-
-__all__ = ["plant", "run"]  # fixtures
 
 SECOND = 1_000_000_000
 NOW = 1_795_253_400 * SECOND

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from peers import require_module
+from raw_client import opened, receive
+from sniffing import sniffing
 from taps import tapped
-from test_cli_sniff import sniffing
-from test_sim_lines import opened, receive
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Splitter, Stream, build_request, parse_reply
 from multidrop.drive import Drive

@@ -8,19 +8,17 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from captures import write
+from commands import Run
 from frames import PRINTED
+from recordings import record, row
 from terminals import MULTIDROP
-from test_capture import write
-from test_cli import Run, run
-from test_plot import record, row
 
 import multidrop.cli
 from multidrop.core import Framing, Message
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.printable import printable
 from multidrop.report import load, plot, plot_page, png, report_page
-
-__all__ = ["run"]  # a fixture
 
 # Clear the screen; set the title; write the clipboard; run from right to left; one-byte escape; two lines.
 TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")

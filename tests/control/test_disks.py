@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from disks import full_at, read_only_directory
-from halls import one
+from simulated_bus import one
 
 from multidrop.cli import main
 from multidrop.control.audit_log import AuditLog, read_audit

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from halls import Hall
 from lines import PATIENCE
+from simulated_bus import SimulatedBus
 from toy import Status, Toy
 
 from multidrop.bus import Bus
@@ -148,7 +148,7 @@ def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.Mon
 
     ledger = Ledger(tmp_path / "wear")
     sim = SimulatedDrive(Fan(1))
-    hall = Hall(monkeypatch, sim, ledger=ledger)
+    hall = SimulatedBus(monkeypatch, sim, ledger=ledger)
     fan = hall.attach(Fan(1, ram=["known"]))
     for register in (fan.relay, fan.speed, fan.known):
         hall.bus.write(fan, register, 1)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from halls import EXCHANGE_TIME, Hall, is_write, one
 from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
+from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
 from toy import Toy
 
 from multidrop.bus import Bus
@@ -41,7 +41,7 @@ from multidrop.transport.exchange import READ_ATTEMPTS
 every_family = pytest.mark.parametrize("model", MAKE)
 
 
-def starts(hall: Hall, model: str) -> list[str]:
+def starts(hall: SimulatedBus, model: str) -> list[str]:
     return [
         frame
         for request, frame in hall.frames
@@ -181,7 +181,7 @@ def test_a_drive_of_another_family_is_not_written_to(
         return
     sim = simulated(MAKE[actual](1))
     assert isinstance(sim, MotorDrive)
-    hall = Hall(monkeypatch, sim)
+    hall = SimulatedBus(monkeypatch, sim)
     drive = hall.attach(MAKE[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
         with pytest.raises((Refused, NoReply, Unsupported)):
@@ -571,7 +571,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     first, _ = (hall.attach(it.drive) for it in sims)
     for value in set(CHEControl) - {CHEControl.STOP}:
         with pytest.raises(Refused, match="no harmless broadcast"):
@@ -593,7 +593,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
 
 def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for it in sims:
         hall.bus.check_identity(hall.attach(it.drive))
     hall.deafens = lambda request: request.address == 2
@@ -606,7 +606,7 @@ def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytes
     assert second.drive == "invt-che@2"
 
 
-def all_stopped(hall: Hall, sims: list[Any]) -> bool:
+def all_stopped(hall: SimulatedBus, sims: list[Any]) -> bool:
     for it in sims:
         it.pass_time(hall.seconds)
     return not any(it.motor.energised for it in sims)
@@ -619,7 +619,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
 
     def keep(exchange: Exchange, **times: int) -> Completion:
         made.append(exchange)
-        return Hall.carry_out(hall, exchange, **times)
+        return SimulatedBus.carry_out(hall, exchange, **times)
 
     monkeypatch.setattr(hall, "carry_out", keep)
     hall.bus.broadcast(InvtCHE.control, CHEControl.STOP)
@@ -636,7 +636,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
 
 def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for it in sims:
         drive = hall.attach(it.drive)
         drive.set_frequency(20)
@@ -653,7 +653,7 @@ def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pyt
 def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """The port fails with it, and comes back."""
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for it in sims:
         drive = hall.attach(it.drive)
         drive.set_frequency(20)
@@ -673,7 +673,7 @@ def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.
 
 def test_stop_all_on_a_line_of_every_family(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(make(address)) for address, make in enumerate(MAKE.values(), 1)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for it in sims:
         drive = hall.attach(it.drive)
         drive.set_frequency(20)
@@ -692,7 +692,7 @@ def test_stop_all_says_of_each_what_is_known(monkeypatch: pytest.MonkeyPatch) ->
         simulated(ErmanERG220(2)),
         simulated(InvtCHE(3)),
     ]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for it in sims:
         hall.attach(it.drive)
     sims[2]["device"] = 0x010A
@@ -715,7 +715,7 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     drives = [hall.attach(it.drive) for it in sims]
     for drive in drives:
         drive.set_frequency(20)
@@ -758,7 +758,7 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
 
 
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = Hall(monkeypatch)
+    hall = SimulatedBus(monkeypatch)
     toy = hall.attach(Toy(1, name="toy"))
     with pytest.raises(Refused, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"):
         ramp(toy, 20.0, rate=5.0)
@@ -826,7 +826,7 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
 
 
 LOST = LineError("hall", "the port was lost")
-ENDINGS: dict[str, tuple[BaseException, int, Callable[[Hall, Any], object], str]] = {
+ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], object], str]] = {
     "port lost at the reading back": (
         LOST,
         3,
@@ -916,7 +916,7 @@ def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch)
 
         speed = setting(5, "rpm", kept=Kept.RAM)
 
-    hall = Hall(monkeypatch)
+    hall = SimulatedBus(monkeypatch)
     drive = hall.attach(Mine(1))
     with pytest.raises(NoReply):
         hall.bus.write(drive, Mine.speed, 10)
@@ -933,7 +933,7 @@ def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch
             yield from wait(3.0)
             yield from read(Toy.fault)
 
-    hall = Hall(monkeypatch, simulated(Sleepy(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
     begun = hall.seconds
     hall.bus.check_identity(hall.attach(Sleepy(1)))
     assert [(it.start, it.count) for it, _ in hall.frames] == [(5, 1), (4, 1)]
@@ -948,7 +948,7 @@ def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.M
         def identify(self) -> Script[None]:
             yield from write(Toy.frequency, 10.0)
 
-    hall = Hall(monkeypatch, simulated(Meddler(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Meddler(1)))
     drive = hall.attach(Meddler(1, name="meddler"))
     with pytest.raises(Refused, match=r"^meddler: a look at its identity must not write$"):
         drive.set_frequency(20.0)
@@ -964,7 +964,7 @@ def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rest
         speed = reading(1, "rpm")
         ratio = setting(2, kept=Kept.RAM, while_running=False)
 
-    hall = Hall(monkeypatch, simulated(Mute(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Mute(1)))
     drive = hall.attach(Mute(1, name="mute"))
     with pytest.raises(Refused) as refusal:
         hall.bus.write(drive, Mute.ratio, 3)

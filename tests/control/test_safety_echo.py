@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from halls import Hall, is_write, one
+from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.control.outcome import Effect
 from multidrop.core import build_request
@@ -21,7 +21,7 @@ DRIVES = (
 )
 
 
-def dies_and_echoes(hall: Hall, drive: Drive) -> None:
+def dies_and_echoes(hall: SimulatedBus, drive: Drive) -> None:
     """From now on all that is heard of a write is what was sent, and of a read nothing."""
     hall.deafens = lambda request: True
     hall.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None

@@ -12,10 +12,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from halls import Hall, is_write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_safety_bus import MAKE, STARTS
+from motors import MAKE, STARTS
+from simulated_bus import SimulatedBus, is_write
 
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
@@ -106,7 +106,7 @@ numbers = st.one_of(
 
 
 @st.composite
-def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[Hall, Any], object]]:
+def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any], object]]:
     """One public call, with any arguments, and its name."""
     family = type(MAKE[model](1))
     name = draw(
@@ -170,11 +170,11 @@ def test_no_sequence_of_calls_sends_what_is_forbidden(
 ) -> None:
     sim: Any = simulated(MAKE[model](1))
     with TemporaryDirectory() as directory:
-        hall = Hall(monkeypatch, sim, ledger=Path(directory) / "wear")
+        hall = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
         play(hall, sim, model, data)
 
 
-def play(hall: Hall, sim: Any, model: str, data: st.DataObject) -> None:
+def play(hall: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
     """A setpoint, and then any calls with any replies lost."""
     drive = hall.attach(sim.drive)
     drive.set_frequency(20)

@@ -18,7 +18,7 @@ import pytest
 from checksums import rtu
 from lines import until
 from motors import MAKE, STARTS, Heard
-from shared import SharedPair, shared
+from shared_pair import SharedPair, shared
 
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request

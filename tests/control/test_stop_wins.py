@@ -1,6 +1,6 @@
 """A stop always wins: after one was called, by anybody, nothing moves a motor that was not called after it.
 
-Real ports and threads, and a far end of our own that notes every frame. Order is judged on the wire alone:
+Real ports and threads, and responders of our own that note every frame. Order is judged on the wire alone:
 a line delivers in order, so what comes after a stop's first frame has left after the stop was called.
 Threads that start motors are held in the middle of their looks until the stop is called. More of it:
 `STOP_EXAMPLES=100 pytest tests/control/test_stop_wins.py`.
@@ -20,8 +20,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from far_drives import KINDS, FarDrive
-from far_end import FarEnd, FarLine
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -34,12 +32,13 @@ from hypothesis.stateful import (
 )
 from lines import line as declared_line
 from lines import plant, polled
-from own_fan import Fan
+from motors import quick
+from responder import Responder, ResponderLine
+from responder_drives import KINDS, ResponderDrive
 
 from multidrop.bus import Bus
 from multidrop.control.ramp import start_staggered
 from multidrop.drive import Drive
-from multidrop.drives import MODELS
 from multidrop.errors import BusError
 from multidrop.poller import Poller
 
@@ -47,16 +46,6 @@ EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
 EXPIRY = 60.0  # s: a busy machine is slow, and nothing is wrong with it
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
-
-
-def quick(kind: str) -> type[Drive]:
-    """The family without the silences that it asks for, which the far end does not need."""
-    family = FAMILIES[kind]
-    without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
-    return type(family.__name__, (family,), without)
 
 
 class Signalled(Exception):
@@ -81,9 +70,9 @@ class Stops(RuleBasedStateMachine):
         directory = Path(self._stack.enter_context(TemporaryDirectory()))
         self._ledger = directory / "ledger"
         self.polling, self.on_exit = polling, on_exit
-        self.far_drives = [FarDrive(KINDS[self.kind], address) for address in range(1, DRIVES + 1)]
-        self.line = FarLine(self.far_drives)
-        self.far = self._stack.enter_context(FarEnd([self.line], directory))
+        self.responders = [ResponderDrive(KINDS[self.kind], address) for address in range(1, DRIVES + 1)]
+        self.line = ResponderLine(self.responders)
+        self.far = self._stack.enter_context(Responder([self.line], directory))
         for number in SIGNALS:
             self._stack.callback(signal.signal, number, signal.signal(number, _signalled))
         self.threads: list[threading.Thread] = []
@@ -95,7 +84,7 @@ class Stops(RuleBasedStateMachine):
         """A client anew, that has written its setpoints, and a mark on the wire."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
-        self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.far_drives]
+        self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.responders]
         if self.polling:
             asked = [polled(it, it.readings()[:2]) for it in self.drives]
             self.poller: Poller | None = Poller(
@@ -160,7 +149,7 @@ class Stops(RuleBasedStateMachine):
 
     @rule(number=st.integers(0, DRIVES - 1))
     def started_by_hand(self, number: int) -> None:
-        self.far_drives[number].turn()
+        self.responders[number].turn()
 
     @rule(
         how=st.sampled_from(["verb", "verb", "stop_all", "leave", "signal", "signal"]),
@@ -276,8 +265,8 @@ class Stops(RuleBasedStateMachine):
         self._close()
         back = [it for it in self.line.log if it.connection == self.line.connection]
         assert [str(it) for it in back if it.what == "moves"] == []
-        assert failures or not self.far_drives[0].runs
-        for drive in self.far_drives:  # there may have been no way to stop them
+        assert failures or not self.responders[0].runs
+        for drive in self.responders:  # there may have been no way to stop them
             drive.switch_on()
         self._open()
 
@@ -285,11 +274,11 @@ class Stops(RuleBasedStateMachine):
     @rule(number=st.integers(0, DRIVES - 1))
     def start(self, number: int) -> None:
         """After a stop a motor can be started again."""
-        if self.far_drives[number].runs:
+        if self.responders[number].runs:
             return
         self.line.troubles.clear()
         self.drives[number].start()
-        assert self.far_drives[number].runs
+        assert self.responders[number].runs
 
     # ---- judging ----
 
@@ -333,14 +322,14 @@ class Stops(RuleBasedStateMachine):
         for number in numbers:
             assert self._heard("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
             if not failures:
-                assert not self.far_drives[number].runs, f"{number + 1} was left running\n{self._story()}"
+                assert not self.responders[number].runs, f"{number + 1} was left running\n{self._story()}"
 
     def _story(self) -> str:
         return "\n".join(str(it) for it in self.line.log[self.begun :])
 
     @invariant()
     def no_frame_of_ours_is_damaged(self) -> None:
-        assert [str(it) for it in getattr(self, "line", FarLine([])).log if it.what == "damaged"] == []
+        assert [str(it) for it in getattr(self, "line", ResponderLine([])).log if it.what == "damaged"] == []
 
     def teardown(self) -> None:
         if not hasattr(self, "_stack"):
@@ -393,6 +382,6 @@ def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
     machine.begin(polling=False, on_exit=False)
     try:
         machine.drives[0].start()
-        assert machine.far_drives[0].runs
+        assert machine.responders[0].runs
     finally:
         machine.teardown()

@@ -10,8 +10,8 @@ from time import sleep
 from typing import Any
 
 import pytest
-from halls import Hall, is_write, one
 from motors import MAKE, STARTS
+from simulated_bus import SimulatedBus, is_write, one
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
@@ -74,11 +74,11 @@ class Own(Drive):
         return State(Condition.RUNNING if speed else Condition.STOPPED)
 
 
-def writes(hall: Hall, begun: int = 0) -> list[Message]:
+def writes(hall: SimulatedBus, begun: int = 0) -> list[Message]:
     return [request for request, _ in hall.frames[begun:] if is_write(request)]
 
 
-def first(hall: Hall, begun: int, met: Callable[[Message], bool]) -> int | None:
+def first(hall: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
     """How many frames went before the first write of this kind."""
     wanted = (at for at, (it, _) in enumerate(hall.frames[begun:]) if is_write(it) and met(it))
     return next(wanted, None)
@@ -87,7 +87,7 @@ def first(hall: Hall, begun: int, met: Callable[[Message], bool]) -> int | None:
 class Meanwhile:
     """Has another thread do something when so many more frames were sent, and waits for that thread."""
 
-    def __init__(self, hall: Hall, frames: int, act: Callable[[], object]) -> None:
+    def __init__(self, hall: SimulatedBus, frames: int, act: Callable[[], object]) -> None:
         self.failure: BaseException | None = None
         self.has_come = False
         self._left = frames
@@ -121,8 +121,8 @@ def started_while(
     tmp_path: Path,
     model: str,
     frames: int,
-    act: Callable[[Hall, Any], object],
-) -> tuple[Hall, Any, Meanwhile, int, BaseException | None]:
+    act: Callable[[SimulatedBus, Any], object],
+) -> tuple[SimulatedBus, Any, Meanwhile, int, BaseException | None]:
     """A start, in which another thread acts after so many frames; and how the start ended."""
     hall, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
     drive.set_frequency(20)
@@ -136,7 +136,7 @@ def started_while(
     return hall, drive, meanwhile, begun, failure
 
 
-ACTS: dict[str, Callable[[Hall, Any], object]] = {
+ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
     "stop": lambda hall, drive: drive.stop(),
     "stop_all": lambda hall, drive: hall.bus.stop_all(),
     "a plain stop": lambda hall, drive: hall.bus.write(drive, *plain_stop(drive)),
@@ -184,7 +184,7 @@ def test_the_other_stops_win_too(
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
         return
 
-    def act(hall: Hall, drive: Any) -> None:
+    def act(hall: SimulatedBus, drive: Any) -> None:
         getattr(drive, verb_name)()
 
     hall, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
@@ -195,7 +195,7 @@ def test_the_other_stops_win_too(
 
 def test_other_drives_are_not_held_up_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     one_of_them, other = (hall.attach(it.drive) for it in sims)
     other.set_frequency(20)
     Meanwhile(hall, 2, one_of_them.stop)
@@ -240,7 +240,7 @@ def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where it came between two starts: the second one is not called after it by anybody."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     drives = [hall.attach(it.drive) for it in sims]
     for drive in drives:
         drive.set_frequency(20)
@@ -380,7 +380,7 @@ def test_the_stop_of_the_family_that_it_looks_like_is_offered(
 ) -> None:
     declared, there = pair
     sim = simulated(there)
-    hall = Hall(monkeypatch, sim)
+    hall = SimulatedBus(monkeypatch, sim)
     drive = hall.attach(declared)
     with pytest.raises(Refused, match=f"multidrop stop PORT {there.model} 1"):
         drive.stop()
@@ -437,7 +437,7 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
 
 def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
-    hall = Hall(monkeypatch, *sims)
+    hall = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
         drive = hall.attach(sim.drive)
         drive.set_frequency(20)
@@ -456,7 +456,7 @@ def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor for the first one, of a drive that is known."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
-    hall = Hall(monkeypatch, *(simulated(drive) for drive in others))
+    hall = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
     hall.attach(InvtCHE(1, maximum_frequency=50))
     for drive in others[1:]:
         hall.attach(drive)
@@ -544,7 +544,7 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
-    hall = Hall(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
+    hall = SimulatedBus(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
     drives = [hall.attach(Own(address)) for address in (1, 2)]
     drives[0].stop()
     assert len(writes(hall)) == 1
@@ -557,7 +557,7 @@ def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
-    hall = Hall(monkeypatch, simulated(Own(1)), ledger=ledger)
+    hall = SimulatedBus(monkeypatch, simulated(Own(1)), ledger=ledger)
     drive = hall.attach(Own(1, confirmed=1))
     drive.start()
     for _ in range(3):
@@ -586,7 +586,7 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
             yield from write(self.run, 0)
             raise ZeroDivisionError("division by zero")
 
-    hall = Hall(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
+    hall = SimulatedBus(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
     for drive in (Broken(1, name="broken"), Breaks(2, name="breaks"), Own(3, name="own")):
         hall.attach(drive)
     found = hall.bus.stop_all()
@@ -600,7 +600,7 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
 
 
 def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = Hall(monkeypatch, simulated(Own(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Own(1)))
     drive = hall.attach(Own(1))
     hall.deafens = lambda request: hall.seconds < 1010
     drive.stop()
@@ -639,7 +639,7 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
                 yield from read(self.speed)
             yield from write(self.ratio, 1)
 
-    hall = Hall(monkeypatch, simulated(Sleepy(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
     hall.attach(Sleepy(1, confirmed=1)).start()
     assert len(writes(hall)) == 1
 
@@ -767,7 +767,7 @@ def test_a_start_that_is_interrupted_says_what_was_sent(
 
 def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     hall, drive, _ = one(monkeypatch, InvtCHE(1))
-    other = Hall(monkeypatch)
+    other = SimulatedBus(monkeypatch)
     with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
         other.attach(drive)
     assert other.bus.drives == []
@@ -779,7 +779,7 @@ def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = Hall(monkeypatch)
+    hall = SimulatedBus(monkeypatch)
     together = threading.Barrier(8)
     add, inside, most = hall.bus._exchanges.add, set[str](), 0
 
@@ -828,7 +828,7 @@ def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: py
 
 def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Each stop was sent before the first record is written."""
-    hall = Hall(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    hall = SimulatedBus(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
     for address in (1, 2):
         hall.attach(InvtCHE(address))
     stopped: list[int] = []

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from lines import PATIENCE, plant, polled, rows_of, until
 from lines import line as declared
-from test_line_ports import SerialServer
+from serial_server import SerialServer
 from toy import Toy
 
 from multidrop.bus import Bus

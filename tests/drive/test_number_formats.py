@@ -7,9 +7,9 @@ import struct
 from typing import Any
 
 import pytest
-from halls import Hall
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from simulated_bus import SimulatedBus
 
 from multidrop.cli.monitor.watched import told
 from multidrop.cli.support.values import as_json, taken
@@ -92,7 +92,7 @@ def test_a_number_is_packed_as_its_format_says(register: Register[float], data: 
 def attached() -> Any:
     with pytest.MonkeyPatch.context() as monkeypatch:
         sim = SimulatedDrive(Meter(1))
-        hall = Hall(monkeypatch, sim)
+        hall = SimulatedBus(monkeypatch, sim)
         yield hall, hall.attach(Meter(1, confirmed=1)), sim
 
 
@@ -210,7 +210,7 @@ def test_a_long_register_is_read_where_no_limit_is_stated(attached: Any) -> None
 def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
     declared = [("status", reading(5)), ("control", command(5, span=(0, 7), moves=False))][::order]
     both = type("Both", (Drive,), dict(declared))
-    hall = Hall(monkeypatch, SimulatedDrive(both(1)))
+    hall = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
     drive = hall.attach(both(1, confirmed=1))
     assert hall.bus.write(drive, drive.control, 3) == 3
     assert hall.bus.read(drive, drive.status) == 3

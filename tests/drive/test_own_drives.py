@@ -6,7 +6,7 @@ from enum import IntEnum
 from pathlib import Path
 
 import pytest
-from halls import Hall
+from simulated_bus import SimulatedBus
 
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
 from multidrop.drive.register import Kept, command, reading, setting
@@ -77,12 +77,12 @@ class Known(Pump):
 STOP, RUN = "01 06 00 30 00 00", "01 06 00 30 00 01"
 
 
-def written(hall: Hall) -> list[str]:
+def written(hall: SimulatedBus) -> list[str]:
     return [frame[:17] for frame in hall.written]
 
 
 def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = Hall(monkeypatch, simulated(Fan(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Fan(1)))
     fan = hall.attach(Fan(1))
     assert hall.bus.write(fan, fan.frequency, 25.0) == 25.0
     assert "confirmed" not in Fan.options
@@ -93,7 +93,7 @@ def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) 
 def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
     monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
 ) -> None:
-    hall = Hall(monkeypatch, simulated(Pump(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = hall.attach(Pump(1, name="pump", confirmed=confirmed))
     with pytest.raises(Refused) as refusal:
         hall.bus.write(pump, pump.control, word)
@@ -111,7 +111,7 @@ def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pyte
         level = reading(1)
         run = command(2)
 
-    hall = Hall(monkeypatch, simulated(Bare(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Bare(1)))
     bare = hall.attach(Bare(1, confirmed=1))
     with pytest.raises(
         Refused, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
@@ -126,7 +126,7 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 
-    hall = Hall(monkeypatch, simulated(Stoppable(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
     pump = hall.attach(Stoppable(1))
     hall.bus.write(pump, pump.control, Word.STOP)
     with pytest.raises(Refused, match="RUN commands the motor"):
@@ -138,7 +138,7 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
 def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    def command_it(hall: Hall, pump: Pump) -> None:
+    def command_it(hall: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
             "set_frequency": lambda: pump.set_frequency(20.0),
@@ -146,7 +146,7 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
         }
         acts[name]()
 
-    hall = Hall(monkeypatch, simulated(Pump(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = hall.attach(Pump(1, name="pump"))
     with pytest.raises(Refused) as refusal:
         command_it(hall, pump)
@@ -164,13 +164,13 @@ def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
 def test_a_stop_is_never_withheld_for_want_of_a_confirmation(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    hall = Hall(monkeypatch, simulated(Pump(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
     getattr(hall.attach(Pump(1)), name)()
     assert written(hall) == [STOP]
 
 
 def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = Hall(monkeypatch, simulated(Pump(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
     hall.attach(Pump(1))
     hall.bus.stop_all()
     assert written(hall) == [STOP]
@@ -178,7 +178,7 @@ def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "confirmed" in Pump.options
-    hall = Hall(monkeypatch, simulated(Known(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Known(1)))
     hall.attach(Known(1)).start()
     assert written(hall) == [RUN]
 
@@ -190,7 +190,7 @@ def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch
         control = setting(1, Word, moves=True, harmless=(Word.STOP,), kept=Kept.RAM)
         mode = setting(2, moves=True, kept=Kept.RAM)
 
-    hall = Hall(monkeypatch, simulated(Readable(1)))
+    hall = SimulatedBus(monkeypatch, simulated(Readable(1)))
     drive = hall.attach(Readable(1, confirmed=1))
     for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
         with pytest.raises(Refused, match="commands the motor"):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import checksums
 import pytest
-from halls import one
 from scripts import Wire, rows, typed
+from simulated_bus import one
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import (

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from halls import one
+from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
-from test_drives_delixi_modbus import MONITORS
+from simulated_bus import one
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported

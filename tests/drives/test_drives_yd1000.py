@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import checksums
 import pytest
-from halls import one
 from scripts import Wire, frame, rows, typed
+from simulated_bus import one
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
 from multidrop.drive.register import Kept

@@ -15,7 +15,7 @@ from typing import Any
 
 import checksums
 import pytest
-from halls import Hall, one, text
+from simulated_bus import SimulatedBus, one, text
 
 from multidrop.core import Framing, Message, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
@@ -59,7 +59,7 @@ class Hazard:
 
     place: str
     drive: Callable[[], Drive]
-    do: Callable[[Hall, Any, Any], object]
+    do: Callable[[SimulatedBus, Any, Any], object]
     naive: str
     sends: tuple[str, ...] = ()
     refuses: str = ""  # the sentence with which it is refused
@@ -68,36 +68,36 @@ class Hazard:
     turning: bool = False  # it was given a setpoint, started, and has run for a second
 
 
-def start(hall: Hall, drive: Any, sim: Any) -> None:
+def start(hall: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.start()
 
 
-def run(hall: Hall, drive: Any, sim: Any) -> None:
+def run(hall: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.set_frequency(20)
     drive.start()
 
 
-def stop(hall: Hall, drive: Any, sim: Any) -> None:
+def stop(hall: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.stop()
 
 
-def reset(hall: Hall, drive: Any, sim: Any) -> None:
+def reset(hall: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.reset_fault()
 
 
-def direct(direction: Direction) -> Callable[[Hall, Any, Any], None]:
+def direct(direction: Direction) -> Callable[[SimulatedBus, Any, Any], None]:
     return lambda hall, drive, sim: drive.start(direction)
 
 
-def frequency(hz: float) -> Callable[[Hall, Any, Any], None]:
+def frequency(hz: float) -> Callable[[SimulatedBus, Any, Any], None]:
     return lambda hall, drive, sim: drive.set_frequency(hz)
 
 
-def write(name: str, value: Any) -> Callable[[Hall, Any, Any], object]:
+def write(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
     return lambda hall, drive, sim: hall.bus.write(drive, drive.register(name), value)
 
 
-def broadcast(name: str, value: Any) -> Callable[[Hall, Any, Any], object]:
+def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
     return lambda hall, drive, sim: hall.bus.broadcast(drive.register(name), value)
 
 
@@ -686,7 +686,7 @@ def test_0_8_what_wears_an_eeprom_is_declared() -> None:
 
 def test_0_3_an_adapter_s_echo_is_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing but the request's copy ever comes: no write leaves, because no read is answered."""
-    hall = Hall(monkeypatch)
+    hall = SimulatedBus(monkeypatch)
     drives = [hall.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
         for script in (drive.set_frequency.script(20), drive.start.script(), drive.reset_fault.script()):

@@ -10,9 +10,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from c_programs import CC, SANITIZERS, STRICT
 from harness import HERE, command
 from readers import READERS, read
-from test_c import CC, SANITIZERS, STRICT
 
 CORPUS = HERE / "corpus"
 HARNESSES = sorted(path.stem.removeprefix("fuzz_") for path in HERE.glob("fuzz_*.c"))

@@ -1,27 +1,17 @@
 """The house's walls, kept by reading the imports."""
 
-import ast
+from __future__ import annotations
+
 from pathlib import Path
 
-import pytest
+from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
 
 import multidrop
 
-ROOT = Path(multidrop.__file__).parent
-FILES = sorted(ROOT.rglob("*.py"))
+FILES = files("src")
 OUTSIDE = {
-    "os",
-    "time",
-    "select",
-    "selectors",
-    "socket",
-    "serial",
-    "termios",
-    "fcntl",
-    "pty",
-    "tty",
-    "signal",
-    "subprocess",
+    *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),
+    *("signal", "subprocess"),
 }
 # from the ground up: a room imports from itself and from those below it
 FLOORS = [
@@ -38,69 +28,81 @@ FLOORS = [
     {"recording", "sim", "scan"},
     {"capture", "report"},
     {"cli"},
+    {"__init__", "__main__"},
 ]
-SYSTEM_ROOMS = {"transport", "recording", "sim", "cli"}
-TOUCHING_THE_SYSTEM = {
+TOUCHING_THE_SYSTEM = {"transport", "recording", "sim", "cli"}
+FILES_TOUCHING_THE_SYSTEM = {
     "core/fork.py",
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
-    *(
-        str(path.relative_to(ROOT))
-        for room in ("transport", "recording", "sim", "cli")
-        for path in (ROOT / room).rglob("*.py")
-    ),
 }
 
 
-def test_public_names_are_told_before_they_are_used() -> None:
-    """Each is loaded when it is asked for the first time."""
-    assert set(multidrop.__all__) <= set(dir(multidrop))
-
-
-def imports(path: Path) -> set[str]:
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names if node.module == "multidrop"}
-    return found
-
-
 def room(path: Path) -> str:
-    return path.relative_to(ROOT).parts[0].removesuffix(".py")
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def ours(path: Path) -> set[str]:
-    return {name.split(".")[1] for name in imports(path) if name.startswith("multidrop.")}
+def rooms(modules: set[str]) -> set[str]:
+    return {name.split(".")[1] for name in modules if name.startswith("multidrop.")}
 
 
 def floor(name: str) -> int:
+    """Return the floor of a room, or of a public name: those stand above all rooms."""
     return next((number for number, names in enumerate(FLOORS) if name in names), len(FLOORS))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_only_core_imports_the_compiled_module(path: Path) -> None:
-    assert "_core" not in ours(path) or room(path) == "core"
+def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
+    return {name: wrong for name, wrong in found.items() if wrong}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_only_these_touch_the_system(path: Path) -> None:
-    if room(path) not in SYSTEM_ROOMS and str(path.relative_to(ROOT)) not in TOUCHING_THE_SYSTEM:
-        assert not imports(path) & OUTSIDE
+def upwards(path: Path, modules: set[str]) -> set[str]:
+    others = rooms(modules) - {"_core", room(path)}
+    return {name for name in others if floor(name) >= floor(room(path))}
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "drives").glob("*.py")), ids=lambda path: path.stem)
-def test_a_family_imports_drive_alone(path: Path) -> None:
-    assert ours(path) <= {"drive", "drives"}
+def test_public_names_are_listed_before_they_are_loaded() -> None:
+    assert set(multidrop.__all__) <= set(dir(multidrop))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_point_downwards(path: Path) -> None:
-    if room(path) == "__init__":
-        return
-    assert floor(room(path)) < len(FLOORS), f"{room(path)} has no floor yet"
-    floors = {name: floor(name) for name in ours(path) - {"_core", room(path)}}
-    assert {name for name, above in floors.items() if above >= floor(room(path))} == set()
+def test_every_room_has_its_floor() -> None:
+    assert {room(path) for path in FILES} <= set().union(*FLOORS)
+
+
+def test_only_core_imports_the_compiled_module() -> None:
+    found = {str(path.relative_to(PACKAGE)) for path in FILES if "_core" in rooms(run_time_imports(path))}
+    assert {name for name in found if not name.startswith("core/")} == set()
+
+
+def test_only_these_touch_the_system() -> None:
+    outside = {str(path.relative_to(PACKAGE)): run_time_imports(path) & OUTSIDE for path in FILES}
+    allowed = {name for name in outside if name.split("/")[0] in TOUCHING_THE_SYSTEM}
+    allowed |= FILES_TOUCHING_THE_SYSTEM
+    assert offenders({name: found for name, found in outside.items() if name not in allowed}) == {}
+
+
+def test_a_family_imports_drive_alone() -> None:
+    families = sorted((PACKAGE / "drives").glob("*.py"))
+    found = {path.name: rooms(run_time_imports(path)) - {"drive", "drives"} for path in families}
+    assert offenders(found) == {}
+
+
+def test_imports_point_downwards() -> None:
+    found = {str(path.relative_to(PACKAGE)): upwards(path, run_time_imports(path)) for path in FILES}
+    assert offenders(found) == {}
+
+
+def test_imports_for_types_alone_point_downwards_too() -> None:
+    """A room whose annotations name what stands above it knows too much."""
+    found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
+    assert offenders(found) == {}
+
+
+def test_no_test_imports_another_one() -> None:
+    tests = files("tests")
+    names = {path.stem for path in tests if path.name.startswith("test_")}
+    assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in tests}) == {}
+
+
+def _imported(path: Path) -> set[str]:
+    return run_time_imports(path) | type_imports(path)

@@ -17,7 +17,7 @@ from multidrop.drives.registry import find_model
 from multidrop.errors import DriveRefused, NoReply
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
-DEVICE = f"{Path(__file__).parents[1] / 'support' / 'device.py'}:Device"
+DEVICE = f"{Path(__file__).parents[1] / 'support' / 'server_device.py'}:Device"
 Device = find_model(DEVICE)
 ADDRESS = 7
 

@@ -10,27 +10,10 @@ import pyarrow as pa
 import pytest
 from batches import EXAMPLE, SECOND, UTC_0, block, completion, counting, example
 from completions import add_miss, add_rows
+from recordings import SCHEMA, rows_of
 
 from multidrop.core import Columns, Names, Status
 from multidrop.polling.batch import Batch, Row
-
-SCHEMA = pa.schema(
-    [
-        pa.field("time", pa.timestamp("ns", "UTC"), nullable=False),
-        pa.field("monotonic_ns", pa.int64(), nullable=False),
-        pa.field("uncertainty_ns", pa.int64()),
-        pa.field("drive", pa.string(), nullable=False),
-        pa.field("register", pa.string(), nullable=False),
-        pa.field("value", pa.float64()),
-        pa.field("status", pa.string(), nullable=False),
-    ]
-)
-
-
-def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
-    """What pyarrow sees, with the time as a number."""
-    numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
-    return [Row(**row) for row in numbers.to_pylist()]
 
 
 def test_rows_for_people() -> None:

@@ -10,35 +10,23 @@ import gc
 import os
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from lines import polled, proofs, rows_of
-from test_mixed_line import REASONS, VARIANTS
+from lines import polled, rows_of
+from stories import HEALTHY, Story
+from variants import LINES, VARIANTS, of_all_variants, of_one_variant
 from worlds import World, WorldWire
 
-from multidrop import poller
-from multidrop.core import Framing, Message, Status
+from multidrop.core import Framing
 from multidrop.drive import Drive
-from multidrop.drives import YD1000, DelixiNative
-from multidrop.planning import schedule
-from multidrop.plant.model import PolledDrive
-from multidrop.polling import polled_line
-from multidrop.polling.batch import Row
-from multidrop.sim import EncodedDrive, Faults, simulated
+from multidrop.drives import DelixiNative
+from multidrop.sim import Faults, simulated
 from multidrop.sim.faults import RATES
 
 pytestmark = pytest.mark.story
 
-S = 1_000_000_000
-REGISTERS = 5  # of each drive
-EVERY = 0.5  # s, of the first of them; the others as fast as the line allows
-HEALTHY, FAULTY = 4.0, 8.0  # s
-CYCLES = 10  # in which the rate must be back, but for what one of them holds
 MOST_GROWTH_KB = 2048
 
 KINDS = {
@@ -66,126 +54,6 @@ NOT_TOLD = {
     "echo": (Framing.DELIXI,),
     "echo now and then": (Framing.DELIXI,),
 }
-
-UNASKED = {str(it) for it in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
-START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
-
-
-def of_one_variant(number: int) -> list[Drive]:
-    """Two drives of one family and framing."""
-    family, framing, _ = VARIANTS[number]
-    return [family(address, name=f"drive-{address}", framing=framing) for address in (1, 2)]
-
-
-def of_all_variants() -> list[Drive]:
-    return [
-        family(address, name=f"drive-{address}", framing=framing)
-        for address, (family, framing, _) in enumerate(VARIANTS, 1)
-    ]
-
-
-LINES = {f"{family.model} {framing}": number for number, (family, framing, _) in enumerate(VARIANTS)}
-
-
-class Story:
-    """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
-
-    wires: type[WorldWire] = WorldWire
-
-    def __init__(self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY) -> None:
-        self.every = every
-        self.asked = [_polls(drive, every) for drive in drives]
-        self.motor = YD1000(31, name="motor")
-        sims = [*(EncodedDrive(drive) for drive in drives), simulated(self.motor)]
-        self.wire: Any = self.wires(sims, Faults(seed=seed))
-        motor = polled(self.motor, self.motor.readings()[:1], every)
-        self.world = World(self.wire, [*self.asked, motor])
-        self.truth = proofs(*self.asked)
-        self.rows: list[Row] = []
-        self.drives = [*drives, self.motor]
-
-    def run(self, seconds: float) -> list[Row]:
-        first = len(self.rows)
-        self.rows += self.world.run(seconds)
-        return self.rows[first:]
-
-    def run_motor(self, seconds: float) -> None:
-        """So many seconds, in each of which the motor starts and stops."""
-        for _ in range(round(seconds)):
-            for command in (START, STOP):
-                self.world.command(self.motor, command)
-                self.run(0.5)
-
-    def tell(self, faults: Faults) -> None:
-        """Health, the fault, and its end, after which the rate must be back."""
-        with self.world:
-            cycle = _longest_gap([row for row in self.run(HEALTHY) if row.value is not None])
-            healthy = [row for row in self.run(CYCLES * cycle) if row.value is not None]
-            self.wire.faults = faults
-            self.run_motor(FAULTY)
-            self.wire.faults = Faults()
-            self.run(2 * faults.late)  # what is on its way comes
-            begin = self.back_off_is_over() + round(cycle * S)
-            end = begin + round(CYCLES * cycle * S)
-            self.run((end - self.world.now) / S)
-            again = [row for row in self.rows if begin <= row.monotonic_ns < end]
-            assert len(again) >= len(healthy) * (CYCLES - 1) / CYCLES
-            assert {row.status for row in again} == {"ok"}
-        self.rows += rows_of(self.world.poller)
-        self.judge()
-
-    def back_off_is_over(self) -> int:
-        """Let time pass until every drive was asked again; when that was.
-
-        It takes until the port is opened again, and silent drives have rested for their share of the line.
-        """
-        cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
-        longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
-        longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
-        ended = self.world.now
-        asked: dict[str, int] = {}
-        while len(asked) < len(self.drives):
-            assert self.world.now <= ended + longest * S
-            for row in self.run(0.5):
-                if row.monotonic_ns >= ended and row.status not in UNASKED:
-                    asked.setdefault(row.drive, row.monotonic_ns)
-        return max(asked.values())
-
-    def judge_values(self) -> None:
-        wrong = [
-            (row, self.truth[row.drive, row.register])
-            for row in self.rows
-            if row.value not in (None, self.truth.get((row.drive, row.register), row.value))
-        ]
-        assert wrong == []
-
-    def judge(self) -> None:
-        self.judge_values()
-        misses = Counter(row.status for row in self.rows if row.value is None)
-        assert {why for why in misses if not why.startswith("exception ")} <= REASONS
-        told = self.world.poller.summary()
-        line = told["lines"]["line"]
-        assert told["dropped"] == 0
-        assert told["samples"] + misses.total() == len(self.rows)
-        assert Counter(line["misses"]) == misses
-        slots = int(self.world.seconds / self.every) - 1 if self.every else 0
-        rows = Counter((row.drive, row.register) for row in self.rows)
-        missing = sum(max(0, slots - rows[it.drive.name, it.polls[0].register.name]) for it in self.asked)
-        assert missing <= line["overrun_slots"]
-
-
-def _polls(drive: Drive, every: float | None) -> PolledDrive:
-    first, *others = drive.readings()[:REGISTERS]
-    timed, quick = polled(drive, [first], every), polled(drive, others)
-    return PolledDrive(drive, (*timed.polls, *quick.polls))
-
-
-def _longest_gap(rows: Sequence[Row]) -> float:
-    """The bus cycle in s: the longest time between two values of one register."""
-    times: dict[tuple[str, str], list[int]] = {}
-    for row in rows:
-        times.setdefault((row.drive, row.register), []).append(row.monotonic_ns)
-    return max(b - a for it in times.values() for a, b in pairwise(it)) / S
 
 
 def descriptors() -> int:

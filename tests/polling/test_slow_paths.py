@@ -13,7 +13,8 @@ from typing import Any, cast
 import pytest
 from lines import proof
 from motors import MAKE, Heard
-from test_hostile_line import LINES, Story, of_all_variants, of_one_variant
+from stories import Story
+from variants import LINES, of_all_variants, of_one_variant
 from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 
 from multidrop import bus

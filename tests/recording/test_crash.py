@@ -20,8 +20,8 @@ from pathlib import Path
 from time import sleep
 
 import pytest
+from killable_client import METADATA, NAME, Counted, audit, ledger
 from lines import until
-from mortal import METADATA, NAME, Counted, audit, ledger
 
 from multidrop.control.audit_log import read_audit
 from multidrop.polling.batch import Row
@@ -59,7 +59,7 @@ class Nursery:
         self._port = port
         self._directory = directory
         self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parents[1] / "support" / "mortal.py")],
+            [sys.executable, str(Path(__file__).parents[1] / "support" / "killable_client.py")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -17,7 +17,7 @@ import pytest
 from batches import EXAMPLE, METADATA, counting, example
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_batch import SCHEMA, rows_of
+from recordings import SCHEMA, rows_of
 
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import (

@@ -19,7 +19,7 @@ import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
 from completions import add_rows
 from disks import full_at, read_only_directory
-from test_batch import rows_of
+from recordings import rows_of
 from toy import Toy
 
 from multidrop.core import Columns

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from batches import METADATA, SECOND, UTC_0, example
-from test_cli import Run, run
+from commands import Run
+from recordings import ABOUT, record, row
 
 import multidrop.cli.support.extra
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
-from multidrop.recording.rows import from_rows
 from multidrop.report import Selection, load, plot, plot_page, png, report_page
 from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
 from multidrop.report.html import _about, _drives
@@ -26,41 +26,8 @@ from multidrop.report.lanes import MOST_LANES
 from multidrop.report.utilisation import used
 from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
-__all__ = ["run"]  # a fixture
-
 PNG = b"\x89PNG\r\n\x1a\n"
-FAULTS = {"NONE": 0, "OVERHEAT": 8, "OVERLOAD": 9}
-ABOUT: dict[str, Any] = {
-    "plant": "hall.toml",
-    "drives": {
-        "pump": {
-            "line": "hall-1",
-            "model": "invt-che",
-            "address": 1,
-            "settings": "9600 8N1",
-            "framing": "rtu",
-            "registers": {
-                "output_frequency": {"unit": "Hz", "step": 0.01, "function": 3, "address": 7, "words": 1},
-                "fault": {"unit": "", "step": 1, "values": FAULTS, "function": 3, "address": 8, "words": 1},
-            },
-        },
-        "fan": {
-            "framing": "rtu",
-            "registers": {
-                "output_current": {"unit": "A", "step": None, "function": 3, "address": 4, "words": 1}
-            },
-        },
-    },
-}
 REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
-
-
-def row(
-    second: float, drive: str, register: str, value: float | None, status: str = "ok", ms: float = 20.0
-) -> Row:
-    at = round(second * SECOND)
-    uncertainty = None if value is None else round(ms * 1e6)
-    return Row(UTC_0 + at, at, uncertainty, drive, register, value, status)
 
 
 def noisy_ramp() -> list[Row]:
@@ -79,13 +46,6 @@ def noisy_ramp() -> list[Row]:
         rows.append(row(second, "fan", "output_current", 5.0, ms=12.0 + tick % 10))
     rows.append(row(100, "fan", "output_current", None, "no reply"))
     return rows
-
-
-def record(path: Path, rows: list[Row], about: dict[str, Any] = ABOUT, pieces: int = 7) -> Path:
-    with open_writer(path, about) as writer:
-        for at in range(0, len(rows), len(rows) // pieces + 1):
-            writer.write(from_rows(rows[at : at + len(rows) // pieces + 1]))
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from typing import Any
 import checksums
 import pytest
 from lines import until
-from test_sim_wire import timeline
 from toy import Toy
+from wire_time import timeline
 
 from multidrop.bus import exchange
 from multidrop.cli import main

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import select
 import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 import checksums
 import pytest
+from raw_client import PATIENCE, opened, receive
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
 from multidrop.drives.delixi_native import DelixiNative
@@ -24,7 +23,6 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire, encoded, serve, simulated
 
-PATIENCE = 5.0  # s until a reply that should come is given up; never waited for when all is well
 READ = Message(1, 0x03, 0x3000, 2)  # of a CHE
 
 
@@ -35,29 +33,6 @@ def wire(*, unpaced: bool = True, port: str = "pty") -> Wire:
 def expected(address: int = 1) -> bytes:
     table = InvtCHE.output_frequency.table
     return b"".join(encoded(address, table, at).to_bytes(2) for at in (0x3000, 0x3001))
-
-
-@contextmanager
-def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
-    """A descriptor, as a client has it."""
-    if path.startswith("socket://"):
-        host, _, port = path.removeprefix("socket://").partition(":")
-        with socket.create_connection((host, int(port))) as client:
-            yield client.fileno()
-        return
-    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    try:
-        set_settings(fd, baudrate, "8N1")
-        yield fd
-    finally:
-        os.close(fd)
-
-
-def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
-    heard = b""
-    while len(heard) < length and select.select([fd], [], [], patience)[0]:
-        heard += os.read(fd, 1024)
-    return heard
 
 
 def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Message:

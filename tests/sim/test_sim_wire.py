@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import checksums
 import pytest
+from wire_time import Own, timeline
 
-from multidrop.core import Framing
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, setting
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.delixi_native import DelixiNative
 from multidrop.drives.erman_er_g_220 import ErmanERG220
@@ -16,30 +15,8 @@ from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
 from multidrop.sim import SimulatedDrive, Wire, simulated
 
-
-class Own(Drive):
-    framings = (Framing.RTU, Framing.ASCII)
-    most_registers = {HOLDING: 10}
-    broadcasts = True
-    value = setting(0x01)
-    another = setting(0x02)
-
-
 READ = checksums.rtu("01 03 00 01 00 01")
 CHARACTER_8N1 = 10 / 9600
-
-
-def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
-    """Every piece that the client hears, at the wake that brings it."""
-    heard = []
-    for _ in range(10_000):
-        wake = wire.wake
-        if wake is None or wake > until:
-            break
-        piece = wire.advance(wake)
-        if piece:
-            heard.append((wake, piece))
-    return heard
 
 
 def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) -> bytes:

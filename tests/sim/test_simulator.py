@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 
-from test_sim_wire import Own
+from wire_time import Own
 
 from multidrop.sim import Simulator, Wire, serve, simulated
 

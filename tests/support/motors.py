@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from own_fan import Fan
+
 from multidrop.core import Message
 from multidrop.drive import Drive
 from multidrop.drives import MODELS, YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
@@ -29,8 +31,16 @@ STARTS: dict[str, Callable[[Message], bool]] = {
     "delixi-native": lambda it: it.function == 2 and it.start in (2, 3),
     "yd1000": lambda it: it.start == 0x1000 and (bool(it.data[0] & 0x05) or not it.data[0] & 0x80),
 }
+FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
 WRITES = (5, 6, 15, 16)
 DELIXI_WRITES = (2, 4, 5, 6)
+
+
+def quick(kind: str) -> type[Drive]:
+    """Return the family without its silences, which a responder does not need."""
+    family = FAMILIES[kind]
+    without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
+    return type(family.__name__, (family,), without)
 
 
 class Heard:

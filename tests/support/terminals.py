@@ -9,13 +9,12 @@ import re
 import select
 import struct
 import subprocess
-import sys
 import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
+from commands import MULTIDROP
 
 
 class Terminal:

@@ -6,13 +6,12 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from lines import line, plant, polled, rows_of, until
-from serial import Serial, rfc2217
+from serial import Serial
+from serial_server import SerialServer, pyserials_own, vanishing_pty
 from toy import PatientToy, Toy
 
 from multidrop.bus import Bus
@@ -122,58 +121,12 @@ def test_a_port_that_does_hold_bytes_back_is_opened(
         read_and_write(bus)
 
 
-class SerialServer:
-    """A port at the far end of a network (RFC 2217), behind which is a simulated line.
-
-    Its settings are only kept here, where a test can see them.
-    """
-
-    def __init__(self, path: str) -> None:
-        settings = {"baudrate": 0, "bytesize": 8, "parity": "N", "stopbits": 1}
-        modem_lines = {"cts": True, "dsr": True, "ri": False, "cd": True}
-        flushes = dict.fromkeys(("reset_input_buffer", "reset_output_buffer"), lambda: None)
-        self.port = SimpleNamespace(**settings, **modem_lines, **flushes)
-        host, port = path.removeprefix("socket://").split(":")
-        self._wire = socket.create_connection((host, int(port)))
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.url = f"rfc2217://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        client, _ = self._listener.accept()
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        manager = rfc2217.PortManager(self.port, SimpleNamespace(write=client.sendall))
-        back = threading.Thread(target=self._copy_back, args=(client, manager), daemon=True)
-        back.start()
-        with suppress(OSError):  # whoever is connected may leave while it is spoken to
-            while received := client.recv(1024):
-                self._wire.sendall(b"".join(manager.filter(received)))
-        with suppress(OSError):
-            self._wire.shutdown(socket.SHUT_RDWR)
-        back.join()
-        client.close()
-
-    def _copy_back(self, client: socket.socket, manager: rfc2217.PortManager) -> None:
-        with suppress(OSError):
-            while heard := self._wire.recv(1024):
-                client.sendall(b"".join(manager.escape(heard)))
-
-    def close(self) -> None:
-        self._thread.join()
-        self._listener.close()
-        self._wire.close()
-
-
 @pytest.fixture
 def server() -> Iterator[SerialServer]:
     with Simulator([wire("socket://127.0.0.1:0")]) as sim:
         server = SerialServer(sim.wires[0].path)
         yield server
         server.close()
-
-
-pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning")
 
 
 @pyserials_own
@@ -264,19 +217,6 @@ def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path)
 
 
 # ---- ports that fail later ----
-
-
-def vanishing_pty() -> tuple[str, Callable[[], None]]:
-    """A pty that hangs up, as an adapter does that is pulled, when it has heard a request."""
-    master, slave = os.openpty()
-    path = os.ttyname(slave)
-
-    def hang_up() -> None:
-        os.read(master, 1024)
-        os.close(slave)
-        os.close(master)
-
-    return path, hang_up
 
 
 def vanishing_socket() -> tuple[str, Callable[[], None]]:

@@ -12,10 +12,10 @@ from checksums import rtu
 from hypothesis import given
 from hypothesis import strategies as st
 from line_driver import MS, LineDriver
+from line_exchanges import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
 from multidrop._core import ffi, lib
-from test_learning import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from toy import Toy
 
 import multidrop.transport.line

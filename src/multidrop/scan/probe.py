@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from multidrop.core import Completion, Message, Peer
+from multidrop.core import Completion, Failure, Message, Peer
 from multidrop.drive.family import Drive
 from multidrop.scan.identify import identify
 from multidrop.scan.results import Found

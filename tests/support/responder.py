@@ -1,4 +1,4 @@
-"""Ports with far ends of our own, kept by one thread: ptys that may vanish, and sockets."""
+"""Responders behind ports, kept by one thread: ptys that may vanish, and sockets."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from far_line import FarLine, Heard
-from far_telnet import Telnet
+from responder_line import Heard, ResponderLine
+from responder_telnet import Telnet
 
-__all__ = ["FarEnd", "FarLine", "Heard"]
+__all__ = ["Heard", "Responder", "ResponderLine"]
 
 
-class FarEnd:
-    """Ports with their far ends, kept by one thread; `ports` are what a client opens.
+class Responder:
+    """Responders behind ports, kept by one thread; `ports` are what a client opens.
 
     A pty is opened under a link in `directory`, so that it can vanish and come back. Instead there may
     be sockets that listen, one a line, on which Telnet's serial port option is spoken or nothing but bytes.
@@ -28,21 +28,21 @@ class FarEnd:
 
     def __init__(
         self,
-        lines: Sequence[FarLine],
+        lines: Sequence[ResponderLine],
         directory: Path | None = None,
         listening: Sequence[socket.socket] = (),
         telnet: bool = False,
     ) -> None:
         self.lines = list(lines)
-        self._telnets: dict[FarLine, Telnet] = {}
+        self._telnets: dict[ResponderLine, Telnet] = {}
         self._is_telnet = telnet
         self.ports: list[str] = []
         self._links: list[Path] = []
-        self._slaves: dict[FarLine, int] = {}
-        self._masters: dict[FarLine, int] = {}
-        self._sockets: dict[FarLine, socket.socket] = {}
+        self._slaves: dict[ResponderLine, int] = {}
+        self._masters: dict[ResponderLine, int] = {}
+        self._sockets: dict[ResponderLine, socket.socket] = {}
         self._listening = list(listening)
-        self._delayed: list[tuple[float, FarLine, bytes]] = []
+        self._delayed: list[tuple[float, ResponderLine, bytes]] = []
         self._ready = selectors.DefaultSelector()
         self._jobs: list[Callable[[], Any]] = []
         self._wake, self._waker = os.pipe()
@@ -56,10 +56,10 @@ class FarEnd:
             self._listen(line, it)
             host, port = it.getsockname()
             self.ports.append(f"{'rfc2217' if telnet else 'socket'}://{host}:{port}")
-        self._thread = threading.Thread(target=self._run, name="far end", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="responder", daemon=True)
         self._done = False
 
-    def __enter__(self) -> FarEnd:
+    def __enter__(self) -> Responder:
         self._thread.start()
         return self
 
@@ -76,7 +76,7 @@ class FarEnd:
 
     # ---- ports ----
 
-    def _plug_in(self, line: FarLine) -> None:
+    def _plug_in(self, line: ResponderLine) -> None:
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -87,10 +87,10 @@ class FarEnd:
         self._masters[line], self._slaves[line] = master, slave
         self._ready.register(master, selectors.EVENT_READ, lambda: self._read(line))
 
-    def _listen(self, line: FarLine, listening: socket.socket) -> None:
+    def _listen(self, line: ResponderLine, listening: socket.socket) -> None:
         self._ready.register(listening, selectors.EVENT_READ, lambda: self._accept(line, listening))
 
-    def _accept(self, line: FarLine, listening: socket.socket) -> None:
+    def _accept(self, line: ResponderLine, listening: socket.socket) -> None:
         if line in self._sockets:
             self._hang_up(line)
         connection, _ = listening.accept()
@@ -102,12 +102,12 @@ class FarEnd:
         line.reconnected()
         self._ready.register(connection, selectors.EVENT_READ, lambda: self._read(line))
 
-    def _hang_up(self, line: FarLine) -> None:
+    def _hang_up(self, line: ResponderLine) -> None:
         connection = self._sockets.pop(line)
         self._ready.unregister(connection)
         connection.close()
 
-    def lose(self, line: FarLine) -> None:
+    def lose(self, line: ResponderLine) -> None:
         """Take the port away, as when an adapter is unplugged."""
 
         def unplug() -> None:
@@ -119,7 +119,7 @@ class FarEnd:
 
         self.do(unplug)
 
-    def bring_back(self, line: FarLine) -> None:
+    def bring_back(self, line: ResponderLine) -> None:
         def plug_in() -> None:
             line.reconnected()
             self._plug_in(line)
@@ -129,7 +129,7 @@ class FarEnd:
     # ---- the thread ----
 
     def do(self, job: Callable[[], Any]) -> None:
-        """Have the far end's thread do this, and wait until it is done."""
+        """Run the job in the responder thread, and wait until it is done."""
         done = threading.Event()
 
         def do_and_tell() -> None:
@@ -140,7 +140,7 @@ class FarEnd:
         os.write(self._waker, b"\0")
         done.wait()  # a signal's handler may end this wait, and the job is done all the same
 
-    def release(self, line: FarLine) -> None:
+    def release(self, line: ResponderLine) -> None:
         """Give the replies that were held back."""
 
         def give() -> None:
@@ -163,7 +163,7 @@ class FarEnd:
                 _, line, said = self._delayed.pop(0)
                 self._send(line, said)
 
-    def _read(self, line: FarLine) -> None:
+    def _read(self, line: ResponderLine) -> None:
         try:
             connection = self._sockets.get(line)
             received = connection.recv(4096) if connection else os.read(self._masters[line], 4096)
@@ -184,7 +184,7 @@ class FarEnd:
             else:
                 self._send(line, said)
 
-    def _send(self, line: FarLine, said: bytes) -> None:
+    def _send(self, line: ResponderLine, said: bytes) -> None:
         with suppress(OSError, KeyError):
             if line in self._sockets:
                 self._sockets[line].send(Telnet.encode(said) if self._is_telnet else said)

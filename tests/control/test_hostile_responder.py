@@ -3,7 +3,7 @@
 As test_hostile_line.py, which has more kinds of faults, but with nothing of the library at the far end: what
 the drives hold, the checksums and the judge of what we send are our own. A seed makes the same faults in
 the same order; the port and the time are real. For longer:
-`HOSTILE_SEEDS=50 pytest tests/control/test_hostile_far_end.py`.
+`HOSTILE_SEEDS=50 pytest tests/control/test_hostile_responder.py`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from pathlib import Path
 
 import checksums
 import pytest
-from far_drives import KINDS, FarDrive
-from far_end import FarEnd, FarLine
 from lines import line, plant, polled, rows_of, until
-from test_mixed_line import REASONS
-from test_stop_wins import quick
+from motors import quick
+from responder import Responder, ResponderLine
+from responder_drives import KINDS, ResponderDrive
+from variants import REASONS
 
 from multidrop.drive import Drive
 from multidrop.errors import BusError
@@ -85,9 +85,9 @@ class Hostile:
         )
 
 
-def far_drive(kind: str, drive: PolledDrive) -> FarDrive:
+def responder_drive(kind: str, drive: PolledDrive) -> ResponderDrive:
     """It holds another number in each register that is polled, and no two drives share one."""
-    found = FarDrive(KINDS[kind], drive.drive.address)
+    found = ResponderDrive(KINDS[kind], drive.drive.address)
     for at, poll in enumerate(drive.polls):
         found.hold(poll.register.address, value(drive.drive.address, at))
     return found
@@ -107,9 +107,9 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
         for kind, it in drives.items()
     }
     asked[MOTOR] = polled(drives[MOTOR], [])  # its values are its motor's
-    far_line = FarLine([far_drive(kind, it) for kind, it in asked.items()])
+    responder_line = ResponderLine([responder_drive(kind, it) for kind, it in asked.items()])
     hostile = Hostile(seed)
-    far_line.mangle = hostile.mangle
+    responder_line.mangle = hostile.mangle
     starts: list[str] = []
     over = threading.Event()
 
@@ -124,12 +124,12 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
                 with suppress(BusError):
                     act()
 
-    with FarEnd([far_line], Path(os.environ["XDG_STATE_HOME"])) as far:
+    with Responder([responder_line], Path(os.environ["XDG_STATE_HOME"])) as far:
         poller = Poller(plant(line(far.ports[0], *asked.values())))
         with poller:
             commander = threading.Thread(target=command)
             commander.start()
-            until(lambda: len(far_line.log) >= FRAMES, patience=120)
+            until(lambda: len(responder_line.log) >= FRAMES, patience=120)
             over.set()
             commander.join()
     truth = {
@@ -144,7 +144,7 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
     assert {row.drive for row in samples} == set(drives) - {MOTOR}
     misses = {row.status for row in rows if row.value is None}
     assert {it for it in misses if not it.startswith("exception ")} <= REASONS
-    assert [str(it) for it in far_line.log if it.what == "damaged"] == []
-    moves = [str(it) for it in far_line.log if it.what == "moves"]
+    assert [str(it) for it in responder_line.log if it.what == "damaged"] == []
+    moves = [str(it) for it in responder_line.log if it.what == "moves"]
     assert len(moves) <= len(starts), "a motor was started that nobody started, or twice"
     assert hostile.struck.total() > FRAMES / 10

@@ -1,4 +1,4 @@
-"""One line's far end: it splits, checks and answers frames by itself, and notes each with its time.
+"""One line of responders: it splits, checks and answers frames by itself, and notes each with its time.
 
 Nothing in it is the library's: checksums are those of checksums.py.
 """
@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import checksums
-from far_drives import DELIXI, Asked, FarDrive
+from responder_drives import DELIXI, Asked, ResponderDrive
 
 READS, WRITES = (1, 2, 3, 4), (5, 6, 15, 16)
 DELIXI_WRITES = (2, 4, 5, 6)
@@ -70,7 +70,7 @@ def _standard(body: bytes) -> Asked:
     return Asked(body[0], body[1], int.from_bytes(body[2:4]), int.from_bytes(value))
 
 
-def reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int = 0) -> bytes:
+def reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int = 0) -> bytes:
     """The drive's reply to a request; writes are carried out before."""
     if drive.kind.protocol == DELIXI:
         return _delixi_reply(drive, asked, frame, exception)
@@ -87,7 +87,7 @@ def reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int = 0) -> by
     return checksums.ascii(body) if frame[:1] == b":" else checksums.rtu(body)
 
 
-def _delixi_reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int) -> bytes:
+def _delixi_reply(drive: ResponderDrive, asked: Asked, frame: bytes, exception: int) -> bytes:
     head = f"{asked.address:02X}"
     if exception:
         return checksums.delixi(f"{head}{exception:02X}000000000000")
@@ -98,15 +98,15 @@ def _delixi_reply(drive: FarDrive, asked: Asked, frame: bytes, exception: int) -
     return frame
 
 
-class FarLine:
-    """One port's far end, with its drives and its troubles.
+class ResponderLine:
+    """One port's line of responders, with its faults.
 
     A trouble befalls the next requests, one each, and is given by name: "mute" carries out and says
     nothing, "deaf" does nothing, "late" answers when the next request has come, and a number answers
     with that exception. `deaf_until` and `delay` (s) last.
     """
 
-    def __init__(self, drives: Sequence[FarDrive]) -> None:
+    def __init__(self, drives: Sequence[ResponderDrive]) -> None:
         self.drives = {it.address: it for it in drives}
         self.log: list[Heard] = []
         self.troubles: list[str | int] = []
@@ -177,7 +177,7 @@ class FarLine:
             return []
         return [said] if said else []
 
-    def _addressed(self, address: int) -> list[FarDrive]:
+    def _addressed(self, address: int) -> list[ResponderDrive]:
         if address == 0:
             return list(self.drives.values())
         return [self.drives[address]] if address in self.drives else []
@@ -190,11 +190,11 @@ class FarLine:
                 self.held.set()
 
 
-def _is_write(drive: FarDrive, asked: Asked) -> bool:
+def _is_write(drive: ResponderDrive, asked: Asked) -> bool:
     return asked.function in (DELIXI_WRITES if drive.kind.protocol == DELIXI else WRITES)
 
 
-def _what(asked: Asked | None, drives: Sequence[FarDrive]) -> str:
+def _what(asked: Asked | None, drives: Sequence[ResponderDrive]) -> str:
     if asked is None:
         return "damaged"
     if not drives or not _is_write(drives[0], asked):

@@ -33,11 +33,11 @@ QUERYING = {3, 7}  # of Delixi's own protocol
 
 
 def text(frame: bytes) -> str:
-    """As documents print it."""
+    """Return the frame as documents print it."""
     return frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
 
 
-class Hall:
+class SimulatedBus:
     """Drives that are simulated, and a bus to them; every frame that was sent is kept.
 
     `loses(request)` says whether the reply to it is lost, `deafens(request)` whether it never arrives.
@@ -90,10 +90,12 @@ class Hall:
         self.seconds += EXCHANGE_TIME
         reply = self.answers(request)
         if reply is None and not self.deafens(request):
-            heard = [
-                it.answer(request, self.seconds) for it in self.sims if it.drive.framing is exchange.framing
+            answers = [
+                sim.answer(request, self.seconds)
+                for sim in self.sims
+                if sim.drive.framing is exchange.framing
             ]
-            replies = [it for it in heard if it is not None]
+            replies = [answer for answer in answers if answer is not None]
             assert len(replies) <= 1
             reply = build_reply(exchange.framing, replies[0]) if replies else None
         if request.address == 0:
@@ -123,9 +125,11 @@ def is_write(request: Message) -> bool:
     return request.function not in READING
 
 
-def one(monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any) -> tuple[Hall, Any, MotorDrive]:
-    """A hall with one drive that is what it is declared to be."""
+def one(
+    monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any
+) -> tuple[SimulatedBus, Any, MotorDrive]:
+    """Return a simulated bus, and its one drive with its simulation."""
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
-    hall = Hall(monkeypatch, sim, **details)
-    return hall, hall.attach(drive), sim
+    bus = SimulatedBus(monkeypatch, sim, **details)
+    return bus, bus.attach(drive), sim

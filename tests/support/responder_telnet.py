@@ -1,4 +1,4 @@
-"""Telnet with the serial port option (RFC 2217), as far as a far end that takes any settings needs it."""
+"""Telnet with the serial port option (RFC 2217), for a responder that takes any settings."""
 
 from __future__ import annotations
 

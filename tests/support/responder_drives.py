@@ -1,4 +1,4 @@
-"""Drives for a far end that knows nothing of the library: what they hold, and which writes move their motors.
+"""Drives of a responder, which knows nothing of the library: registers, and the writes that start motors.
 
 Typed from the documents. A write that takes a stop back is counted among those that move a motor.
 """
@@ -135,7 +135,7 @@ KINDS = {
 }
 
 
-class FarDrive:
+class ResponderDrive:
     """One drive: what it holds, and whether its motor turns.
 
     `ramp` is how many seconds the motor takes to stand after a stop.

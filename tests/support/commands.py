@@ -1,0 +1,53 @@
+"""Commands as their users give them, in this process or in one of their own."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from multidrop.drives.registry import find_model
+
+MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
+TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
+find_model(TOY)  # says that the file is run, once in a process: not in the midst of a test
+Run = Callable[..., tuple[int, str, str]]
+TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a model of one's own is a program\n"
+
+
+def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+    """A command to its end; `most_bytes`: as if the disk had only so much room."""
+
+    def limit() -> None:
+        if most_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+
+    done = subprocess.run(
+        [*MULTIDROP, *map(str, words)], capture_output=True, text=True, timeout=180, preexec_fn=limit
+    )
+    done.stderr = done.stderr.replace(TOY_IS_RUN, "", 1)
+    return done
+
+
+@contextmanager
+def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
+    """A command under way, and what it prints."""
+    with subprocess.Popen([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout
+        finally:
+            process.kill()
+
+
+def plant_file(directory: Path, *, dead: bool = False) -> Path:
+    """One line with a living drive, and one that nobody simulates."""
+    line = f'[[line]]\nname = "hall-1"\nport = "{directory}/ports/hall-1"\n'
+    drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
+    path = directory / f"{'with-dead' if dead else 'living'}.toml"
+    path.write_text(line + drive.format("pump-1", TOY, 1) + (drive.format("pump-9", TOY, 9) if dead else ""))
+    return path

@@ -1,0 +1,36 @@
+"""A client of bytes: it opens ports and knows nothing of the simulator."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from multidrop.core import set_settings
+
+PATIENCE = 5.0  # s until a reply that should come is given up; never waited for when all is well
+
+
+@contextmanager
+def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
+    """A descriptor, as a client has it."""
+    if path.startswith("socket://"):
+        host, _, port = path.removeprefix("socket://").partition(":")
+        with socket.create_connection((host, int(port))) as client:
+            yield client.fileno()
+        return
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        set_settings(fd, baudrate, "8N1")
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
+    heard = b""
+    while len(heard) < length and select.select([fd], [], [], patience)[0]:
+        heard += os.read(fd, 1024)
+    return heard

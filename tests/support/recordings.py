@@ -1,0 +1,75 @@
+"""Recordings and their rows: written for a test, and read by us and by pyarrow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from batches import SECOND, UTC_0
+
+from multidrop.polling.batch import Row
+from multidrop.recording import open_reader, open_writer
+from multidrop.recording.rows import from_rows
+
+FAULTS = {"NONE": 0, "OVERHEAT": 8, "OVERLOAD": 9}
+ABOUT: dict[str, Any] = {
+    "plant": "hall.toml",
+    "drives": {
+        "pump": {
+            "line": "hall-1",
+            "model": "invt-che",
+            "address": 1,
+            "settings": "9600 8N1",
+            "framing": "rtu",
+            "registers": {
+                "output_frequency": {"unit": "Hz", "step": 0.01, "function": 3, "address": 7, "words": 1},
+                "fault": {"unit": "", "step": 1, "values": FAULTS, "function": 3, "address": 8, "words": 1},
+            },
+        },
+        "fan": {
+            "framing": "rtu",
+            "registers": {
+                "output_current": {"unit": "A", "step": None, "function": 3, "address": 4, "words": 1}
+            },
+        },
+    },
+}
+
+
+def row(
+    second: float, drive: str, register: str, value: float | None, status: str = "ok", ms: float = 20.0
+) -> Row:
+    at = round(second * SECOND)
+    uncertainty = None if value is None else round(ms * 1e6)
+    return Row(UTC_0 + at, at, uncertainty, drive, register, value, status)
+
+
+def record(path: Path, rows: list[Row], about: dict[str, Any] = ABOUT, pieces: int = 7) -> Path:
+    with open_writer(path, about) as writer:
+        for at in range(0, len(rows), len(rows) // pieces + 1):
+            writer.write(from_rows(rows[at : at + len(rows) // pieces + 1]))
+    return path
+
+
+SCHEMA = pa.schema(
+    [
+        pa.field("time", pa.timestamp("ns", "UTC"), nullable=False),
+        pa.field("monotonic_ns", pa.int64(), nullable=False),
+        pa.field("uncertainty_ns", pa.int64()),
+        pa.field("drive", pa.string(), nullable=False),
+        pa.field("register", pa.string(), nullable=False),
+        pa.field("value", pa.float64()),
+        pa.field("status", pa.string(), nullable=False),
+    ]
+)
+
+
+def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
+    """What pyarrow sees, with the time as a number."""
+    numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
+    return [Row(**row) for row in numbers.to_pylist()]
+
+
+def recorded(path: Path) -> list[Row]:
+    return [row for rows in open_reader(path) for row in rows]

@@ -1,0 +1,100 @@
+"""The project's own text, parsed once: for the tests that keep its rules."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "src" / "multidrop"
+ROOMS = ("src", "csrc", "tests", "bench", "docs")
+BUILT = {"_build", "__pycache__", "corpus"}
+
+
+def files(*rooms: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
+    """Return these rooms' files of these kinds, without what a build leaves there."""
+    return [
+        path
+        for room in rooms
+        for path in sorted((ROOT / room).rglob("*"))
+        if path.suffix in suffixes and not BUILT & set(path.parts)
+    ]
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"), str(path))
+
+
+def place(path: Path, line: int) -> str:
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
+def run_time_imports(path: Path) -> set[str]:
+    """Return the modules that a file imports when it runs, in functions too."""
+    return _imports(path) - _imports(path, for_types=True)
+
+
+def type_imports(path: Path) -> set[str]:
+    """Return the modules that a file imports for its annotations alone."""
+    return _imports(path, for_types=True) - run_time_imports(path)
+
+
+@cache
+def _imports(path: Path, for_types: bool = False) -> set[str]:
+    found: set[str] = set()
+    for node, is_for_types in _import_nodes(parsed(path), False):
+        if is_for_types != for_types:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif node.module:
+            found.add(node.module)
+            if node.module == "multidrop":
+                found |= {f"multidrop.{alias.name}" for alias in node.names}
+    return found
+
+
+def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child, for_types
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            for part in child.body:
+                yield from _import_nodes(ast.Module([part], []), True)
+            for part in child.orelse:
+                yield from _import_nodes(ast.Module([part], []), for_types)
+        else:
+            yield from _import_nodes(child, for_types)
+
+
+def docstrings(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield each docstring with the line on which it begins."""
+    kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, kinds) and node.body and (text := ast.get_docstring(node)):
+            yield node.body[0].lineno, text
+
+
+def loop_variables(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield each name that a loop or a comprehension binds, with its line."""
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.For | ast.AsyncFor | ast.comprehension):
+            for name in ast.walk(node.target):
+                if isinstance(name, ast.Name):
+                    yield name.lineno, name.id
+
+
+def comments(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield each comment of a C file with its line; lines of // one below the other are one comment."""
+    before = -1
+    text = path.read_text("utf-8")
+    for match in re.finditer(r"/\*+(.*?)\*/|//+([^\n]*)", text, re.DOTALL):
+        line = text.count("\n", 0, match.start()) + 1
+        alone = not text[text.rfind("\n", 0, match.start()) + 1 : match.start()].strip()
+        if match[2] is None or line != before + 1 or not alone:
+            yield line, (match[1] or match[2] or "").strip()
+        before = line if match[2] is not None else -1
