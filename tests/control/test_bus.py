@@ -119,7 +119,7 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
         found = bus.read_many(ours, ours.readings())
         counters = bus.peer(ours).counters()
     assert found == {register.name: proof(ours, register) for register in ours.readings()}
-    echo_probes = 1 if ours.telling else 0  # on a line of which it is not known whether its adapter echoes
+    echo_probes = 1 if ours.echo_probe else 0  # on a line of which it is not known whether its adapter echoes
     assert counters.answered == REQUESTS[family] + echo_probes
     assert there.counters.requests == counters.exchanges == counters.answered
     assert there.counters.refusals == 0

@@ -83,7 +83,7 @@ class IdentityCheck:
     def _read_something(
         self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0
     ) -> None:
-        register = drive.telling or next((it for it in drive.registers.values() if it.readable), None)
+        register = drive.echo_probe or next((it for it in drive.registers.values() if it.readable), None)
         if register is not None:
             with suppress(DriveRefused):  # an answer too
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)

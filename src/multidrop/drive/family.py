@@ -234,7 +234,7 @@ class Drive:
         return tuple(it for it in cls.registers.values() if it.access is Access.READING and it.readable)
 
     @property
-    def telling(self) -> Register[Any] | None:
+    def echo_probe(self) -> Register[Any] | None:
         """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
         return None
 

@@ -31,9 +31,9 @@ from multidrop.core import (
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.errors import LineError
-from multidrop.planning.blocks import Block, Plan, alone
+from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import in_order, kind, sending, silence
-from multidrop.planning.schedule import Asking, Job, Schedule
+from multidrop.planning.schedule import Job, Schedule, Turn
 from multidrop.plant import model as plant
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.clock import now_ns
@@ -129,7 +129,7 @@ class PolledLine:
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
         self._cycle: list[PolledJob] = []  # what the core repeats
-        self._queued: deque[Asking[PolledJob]] = deque()  # what the core has not carried out yet
+        self._queued: deque[Turn[PolledJob]] = deque()  # what the core has not carried out yet
         register_at_fork(self)
         try:
             for polled in declared.drives:
@@ -162,7 +162,7 @@ class PolledLine:
         for job in jobs:
             self.schedule.add(job, due_ns)
         if jobs and not self.bus.peer(drive).has_answered:
-            self.schedule.meet(drive.address)
+            self.schedule.back_off.meet(drive.address)
 
     def _jobs_of(self, polled: PolledDrive) -> list[PolledJob]:
         """A drive that comes back has the jobs that it had."""
@@ -174,12 +174,12 @@ class PolledLine:
         return self._chosen[polled].jobs
 
     def _choose(self, polled: PolledDrive, delay: float) -> Chosen:
-        plan = polled.plan(delay)
+        chosen = plan(drive := polled.drive, polled.wanted, delay)
         jobs = [
-            self._job(one.drive, one.block, None if one.every is None else round(one.every * 1e9))
-            for one in plan.planned
+            self._job(drive, each.block, None if each.every is None else round(each.every * 1e9))
+            for each in chosen.planned
         ]
-        return Chosen(jobs, plan)
+        return Chosen(jobs, chosen)
 
     def remove(self, drive: Drive) -> None:
         with self._lock:
@@ -188,7 +188,7 @@ class PolledLine:
             self._miss(over([(it, it.due_ns) for it in jobs if it.period_ns], now), Result.POLL_ENDED)
             for job in jobs:
                 self.schedule.remove(job)
-            self.schedule.forget(drive.address)
+            self.schedule.back_off.forget(drive.address)
             self.set_aside = {it: whole for it, whole in self.set_aside.items() if it.owner is not drive}
             self._asked_of = [it for it in self._asked_of if it[0] is not drive]
         self.bus.detach(drive)
@@ -258,7 +258,7 @@ class PolledLine:
         for _ in range((done - self._done) & 0xFFFF_FFFF):
             job = self._queued.popleft().job
             self._ahead_ns -= job.duration_ns
-            self.schedule.conclude(job)
+            self.schedule.back_off.conclude(job.drive)
         self._done = done
 
     def _lose(self, port: Port, now: int) -> None:
@@ -268,7 +268,7 @@ class PolledLine:
         slots = [(it.job, now if it.due_ns is None else min(it.due_ns, now)) for it in self._queued]
         self._miss(slots, Result.LINE_LOST)
         for asking in self._queued:
-            self.schedule.conclude(asking.job)
+            self.schedule.back_off.conclude(asking.job.drive)
         self._queued.clear()
         self._cycle = []
         self._ahead_ns = 0
@@ -283,7 +283,7 @@ class PolledLine:
             return
         self._seen = seen
         for (drive, peer), (failures, late_until_ns, has_answered) in zip(self._asked_of, seen, strict=True):
-            self.schedule.observe(
+            self.schedule.back_off.observe(
                 drive.address,
                 failures,
                 now,
@@ -327,7 +327,10 @@ class PolledLine:
             self.schedule.replace([job], [self.set_aside.pop(job)], now)
         for job in [it for it in self.schedule.jobs if self._is_refused(it)]:
             if len(job.block.registers) > 1:
-                parts = [self._job(job.owner, alone(it), job.period_ns) for it in job.block.registers]
+                parts = [
+                    self._job(job.owner, Block.of(job.owner, [it]), job.period_ns)
+                    for it in job.block.registers
+                ]
                 self.schedule.replace([job], parts, now)
             elif job not in self.set_aside:
                 if job not in self._rare:

@@ -10,7 +10,7 @@ from multidrop.core import Completion, Exchange, Message, Peer, Permit, Result, 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
-from multidrop.planning.blocks import Block, alone, blocks
+from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
 from multidrop.transport.clock import now_ns, sleep
@@ -69,11 +69,17 @@ def reading(
 ) -> Exchange:
     """What reads a block from this drive, whose reply is not taken from an adapter's echo."""
     echo_probe = None
-    if drive.telling and drive.telling not in block.registers:
-        echo_probe = exchange(drive, alone(drive.telling).request(drive.address), peer, NO_ROWS)
-    request = block.request(drive.address)
+    if drive.echo_probe and drive.echo_probe not in block.registers:
+        echo_probe = exchange(drive, Block.of(drive, [drive.echo_probe]).request, peer, NO_ROWS)
     return exchange(
-        drive, request, peer, rows, period=period, insists=insists, timeout=timeout, echo_probe=echo_probe
+        drive,
+        block.request,
+        peer,
+        rows,
+        period=period,
+        insists=insists,
+        timeout=timeout,
+        echo_probe=echo_probe,
     )
 
 
@@ -114,7 +120,7 @@ class Exchanges:
             made = self._known[key] = Peer(least_timeout=least, most_timeout=drive.response_timeout)
             made.prove_by(
                 [
-                    exchange(drive, block.request(drive.address), made, NO_ROWS, answer=answer)
+                    exchange(drive, block.request, made, NO_ROWS, answer=answer)
                     for block, answer in proofs(drive)
                 ]
             )

@@ -180,7 +180,7 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
     (block,) = blocks(drive, [register])
     with Bus(port) as bus:
         bus.attach(drive)
-        made = exchange(drive, block.request(drive.address), bus.peer(drive))
+        made = exchange(drive, block.request, bus.peer(drive))
         asked = list(_asked(bus.line, made))
     # Request and first character: on a network and on a pseudo-terminal nobody knows how long they take.
     wire = (len(build_request(drive.framing, made.request)) + 1) * drive.settings.character
