@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_driver import LineDriver
 
-from multidrop.bus import exchange
 from multidrop.core import Peer, build_reply
 from multidrop.drive import Drive, Framing
 from multidrop.drive.register import HOLDING, reading
@@ -22,6 +21,7 @@ from multidrop.planning.prediction import predict as predict_with_host
 from multidrop.planning.schedule import TURN_SHARE
 from multidrop.planning.suggestions import Suggestions, duration_text, suggest
 from multidrop.sim import EncodedDrive
+from multidrop.transport.exchange import make_exchange
 
 BIT = 1 / 9600
 predict = partial(predict_with_host, lateness=0.0)
@@ -138,7 +138,7 @@ def carried_out(exchanges: Sequence[Planned]) -> float:
     drives = in_order(dict.fromkeys(it.drive for it in exchanges))
     order = [it for drive in drives for it in exchanges if it.drive is drive]
     peers = {it: Peer(least_timeout=0.02, most_timeout=it.response_timeout) for it in drives}
-    made = [exchange(it.drive, it.block.request, peers[it.drive]) for it in order]
+    made = [make_exchange(it.drive, it.block.request, peers[it.drive]) for it in order]
     answers = [EncodedDrive(it.drive).answer(it.block.request, 0) for it in order]
     line = LineDriver()
     begun = []

@@ -158,6 +158,7 @@ class Drive:
         self.option = self._options(options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
+        self.bus: Any = None  # that it is attached to
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.check_identity: Callable[[], None] = lambda: None  # a bus looks at it
         self.begin_call: Callable[[str], Any] = lambda verb: (
@@ -167,6 +168,11 @@ class Drive:
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
             lambda verb, make, seconds: self.perform(make())
         )
+
+    def __repr__(self) -> str:
+        where = f"on {self.bus.line.port}" if self.bus else "not attached"
+        line = f"{self.framing}, {self.settings}"
+        return f"<{type(self).__name__} {self.name!r}, address {self.address}, {line}, {where}>"
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
         self.check_identity()
@@ -393,5 +399,5 @@ class Drive:
 # What a drive has besides registers.
 _NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "commanded", "perform", "check_identity"}
+    | {"option", "ram", "commanded", "bus", "perform", "check_identity"}
 )

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.timing import Settings
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
+from multidrop.transport.exchange import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
