@@ -57,8 +57,23 @@ def test_tests_that_are_named_exist(name: str) -> None:
         assert f"def {name}(" in (ROOT / file).read_text("utf-8")
 
 
-@pytest.mark.parametrize("command", [it for it in CODE if " --" in it and re.search(FILE, it)])
+MODULE = r"(?<=-m )bench\.[\w.]+"
+SCRIPT = rf"{FILE}|{MODULE}"
+
+
+@pytest.mark.parametrize("module", named(MODULE))
+def test_benchmarks_that_are_named_exist(module: str) -> None:
+    assert _source(module).exists()
+
+
+@pytest.mark.parametrize(
+    "command", [it for it in CODE if re.search(r" --(?!benchmark)", it) and re.search(SCRIPT, it)]
+)
 def test_options_that_are_named_exist(command: str) -> None:
-    (script,) = re.findall(FILE, command)
-    sources = "".join((ROOT / it).read_text("utf-8") for it in (script, "tests/conftest.py"))
+    (script,) = re.findall(SCRIPT, command)
+    sources = "".join(it.read_text("utf-8") for it in (_source(script), ROOT / "tests/conftest.py"))
     assert all(f'"{option}"' in sources for option in re.findall(r"--[\w-]+", command))
+
+
+def _source(script: str) -> Path:
+    return ROOT / (script if "/" in script else f"{script.replace('.', '/')}.py")

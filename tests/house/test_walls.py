@@ -15,7 +15,7 @@ OUTSIDE = {
 }
 # from the ground up: a room imports from itself and from those below it
 FLOORS = [
-    {"errors", "printable", "interpreter"},
+    {"errors", "printable", "iso_time", "interpreter"},
     {"core"},
     {"drive"},
     {"drives"},

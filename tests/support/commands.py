@@ -12,7 +12,7 @@ from typing import IO
 
 from multidrop.drives.registry import find_model
 
-MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
+MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
 find_model(TOY)  # says that the file is run, once in a process: not in the midst of a test
 Run = Callable[..., tuple[int, str, str]]

@@ -15,7 +15,7 @@ from multidrop import poller
 from multidrop.core import Message, Status
 from multidrop.drive import Drive
 from multidrop.drives import YD1000
-from multidrop.planning import schedule
+from multidrop.planning import back_off
 from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
@@ -83,7 +83,7 @@ class Story:
         It takes until the port is opened again, and silent drives have rested for their share of the line.
         """
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
-        longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
+        longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
         ended = self.world.now
         asked: dict[str, int] = {}

@@ -93,7 +93,7 @@ def _start_motors(line: PlantLine) -> None:
 @contextmanager
 def _simulator(plant: Path, ports: Path) -> Iterator[None]:
     """A process of its own, so that the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", str(ports)]
+    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
     # In a session of its own, Ctrl-C reaches it only when polling has ended.
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         assert process.stdout is not None

@@ -16,8 +16,9 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.saying import say
 from multidrop.cli.support.values import Row, aligned
 from multidrop.planning.prediction import Prediction, Rate, predict
-from multidrop.planning.suggestions import Remedies, duration_text, remedies
+from multidrop.planning.suggestions import Suggestions, duration_text, suggest
 from multidrop.plant.loader import load_plant
+from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
 
 WIDTH = 80
@@ -44,13 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
 class _Plan:
     line: PlantLine
     prediction: Prediction
-    remedies: Remedies | None  # None: it fits
+    suggestions: Suggestions | None  # None: it fits
 
 
 def _plan(line: PlantLine) -> _Plan:
-    wanted = line.planned()
+    wanted = planned_on(line)
     prediction = predict(wanted, switching=line.switching)
-    return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction, line.switching))
+    return _Plan(line, prediction, None if prediction.fits else suggest(wanted, prediction, line.switching))
 
 
 def _misfits(plan: _Plan) -> list[str]:
@@ -102,8 +103,8 @@ def _text(plan: _Plan) -> Iterator[str]:
     yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
     for sentence in _misfits(plan):
         yield from _wrapped(f"! {sentence}")
-    if plan.remedies:
-        yield from _wrapped(f"! {plan.remedies}")
+    if plan.suggestions:
+        yield from _wrapped(f"! {plan.suggestions}")
     for sentence in _warnings(plan):
         yield from _wrapped(f"? {sentence}")
 
@@ -149,7 +150,7 @@ def _as_json(plan: _Plan) -> dict[str, Any]:
         "switching_ms": plan.line.switching * 1e3,
         "drives": {polled.drive.name: _drive_as_json(plan, polled.drive.name) for polled in plan.line.drives},
         "misfits": _misfits(plan),
-        "remedies": _remedies_as_json(plan.remedies) if plan.remedies else None,
+        "remedies": _suggestions_as_json(plan.suggestions) if plan.suggestions else None,
         "warnings": _warnings(plan),
     }
 
@@ -169,9 +170,9 @@ def _drive_as_json(plan: _Plan, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _remedies_as_json(found: Remedies) -> dict[str, Any]:
+def _suggestions_as_json(found: Suggestions) -> dict[str, Any]:
     return {
-        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every or ()],
+        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every],
         "baudrate": found.baudrate and found.baudrate[0],
         "baudrate_for": [it.name for it in found.baudrate[1]] if found.baudrate else [],
         "registers": found.registers,

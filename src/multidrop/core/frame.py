@@ -85,7 +85,7 @@ def build_reply(framing: Framing, message: Message) -> bytes:
 
 
 def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | None]:
-    """The request at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    """The request at the beginning of `received`: bytes consumed, 0 or a FrameFault, and its meaning."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_request(framing, received, len(received), found)
     return used, from_c(found) if used > 0 else None

@@ -160,6 +160,7 @@ class Drive:
         self.option = self._options(options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
+        self.bus: Any = None  # that it is attached to
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.check_identity: Callable[[], None] = lambda: None  # a bus looks at it
         self.begin_call: Callable[[str], Any] = lambda verb: (
@@ -169,6 +170,11 @@ class Drive:
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
             lambda verb, make, seconds: self.perform(make())
         )
+
+    def __repr__(self) -> str:
+        where = f"on {self.bus.line.port}" if self.bus else "not attached"
+        line = f"{self.framing}, {self.settings}"
+        return f"<{type(self).__name__} {self.name!r}, address {self.address}, {line}, {where}>"
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
         self.check_identity()
@@ -236,7 +242,7 @@ class Drive:
         return tuple(it for it in cls.registers.values() if it.access is Access.READING and it.readable)
 
     @property
-    def telling(self) -> Register[Any] | None:
+    def echo_probe(self) -> Register[Any] | None:
         """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
         return None
 
@@ -401,5 +407,5 @@ class Drive:
 # What a drive has besides registers.
 _NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "commanded", "perform", "check_identity"}
+    | {"option", "ram", "commanded", "bus", "perform", "check_identity"}
 )

@@ -181,9 +181,9 @@ class Register(Generic[T]):
     def __str__(self) -> str:
         return self.name
 
-    @property
+    @cached_property
     def words(self) -> int:
-        """How many addresses it takes in its table."""
+        """Addresses that it takes in its table."""
         return 2 if self.table.carrier is Carrier.WORD and self.number_format in _LONG_WIRES else 1
 
     @property

@@ -126,7 +126,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     )
 
     @property
-    def telling(self) -> Register[Any]:
+    def echo_probe(self) -> Register[Any]:
         """A parameter's request has the value 0 in it; no state is 0 (part 3, section 5: K = 03 and 07)."""
         return self.status
 

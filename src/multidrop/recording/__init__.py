@@ -28,7 +28,7 @@ one of these. The reader removes one apostrophe.
 
 The metadata is one JSON object: under the key `multidrop` of the schema's metadata (.arrows, .parquet) or
 in the file NAME.csv.json. `multidrop poll` writes `plant`, the plant file; `planned`, the prediction for
-each line by name (multidrop.planning.forecast); and `drives`: by name each drive's line, model, address,
+each line by name (multidrop.planning.prediction); and `drives`: by name each drive's line, model, address,
 settings and framing, and `registers`, by name each register's unit and step.
 
 pyarrow.ipc.open_stream and polars.read_ipc_stream open .arrows; they refuse a recording with a truncated

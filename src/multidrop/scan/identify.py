@@ -99,5 +99,5 @@ def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
 
 def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
     (block,) = blocks(drive, [register])
-    reply = ask(drive, block.request(drive.address))
+    reply = ask(drive, block.request)
     return register.decode(raw_value(reply.data, block.offset(register), register.number_format))

@@ -191,12 +191,11 @@ def _sweep(
     setting: Setting, families: tuple[type[Drive], ...], register: Register[Any], addresses: tuple[int, ...]
 ) -> Sweep:
     settings, framing = setting
-    block = Block(register.table, register.address, register.words, (register,))
-    request = block.request(addresses[0])
     drives = [
         family(family.addresses[0], framing=framing, baudrate=settings.baudrate, format=settings.format)
         for family in families
     ]
+    request = Block.of(drives[0], [register]).request
     return Sweep(
         settings,
         framing,

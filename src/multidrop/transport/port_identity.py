@@ -1,4 +1,4 @@
-"""Identities of ports: what a port is, however its name is spelt."""
+"""Identities of ports: one text for each port, however its name is spelt."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from multidrop.bus import LEAST_TIMEOUT, Bus, exchange
+from multidrop.bus import Bus
 from multidrop.cli.doctor.adapter import find_adapter, low_latency, rs485_mode
 from multidrop.cli.doctor.findings import (
     ROUNDS,
@@ -31,6 +31,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import blocks
+from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
 
 WIDTH = 80
@@ -180,7 +181,7 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
     (block,) = blocks(drive, [register])
     with Bus(port) as bus:
         bus.attach(drive)
-        made = exchange(drive, block.request(drive.address), bus.peer(drive))
+        made = make_exchange(drive, block.request, bus.peer(drive))
         asked = list(_asked(bus.line, made))
     # Request and first character: on a network and on a pseudo-terminal nobody knows how long they take.
     wire = (len(build_request(drive.framing, made.request)) + 1) * drive.settings.character

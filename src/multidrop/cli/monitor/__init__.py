@@ -22,7 +22,7 @@ from multidrop.cli.support.extra import need
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.saying import say
 from multidrop.cli.support.signals import Interruption
-from multidrop.control.stop_all import Seen
+from multidrop.control.outcome import Seen
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller

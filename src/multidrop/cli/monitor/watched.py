@@ -14,7 +14,7 @@ from multidrop.core import UNASKED, Counters
 from multidrop.drive.register import Register
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.batch import Row, Rows
-from multidrop.transport.statistics import LineStatistics, Statistics, look
+from multidrop.transport.statistics import LineStatistics, Statistics, line_statistics
 
 HISTORY = 240  # s, a point each
 LATELY = 5.0  # s: rates are those of so long
@@ -100,7 +100,7 @@ class WatchedPlant:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.drives = [Watched(line, polled) for line in plant.lines for polled in line.drives]
-        self.so_far = {line.name: look(1.0, {}, None) for line in plant.lines}
+        self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
         self.lately = self.so_far
         self._by_name = {it.name: it for it in self.drives}
         self._earlier: deque[tuple[float, Mapping[str, LineStatistics]]] = deque()

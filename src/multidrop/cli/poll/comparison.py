@@ -8,6 +8,7 @@ from typing import Any
 from multidrop.cli.plan import shortened
 from multidrop.cli.support.values import aligned
 from multidrop.planning.prediction import Prediction, predict
+from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
 
 Figures = dict[str, Any]
@@ -24,9 +25,9 @@ def compared(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
     polls = [poll for polled in line.drives for poll in polled.polls]
     asked_for = any(poll.every is not None for poll in polls)  # then no cycle follows the other
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
-    by_delays = predict(line.planned(known), known, summary["switching_ms"] / 1e3)
+    by_delays = predict(planned_on(line, known), known, summary["switching_ms"] / 1e3)
     return {
-        "predicted": _figures(predict(line.planned(), switching=line.switching)),
+        "predicted": _figures(predict(planned_on(line), switching=line.switching)),
         "predicted_with_measured_delays": _figures(by_delays),
         "measured": {
             "cycle_ms": None if asked_for or not cycles else round(summary["seconds"] / cycles * 1e3, 3),

@@ -17,7 +17,7 @@ from multidrop.core import REFUSALS, Stream, set_settings
 from multidrop.drive.timing import Settings
 from multidrop.errors import LineError
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.line import reason_of, unopened
+from multidrop.transport.opening import reason_of, unopened
 
 LOOK_S = 0.05  # the longest that bytes are waited for at a time
 _MOST = 4096  # bytes read at once
