@@ -25,7 +25,7 @@ OUTSIDE = {
 }
 # from the ground up: a room imports from itself and from those below it
 FLOORS = [
-    {"errors", "printable", "interpreter"},
+    {"errors", "printable", "interpreter", "iso_time"},
     {"core"},
     {"drive"},
     {"drives"},
