@@ -1,8 +1,8 @@
-"""A recording as pictures and as one page; needs matplotlib, the extra `plot`."""
+"""Show a recording as pictures and as one page; needs matplotlib, the extra `plot`."""
 
 from multidrop.report.html import plot_page as plot_page
 from multidrop.report.html import report_page as report_page
-from multidrop.report.load import Selection as Selection
+from multidrop.report.load import Recording as Recording
 from multidrop.report.load import Series as Series
 from multidrop.report.load import TimeSpan as TimeSpan
 from multidrop.report.load import load as load
