@@ -94,8 +94,6 @@ class SimulatedDrive:
         for cell in self.memory.of(register):
             self.changed(cell)
 
-    # ---- hooks for a family ----
-
     def pass_time(self, now: float) -> None:
         """Bring the drive to the time `now`."""
 
@@ -128,8 +126,6 @@ class SimulatedDrive:
 
     def takes_broadcast(self, request: Message) -> bool:
         return self.drive.broadcasts
-
-    # ---- called by the wire ----
 
     @property
     def delay(self) -> float:
@@ -205,8 +201,6 @@ class SimulatedDrive:
         if not self._knows(request.function):
             raise Refusal(Reason.FUNCTION)
         return self.protocol.answers[request.function](self, request)
-
-    # ---- called by the protocol ----
 
     def check_count(self, function: int, count: int) -> None:
         if not 1 <= count <= self.most.get(function, 1):

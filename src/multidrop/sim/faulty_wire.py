@@ -62,8 +62,6 @@ class FaultyWire(Wire):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
         return frame
 
-    # ---- from the client to the drives ----
-
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
         if self._strikes("hang_up"):
             self._hang_up(now)
@@ -95,8 +93,6 @@ class FaultyWire(Wire):
         self._stray.append(Transmission(noise, begin, character))
         for group in self._groups:
             super()._deliver(group, group.receiver.feed(noise, begin))
-
-    # ---- from the drives to the client ----
 
     def _send(self, data: bytes, begin: float, character: float) -> None:
         data = self._damaged(data)
@@ -138,8 +134,6 @@ class FaultyWire(Wire):
         if self._held:
             times.append(self._held.begin)
         return min((at for at in times if at is not None), default=None)
-
-    # ---- its port ----
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number

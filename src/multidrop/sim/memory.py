@@ -104,8 +104,6 @@ class Memory:
         """Return the cell that a write there changes, with any function that the drive takes."""
         return self._written.get((function, address))
 
-    # ---- whole registers ----
-
     def get(self, register: Register[Any]) -> Any:
         """Return the register's value in its own unit."""
         data = b"".join(pack(register.table, cell.raw) for cell in self.of(register))

@@ -70,8 +70,6 @@ class Motor:
         self._goal: float | None = 0.0  # Hz; None: the target
         self._brakes = False  # by direct current
 
-    # ---- commands ----
-
     def run(self, direction: int | None = None) -> None:
         """Run at `target`, which may change meanwhile; without a direction, in the present one."""
         self._start(direction, None)
@@ -116,8 +114,6 @@ class Motor:
         """Clear the fault; the motor stays off."""
         self.fault = 0
 
-    # ---- time ----
-
     def run_to(self, now: float) -> None:
         """Let time pass until `now`."""
         seconds = now - self.now
@@ -152,8 +148,6 @@ class Motor:
             return seconds - needed
         self.frequency += math.copysign(distance * seconds / needed, goal - self.frequency)
         return 0.0
-
-    # ---- measurements ----
 
     def fault_record(self, number: int) -> int:
         """Return the code of a fault, the latest being number 1; 0 where there is none."""

@@ -6,7 +6,6 @@ import contextlib
 import os
 import socket
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 from multidrop.control.eeprom_ledger import default_path
@@ -16,31 +15,6 @@ from multidrop.transport.port_identity import of_address
 from multidrop.transport.simulated_ports import SimulatedPort
 
 MOST_READ = 4096
-
-
-class SimulatedEnd(Protocol):
-    path: str  # that a client opens
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait for; it may change with each read."""
-
-    def read(self) -> bytes:
-        """Return the bytes that have come; never blocks."""
-
-    def write(self, data: bytes) -> None:
-        """Send to the client, if there is one; never blocks."""
-
-    def baudrate(self) -> int | None:
-        """Return the client's baud rate, or None where it cannot be seen."""
-
-    def close(self) -> None: ...
-
-
-def open_port(where: str, settings: Settings) -> SimulatedEnd:
-    """Open a port of the kind that `where` names: see Wire."""
-    if where.startswith("socket://"):
-        return TCPPort(where)
-    return PtyPort(settings, None if where == "pty" else Path(where))
 
 
 class PtyPort:
@@ -108,6 +82,7 @@ class TCPPort:
         self.path = f"socket://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
+        """Return the descriptor to wait for; it changes when a client comes or goes."""
         return (self._client or self._listener).fileno()
 
     def read(self) -> bytes:
@@ -137,10 +112,20 @@ class TCPPort:
             with contextlib.suppress(OSError):  # a client that has gone is noticed when reading
                 self._client.send(data)
 
-    def baudrate(self) -> int | None:
-        return None
+    def baudrate(self) -> None:
+        """Return None: a client's baud rate cannot be seen."""
 
     def close(self) -> None:
         self._hang_up()
         self._simulated.close()
         self._listener.close()
+
+
+SimulatedEnd = PtyPort | TCPPort  # neither blocks
+
+
+def open_port(where: str, settings: Settings) -> SimulatedEnd:
+    """Open a port of the kind that `where` names: see Wire."""
+    if where.startswith("socket://"):
+        return TCPPort(where)
+    return PtyPort(settings, None if where == "pty" else Path(where))

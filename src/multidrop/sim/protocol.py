@@ -1,4 +1,7 @@
-"""Function codes and what they make a drive do: Modbus, and Delixi's own protocol."""
+"""Function codes and what they make a drive do.
+
+Modbus (application protocol V1.1b3), and Delixi's own (RS-485 communication protocol, part 3).
+"""
 
 from __future__ import annotations
 
@@ -51,9 +54,6 @@ class DriveProtocol:
     no_data: bytes = b""  # the data of a refusal
 
 
-# ---- Modbus (application protocol V1.1b3) ----
-
-
 def _with_data(request: Message, data: bytes) -> Message:
     return Message(request.address, request.function, request.start, request.count, data)
 
@@ -101,9 +101,6 @@ def _return_query_data(sim: SimulatedDrive, request: Message) -> Message:
     if request.start != 0:  # the only subfunction that is simulated
         raise Refusal(Reason.FUNCTION)
     return request
-
-
-# ---- Delixi's own (RS-485 communication protocol, part 3) ----
 
 
 def _command(sim: SimulatedDrive, request: Message) -> Message:

@@ -84,8 +84,6 @@ class Receiver:
         end = self._end - after * self.character
         return Frame(body, message, intact, end - length * self.character, end)
 
-    # ---- RTU: found by length and CRC ----
-
     def _cut_rtu(self) -> Frame | None:
         """Return the next request: the first byte at which a good one begins wins.
 
@@ -103,8 +101,6 @@ class Receiver:
             pending = pending or used == 0
         self._buffer = bytearray(data)
         return None
-
-    # ---- text: from ':' to line feed ----
 
     def _cut_text(self) -> Frame | None:
         data = self._buffer

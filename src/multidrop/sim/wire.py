@@ -111,8 +111,6 @@ class Wire:
     def __repr__(self) -> str:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
-    # ---- on the wires ----
-
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
         """Take bytes of the client, at its baud rate where that can be seen."""
         if baudrate != self._baudrate:
@@ -173,8 +171,6 @@ class Wire:
             return True
         sim.counters.early += 1
         return not sim.needs_silence and silent_for >= -bit
-
-    # ---- its port ----
 
     @property
     def path(self) -> str:
