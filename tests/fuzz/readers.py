@@ -118,8 +118,8 @@ def _pair(capture: Capture) -> None:
             exchanges += sum(1 for it in told if not isinstance(it, Junk) and it.request and it.reply)
     for pairing in pairings:
         junk += sum(len(it.raw) for it in pairing.flush() if isinstance(it, Junk))
-    assert junk == sum(it.junk_bytes for it in pairings)
-    assert exchanges == sum(it.exchanges for it in pairings)
+    assert junk == sum(it.counts()["unknown_bytes"] for it in pairings)
+    assert exchanges == sum(it.counts()["exchanges"] for it in pairings)
 
 
 def _comparable(batches: Iterable[Rows]) -> list[Row]:

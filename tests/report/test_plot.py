@@ -19,11 +19,12 @@ import multidrop.cli.support.extra
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
-from multidrop.report import Selection, load, plot, plot_page, png, report_page
+from multidrop.recording.rows import from_rows
+from multidrop.report import Recording, load, plot, plot_page, png, report_page
 from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
 from multidrop.report.html import _about, _drives
 from multidrop.report.lanes import MOST_LANES
-from multidrop.report.utilisation import used
+from multidrop.report.utilisation import line_uses
 from multidrop.report.value_plot import MOST_PANELS, MOST_POINTS, thinned
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -54,14 +55,14 @@ def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def look(ramp: Path) -> Selection:
+def look(ramp: Path) -> Recording:
     return load(ramp)
 
 
 # ---- what is read ----
 
 
-def test_series_have_every_value_and_every_miss(look: Selection) -> None:
+def test_series_have_every_value_and_every_miss(look: Recording) -> None:
     assert [(it.drive, it.register, it.unit, len(it.time)) for it in look.series] == [
         ("pump", "output_frequency", "Hz", 1000),
         ("pump", "fault", "", 1000),
@@ -105,7 +106,7 @@ def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
     assert "насос" in report_page(it)
 
 
-def test_a_fault_is_a_span_that_misses_do_not_end(look: Selection) -> None:
+def test_a_fault_is_a_span_that_misses_do_not_end(look: Recording) -> None:
     (span,) = look.of("pump", "fault")[0].faults()
     assert span.what == "OVERHEAT"
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
@@ -125,7 +126,7 @@ def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> Non
 # ---- what is worked out ----
 
 
-def test_the_response_delay_is_without_the_request(look: Selection) -> None:
+def test_the_response_delay_is_without_the_request(look: Recording) -> None:
     pump, fan = delays(look)
     assert pump.exact
     assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
@@ -134,7 +135,7 @@ def test_the_response_delay_is_without_the_request(look: Selection) -> None:
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
 
-def test_noise_that_comes_with_speed_is_seen(look: Selection) -> None:
+def test_noise_that_comes_with_speed_is_seen(look: Recording) -> None:
     shares = miss_shares(look, "pump")
     assert shares is not None
     slow = shares[1][shares[0] < 28]
@@ -198,7 +199,7 @@ def turns() -> list[Row]:
 
 def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
-    (line,) = used(look)
+    (line,) = line_uses(look)
     # pump: 14 ms to the reply's first character, 8 more; fan: 13 and 6; the silence is the longer of two.
     assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
     assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
@@ -215,7 +216,7 @@ def test_no_more_is_used_of_a_port_without_a_wire_than_there_is(tmp_path: Path) 
     """Requests follow each other by 2 ms, where a wire would take 32."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
-    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    (line,) = line_uses(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
     assert 0.9 < line.utilisation <= 1.0 + 1e-9
 
 
@@ -227,7 +228,7 @@ def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
         for name in ("output_frequency", "fault")
     ]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"pump": PLANNED["hall-1"]["drives"]["pump"]}}}
-    (line,) = used(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
+    (line,) = line_uses(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
     assert line.asked == {"pump": 150}
     assert line.needed == pytest.approx(np.array([0.024] * 100 + [0.026] * 50))
     assert line.cycle == pytest.approx(0.1, rel=0.01)
@@ -236,7 +237,7 @@ def test_what_was_used_of_blocks_that_were_chosen_anew(tmp_path: Path) -> None:
 @pytest.mark.parametrize("planned", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
 def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
-    assert used(look) == []
+    assert line_uses(look) == []
 
 
 def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
@@ -261,7 +262,7 @@ def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
     planned = json.loads(json.dumps(PLANNED))
     planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"] = 100
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
-    (line,) = used(look)
+    (line,) = line_uses(look)
     assert line.cycle is None
     assert line.utilisation > 0.4
     assert "bus cycle" not in report_page(look)
@@ -270,7 +271,7 @@ def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
 def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
     planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
-    (line,) = used(look)
+    (line,) = line_uses(look)
     assert (line.utilisation, line.cycle) == (0, None)
     assert "hall-2" in report_page(look)
 
@@ -281,7 +282,7 @@ def test_a_motor_that_keeps_its_speed_tells_nothing_of_noise_that_comes_with_it(
     assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
 
 
-def test_misses_are_told_by_reason(look: Selection) -> None:
+def test_misses_are_told_by_reason(look: Recording) -> None:
     assert reasons_of(look, "pump") == {"bad checksum": 200}
     assert reasons_of(look, "fan") == {"no reply": 1}
 
@@ -301,7 +302,7 @@ def test_thinning_keeps_every_extreme() -> None:
 # ---- pictures and pages ----
 
 
-def test_there_is_a_panel_for_every_quantity_and_unit(look: Selection) -> None:
+def test_there_is_a_panel_for_every_quantity_and_unit(look: Recording) -> None:
     figure, left = plot(look)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == ["faults", "output_frequency, Hz", "output_current, raw count"]
@@ -309,7 +310,7 @@ def test_there_is_a_panel_for_every_quantity_and_unit(look: Selection) -> None:
     assert png(figure).startswith(PNG)
 
 
-def test_drives_and_registers_can_be_chosen(look: Selection) -> None:
+def test_drives_and_registers_can_be_chosen(look: Recording) -> None:
     figure, _ = plot(look, ["fan"])
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["output_current, raw count"]
     figure, _ = plot(look, [], ["output_frequency"])
@@ -348,7 +349,7 @@ STATUS = {  # the families' own, as their documents have them
 }
 
 
-def states(path: Path, rows: list[Row]) -> Selection:
+def states(path: Path, rows: list[Row]) -> Recording:
     """A recording of two enumerations and one register of bits, all called status."""
     meanings: dict[str, Any] = {
         name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
@@ -459,7 +460,7 @@ def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     )
 
 
-def test_the_report_is_one_page_that_needs_nothing_else(look: Selection) -> None:
+def test_the_report_is_one_page_that_needs_nothing_else(look: Recording) -> None:
     page = report_page(look)
     assert page.startswith("<!DOCTYPE html>")
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
@@ -545,7 +546,9 @@ def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> N
         if not isinstance(metadata, dict):
             continue  # is no recording
         look = load(record(tmp_path / f"{number}.arrows", turns()[:30], metadata))
-        assert all(np.isfinite([it.utilisation, it.rate("pump"), it.cycle or 0]).all() for it in used(look))
+        assert all(
+            np.isfinite([it.utilisation, it.rate("pump"), it.cycle or 0]).all() for it in line_uses(look)
+        )
         assert {it.drive for it in delays(look)} == {"pump", "fan"}
         assert len(_about(look) + "".join(_drives(look))) > 100
         if metadata.get("planned") is odd or metadata.get("drives") is odd:

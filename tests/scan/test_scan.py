@@ -49,14 +49,14 @@ class Pair(Wire):
 
     def __init__(self, drives: Sequence[SimulatedDrive]) -> None:
         super().__init__(drives)
-        self._all_ears = self._ears
+        self._all_groups = self._groups
         self.request = b""
 
     def send(self, frame: bytes, now: float, settings: Settings) -> None:
         self.request = frame
-        self._ears = [it for it in self._all_ears if _alike(it.settings, settings)]
+        self._groups = [it for it in self._all_groups if _alike(it.settings, settings)]
         self.receive(frame, now, settings.baudrate)
-        self._ears = self._all_ears
+        self._groups = self._all_groups
 
 
 def _alike(one: Settings, other: Settings) -> bool:

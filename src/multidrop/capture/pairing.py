@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from multidrop.core import FrameSpan, Framing, Kind, Message, Side
 
 _MOST_JUNK = 4096  # bytes in one Junk
+_COUNTED = ("exchanges", "broadcasts", "unanswered", "strays", "unknown_bytes")
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Pairing:
     """Pair the frames of one line, and count them."""
 
     def __init__(self) -> None:
-        self.exchanges = self.broadcasts = self.unanswered = self.strays = self.junk_bytes = 0
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._asked: FrameSpan | None = None
         self._junk: list[FrameSpan] = []
 
@@ -57,16 +58,16 @@ class Pairing:
                 continue
             if span.kind is Kind.REPLY and self._asked:
                 asked, self._asked = self._asked, None
-                self.exchanges += 1
+                self._counts["exchanges"] += 1
                 yield _exchange(asked, span)
                 yield from self._flush_junk()
                 continue
             yield from self.flush()
             if span.kind in (Kind.REPLY, Kind.STRAY):
-                self.strays += 1
+                self._counts["strays"] += 1
                 yield _exchange(None, span)
             elif span.message.address == 0:
-                self.broadcasts += 1
+                self._counts["broadcasts"] += 1
                 yield _exchange(span, None)
             else:
                 self._asked = span
@@ -75,21 +76,15 @@ class Pairing:
         """Yield what waits, because nothing more is to come."""
         if self._asked:
             asked, self._asked = self._asked, None
-            self.unanswered += 1
+            self._counts["unanswered"] += 1
             yield _exchange(asked, None)
         yield from self._flush_junk()
 
     def counts(self) -> dict[str, int]:
-        return {
-            "exchanges": self.exchanges,
-            "broadcasts": self.broadcasts,
-            "unanswered": self.unanswered,
-            "strays": self.strays,
-            "unknown_bytes": self.junk_bytes,
-        }
+        return dict(self._counts)
 
     def _add_junk(self, span: FrameSpan) -> Iterator[Sniffed]:
-        self.junk_bytes += len(span.raw)
+        self._counts["unknown_bytes"] += len(span.raw)
         self._junk.append(span)
         if sum(len(span.raw) for span in self._junk) >= _MOST_JUNK:
             yield from self._flush_junk()

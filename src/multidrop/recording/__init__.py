@@ -42,10 +42,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from multidrop.recording.format import Metadata, RecordingError, RecordingReader, RecordingWriter
-
-__all__ = ["FORMATS", "Metadata", "RecordingError", "RecordingReader", "RecordingWriter"]
-__all__ += ["convert", "open_reader", "open_writer", "repair"]
+from multidrop.recording.format import Metadata as Metadata
+from multidrop.recording.format import RecordingError as RecordingError
+from multidrop.recording.format import RecordingReader as RecordingReader
+from multidrop.recording.format import RecordingWriter as RecordingWriter
 
 FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix: module
 

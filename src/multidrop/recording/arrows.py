@@ -16,17 +16,7 @@ from typing import Any
 
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.arrow_ipc import RECORD_BATCH, SCHEMA, FlatTable, IpcMessage, messages
-from multidrop.recording.format import (
-    METADATA_KEY,
-    AppendingWriter,
-    Metadata,
-    RecordingError,
-    RecordingReader,
-    damaged,
-    dump_metadata,
-    load_metadata,
-    not_a_recording,
-)
+from multidrop.recording.format import METADATA_KEY, AppendingWriter, Metadata, RecordingReader, dump_metadata
 from multidrop.recording.rows import RecordedRows
 
 INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
@@ -55,7 +45,7 @@ class ArrowsWriter(AppendingWriter):
         super().__init__(path)
         try:
             self._append_message(CArrayStream.from_c_arrays([], described))
-        except RecordingError:
+        except OSError:
             self.discard()
             raise
 
@@ -77,7 +67,7 @@ class ArrowsReader(RecordingReader):
     """Read every whole message; a truncated one at the end is left out."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             self._whole = 0
@@ -86,7 +76,7 @@ class ArrowsReader(RecordingReader):
                     self.metadata = self._read_schema(message)
                 self._whole = message.end
         if not self._whole:
-            raise not_a_recording(path, "it does not begin like an Arrow stream")
+            raise self._not_a_recording("it does not begin like an Arrow stream")
         self.truncated = size - self._whole
 
     def __iter__(self) -> Iterator[Rows]:
@@ -100,7 +90,7 @@ class ArrowsReader(RecordingReader):
                 try:
                     batch = _decode(message, message.header, body)
                 except (struct.error, RuntimeError, ValueError) as error:
-                    raise damaged(self.path, rows, error) from error
+                    raise self._damaged(rows, error) from error
                 yield batch
                 rows += len(batch)
 
@@ -108,11 +98,11 @@ class ArrowsReader(RecordingReader):
         try:
             head = message.header if message.kind == SCHEMA else None
             if not head or [_column(field) for field in head.tables(1)] != COLUMNS:
-                raise not_a_recording(self.path, "it is an Arrow stream with other columns")
+                raise self._not_a_recording("it is an Arrow stream with other columns")
             entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
         except struct.error as error:
-            raise not_a_recording(self.path, "it does not begin like an Arrow stream") from error
-        return load_metadata(entries.get(METADATA_KEY.encode(), b"{}"), self.path)
+            raise self._not_a_recording("it does not begin like an Arrow stream") from error
+        return self._parse_metadata(entries.get(METADATA_KEY.encode(), b"{}"))
 
 
 def _column(field: FlatTable) -> tuple[bytes, int, int]:

@@ -14,15 +14,7 @@ from typing import BinaryIO
 
 from multidrop.iso_time import format_time, parse_time
 from multidrop.polling.batch import Row, Rows
-from multidrop.recording.format import (
-    AppendingWriter,
-    Metadata,
-    RecordingReader,
-    dump_metadata,
-    load_metadata,
-    not_a_recording,
-    writing,
-)
+from multidrop.recording.format import AppendingWriter, Metadata, RecordingReader, dump_metadata, writing
 from multidrop.recording.rows import from_rows
 
 HEADER = ",".join(Row._fields) + "\n"
@@ -75,10 +67,10 @@ class CsvReader(RecordingReader):
     """Read every whole line; without its .csv.json the metadata is empty."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         with path.open("rb") as file:
             if file.read(len(HEADER)) != HEADER.encode():
-                raise not_a_recording(path, f"its first line is not {HEADER.strip()}")
+                raise self._not_a_recording(f"its first line is not {HEADER.strip()}")
             size = file.seek(0, os.SEEK_END)
             self._whole = _whole_lines(file, size)
         self.truncated = size - self._whole
@@ -86,7 +78,7 @@ class CsvReader(RecordingReader):
             described = metadata_path(path).read_bytes()
         except FileNotFoundError:
             described = b"{}"
-        self.metadata = load_metadata(described, metadata_path(path))
+        self.metadata = self._parse_metadata(described, metadata_path(path))
 
     def __iter__(self) -> Iterator[Rows]:
         with self.path.open("rb") as file:

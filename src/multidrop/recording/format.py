@@ -92,40 +92,6 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-class RecordingReader(ABC):
-    """A recording as it was when it was opened; may be iterated over more than once.
-
-    `truncated` is the number of bytes at its end that are left out: the writer was killed, or the disk
-    was full, before their batch was whole.
-    """
-
-    path: Path
-    metadata: Metadata
-    truncated: int
-
-    @abstractmethod
-    def __iter__(self) -> Iterator[Rows]:
-        """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
-
-
-def dump_metadata(metadata: Metadata) -> str:
-    """Return the metadata as a recording holds it. Raises TypeError for what JSON cannot hold."""
-    return json.dumps(metadata, ensure_ascii=False)
-
-
-def load_metadata(text: str | bytes, path: Path) -> Metadata:
-    """Return the metadata of a recording. Raises ValueError unless it is a JSON object."""
-    try:
-        metadata = json.loads(text)
-    except ValueError as error:
-        raise not_a_recording(path, f"its metadata is not JSON: {error}") from error
-    except RecursionError as error:
-        raise not_a_recording(path, "its metadata is nested too deeply") from error
-    if not isinstance(metadata, dict):
-        raise not_a_recording(path, "its metadata is not a JSON object")
-    return metadata
-
-
 _REASONS = {  # a library's own sentence is about its internals
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "its lengths do not fit together",
@@ -133,11 +99,44 @@ _REASONS = {  # a library's own sentence is about its internals
 }
 
 
-def damaged(path: Path, rows: int, error: Exception) -> ValueError:
-    """Return the error that says how many rows can be read, and why no more."""
-    reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
-    return ValueError(f"{path} is damaged after row {rows}: {reason}")
+class RecordingReader(ABC):
+    """A recording as it was when it was opened; may be iterated over more than once.
+
+    `truncated` is the number of bytes at its end that are left out: the writer was killed, or the disk
+    was full, before their batch was whole.
+    """
+
+    metadata: Metadata
+    truncated: int
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Rows]:
+        """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
+
+    def _damaged(self, rows: int, error: Exception | str) -> ValueError:
+        """Return the error that says how many rows can be read, and why no more."""
+        reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
+        return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
+
+    def _not_a_recording(self, reason: str, path: Path | None = None) -> ValueError:
+        return ValueError(f"{path or self.path} is not a recording: {reason}")
+
+    def _parse_metadata(self, text: bytes, path: Path | None = None) -> Metadata:
+        """Return metadata, from this file or the one at `path`. Raises ValueError for no JSON object."""
+        try:
+            metadata = json.loads(text)
+        except ValueError as error:
+            raise self._not_a_recording(f"its metadata is not JSON: {error}", path) from error
+        except RecursionError as error:
+            raise self._not_a_recording("its metadata is nested too deeply", path) from error
+        if not isinstance(metadata, dict):
+            raise self._not_a_recording("its metadata is not a JSON object", path)
+        return metadata
 
 
-def not_a_recording(path: Path, reason: str) -> ValueError:
-    return ValueError(f"{path} is not a recording: {reason}")
+def dump_metadata(metadata: Metadata) -> str:
+    """Return the metadata as a recording holds it. Raises TypeError for what JSON cannot hold."""
+    return json.dumps(metadata, ensure_ascii=False)

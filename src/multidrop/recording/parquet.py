@@ -20,10 +20,7 @@ from multidrop.recording.format import (
     RecordingError,
     RecordingReader,
     RecordingWriter,
-    damaged,
     dump_metadata,
-    load_metadata,
-    not_a_recording,
     writing,
 )
 from multidrop.recording.rows import RecordedRows
@@ -96,14 +93,14 @@ class ParquetReader(RecordingReader):
     truncated = 0
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         self._arrow = _pyarrow(path)
         with self._open() as file:
             found = file.schema_arrow
         wanted = self._arrow.schema(schema())
         if (found.names, found.types) != (wanted.names, wanted.types):
-            raise not_a_recording(path, "it is a Parquet file with other columns")
-        self.metadata = load_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"), path)
+            raise self._not_a_recording("it is a Parquet file with other columns")
+        self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
 
     def __iter__(self) -> Iterator[Rows]:
         from nanoarrow import c_array
@@ -121,7 +118,7 @@ class ParquetReader(RecordingReader):
             try:
                 opened = self._arrow.parquet.ParquetFile(file)
             except (OSError, ValueError, self._arrow.ArrowException) as failure:
-                raise not_a_recording(self.path, f"it is no whole Parquet file; {UNREADABLE}") from failure
+                raise self._not_a_recording(f"it is no whole Parquet file; {UNREADABLE}") from failure
             yield opened
 
     def _read_group(self, file: Any, group: int, rows: int) -> Any:
@@ -129,8 +126,7 @@ class ParquetReader(RecordingReader):
             table = file.read_row_group(group).combine_chunks()
             table.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
-            reason = ValueError("what follows cannot be unpacked")
-            raise damaged(self.path, rows, reason) from failure
+            raise self._damaged(rows, "what follows cannot be unpacked") from failure
         return table.replace_schema_metadata().to_batches()
 
 

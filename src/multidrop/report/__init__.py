@@ -1,8 +1,10 @@
-"""A recording as pictures and as one page; needs matplotlib, the extra `plot`."""
+"""Show a recording as pictures and as one page; needs matplotlib, the extra `plot`."""
 
-from multidrop.report.html import plot_page, report_page
-from multidrop.report.load import Selection, Series, TimeSpan, load
-from multidrop.report.style import png
-from multidrop.report.value_plot import plot
-
-__all__ = ["Selection", "Series", "TimeSpan", "load", "plot", "plot_page", "png", "report_page"]
+from multidrop.report.html import plot_page as plot_page
+from multidrop.report.html import report_page as report_page
+from multidrop.report.load import Recording as Recording
+from multidrop.report.load import Series as Series
+from multidrop.report.load import TimeSpan as TimeSpan
+from multidrop.report.load import load as load
+from multidrop.report.style import png as png
+from multidrop.report.value_plot import plot as plot

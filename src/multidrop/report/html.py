@@ -1,4 +1,4 @@
-"""A recording as one HTML page that needs nothing else: tables, and pictures inside it."""
+"""Write a recording as one HTML page that needs nothing else: tables and pictures."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from multidrop.printable import printable
 from multidrop.report.health import DelaySeries, delays, draw_delays, draw_miss_shares, draw_rates, reasons_of
-from multidrop.report.load import Selection
+from multidrop.report.load import Recording, Series
 from multidrop.report.style import png
-from multidrop.report.utilisation import Used, draw_used, used
+from multidrop.report.utilisation import LineUse, draw_utilisation, line_uses
 from multidrop.report.value_plot import FAULTS, plot
 
 SHORT = 32  # characters, in a cell that is not broken
@@ -35,25 +35,27 @@ div.wide { overflow-x: auto; }
 """
 
 
-def plot_page(look: Selection, figure: Figure) -> str:
-    """The picture of values, as a page."""
-    return _page(f"{look.path.name}", [_about(look), _image(figure, "values over time")])
+def plot_page(recording: Recording, figure: Figure) -> str:
+    """Return a page with the picture of values."""
+    return _page(f"{recording.path.name}", [_about(recording), _image(figure, "values over time")])
 
 
-def report_page(look: Selection) -> str:
-    """All that the recording tells of itself."""
-    parts = [_about(look), *_drives(look), *_used(used(look), look), "<h2>Rates and misses</h2>"]
-    parts += [_image(draw_rates(look), "values and misses a second"), *_misses(look)]
-    shares = draw_miss_shares(look)
+def report_page(recording: Recording) -> str:
+    """Return the report: use of the lines, rates, misses, delays, faults and values."""
+    parts = [
+        _about(recording),
+        *_drives(recording),
+        *_utilisation(line_uses(recording), recording),
+        "<h2>Rates and misses</h2>",
+    ]
+    parts += [_image(draw_rates(recording), "values and misses a second"), *_misses(recording)]
+    shares = draw_miss_shares(recording)
     if shares:
-        text = "Noise that comes with the motor's speed shows as a slope to the right."
-        parts += [
-            "<h2>Misses against output frequency</h2>",
-            f"<p>{text}</p>",
-            _image(shares, "misses against output frequency"),
-        ]
-    parts += [*_delays(delays(look)), *_faults(look), "<h2>Values</h2>", *_values(look)]
-    return _page(f"Report on {look.path.name}", parts)
+        parts.append("<h2>Misses against output frequency</h2>")
+        parts.append("<p>Noise that comes with the motor's speed shows as a slope to the right.</p>")
+        parts.append(_image(shares, "misses against output frequency"))
+    parts += [*_delays(delays(recording)), *_faults(recording), "<h2>Values</h2>", *_values(recording)]
+    return _page(f"Report on {recording.path.name}", parts)
 
 
 def _page(title: str, parts: Sequence[str]) -> str:
@@ -65,17 +67,26 @@ def _page(title: str, parts: Sequence[str]) -> str:
     )
 
 
-def _about(look: Selection) -> str:
-    begin = datetime.fromtimestamp(look.begin / 1e9, UTC)
-    plant = look.metadata.get("plant")
-    values = sum(int((~it.missed).sum()) for it in look.series)
-    misses = sum(int(it.missed.sum()) for it in look.series)
+def _about(recording: Recording) -> str:
+    plant = recording.metadata.get("plant")
+    values, misses = _counts(recording.series)
     text = (
-        f"From {begin:%Y-%m-%d %H:%M:%S} UTC, {_duration(look.seconds)}; "
-        f"{_count(len(look.drives), 'drive')}; {_count(values, 'value')}, {_count(misses, 'miss', 'misses')}"
+        f"From {_utc(recording.begin)} UTC, {_duration(recording.seconds)}; "
+        f"{_count(len(recording.drives), 'drive')}; "
+        f"{_count(values, 'value')}, {_count(misses, 'miss', 'misses')}"
     )
     of_plant = _escape(f"; plant {plant}") if plant else ""
     return f'<p class="about">{text}{of_plant}</p>'
+
+
+def _utc(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def _counts(series: Sequence[Series]) -> tuple[int, int]:
+    """Count values and misses."""
+    misses = sum(int(one.missed.sum()) for one in series)
+    return sum(len(one.time) for one in series) - misses, misses
 
 
 def _count(number: int, one: str, many: str = "") -> str:
@@ -90,14 +101,13 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest:02} s" if minutes else f"{seconds:.1f} s"
 
 
-def _drives(look: Selection) -> Iterator[str]:
+def _drives(recording: Recording) -> Iterator[str]:
     yield "<h2>What was polled</h2>"
     rows = []
-    for drive in look.drives:
-        about = look.about(drive)
-        series = look.of(drive)
-        values = sum(int((~it.missed).sum()) for it in series)
-        misses = sum(int(it.missed.sum()) for it in series)
+    for drive in recording.drives:
+        about = recording.about(drive)
+        series = recording.of(drive)
+        values, misses = _counts(series)
         rows.append(
             [
                 drive,
@@ -105,8 +115,8 @@ def _drives(look: Selection) -> Iterator[str]:
                 str(about.get("model", "")),
                 str(about.get("address", "")),
                 f"{about.get('settings', '')} {about.get('framing', '')}",
-                ", ".join(it.register for it in series),
-                f"{values / max(look.seconds, 1e-9):.1f}",
+                ", ".join(one.register for one in series),
+                f"{values / max(recording.seconds, 1e-9):.1f}",
                 str(values),
                 str(misses),
                 f"{misses / max(values + misses, 1):.2%}",
@@ -116,9 +126,9 @@ def _drives(look: Selection) -> Iterator[str]:
     yield _table([*heads, "#Values/s", "#Values", "#Misses", "#Missed"], rows)
 
 
-def _used(found: Sequence[Used], look: Selection) -> Iterator[str]:
+def _utilisation(uses: Sequence[LineUse], recording: Recording) -> Iterator[str]:
     yield "<h2>Utilisation against plan</h2>"
-    if not found:
+    if not uses:
         yield "<p>The recording does not carry a plan: it was not made by polling a plant file.</p>"
         return
     yield (
@@ -126,16 +136,15 @@ def _used(found: Sequence[Used], look: Selection) -> Iterator[str]:
         "reply. What else was sent meanwhile, such as commands, is not recorded. The plan reckons with "
         "the response delays that the drives' documents state.</p>"
     )
-    yield _image(draw_used(found, look), "utilisation over time")
+    yield _image(draw_utilisation(uses, recording), "utilisation over time")
     rows = []
-    for it in found:
-        planned = it.planned
-        cycle = "" if it.cycle is None else f"{it.cycle * 1e3:.1f}"
-        rows.append([it.line, "utilisation, %", _percent(planned["utilisation"]), _percent(it.utilisation)])
-        if cycle:
-            rows.append(["", "bus cycle, ms", f"{planned['cycle_ms']:.1f}", cycle])
+    for use in uses:
+        planned = use.planned
+        rows.append([use.line, "utilisation, %", _percent(planned["utilisation"]), _percent(use.utilisation)])
+        if use.cycle is not None:
+            rows.append(["", "bus cycle, ms", f"{planned['cycle_ms']:.1f}", f"{use.cycle * 1e3:.1f}"])
         rows += [
-            ["", f"{name}, exchanges/s", f"{drive['exchanges_per_second']:.1f}", f"{it.rate(name):.1f}"]
+            ["", f"{name}, exchanges/s", f"{drive['exchanges_per_second']:.1f}", f"{use.rate(name):.1f}"]
             for name, drive in planned["drives"].items()
         ]
     yield _table(["Line", "What", "#Planned", "#Measured"], rows)
@@ -145,8 +154,8 @@ def _percent(part: float) -> str:
     return f"{part * 100:.1f}"
 
 
-def _misses(look: Selection) -> Iterator[str]:
-    by_drive = {drive: reasons_of(look, drive) for drive in look.drives}
+def _misses(recording: Recording) -> Iterator[str]:
+    by_drive = {drive: reasons_of(recording, drive) for drive in recording.drives}
     reasons = sum(by_drive.values(), Counter())
     if not reasons:
         return
@@ -168,41 +177,41 @@ def _delays(found: Sequence[DelaySeries]) -> Iterator[str]:
     parts = {"least": 0.0, "median": 0.5, "95 %": 0.95, "99 %": 0.99, "longest": 1.0}
     rows = [
         [
-            it.drive + ("" if it.exact else " (with the request)"),
-            str(len(it.seconds)),
-            *(f"{it.quantile(part) * 1e3:.1f}" for part in parts.values()),
+            delay.drive + ("" if delay.exact else " (with the request)"),
+            str(len(delay.seconds)),
+            *(f"{delay.quantile(part) * 1e3:.1f}" for part in parts.values()),
         ]
-        for it in found
+        for delay in found
     ]
     yield _table(["Drive", "#Replies", *(f"#{name}, ms" for name in parts)], rows)
 
 
-def _faults(look: Selection) -> Iterator[str]:
+def _faults(recording: Recording) -> Iterator[str]:
     yield "<h2>Faults</h2>"
-    series = [it for it in look.series if it.register == FAULTS]
+    polled = [series for series in recording.series if series.register == FAULTS]
     rows = [
         [
-            it.drive,
+            series.drive,
             span.what,
-            f"{datetime.fromtimestamp(span.begin / 1e9, UTC):%Y-%m-%d %H:%M:%S}",
+            _utc(span.begin),
             _duration((span.end - span.begin) / 1e9),
         ]
-        for it in series
-        for span in it.faults()
+        for series in polled
+        for span in series.faults()
     ]
     if rows:
         yield _table(["Drive", "Fault", "From, UTC", "#For"], rows)
-    elif series:
+    elif polled:
         yield "<p>None was seen.</p>"
     else:
         yield "<p>No register called fault was polled.</p>"
 
 
-def _values(look: Selection) -> Iterator[str]:
-    if not any(it.has_values for it in look.series):
+def _values(recording: Recording) -> Iterator[str]:
+    if not any(series.has_values for series in recording.series):
         yield "<p>There is none.</p>"
         return
-    figure, left = plot(look)
+    figure, left = plot(recording)
     if left:
         names = _escape("; ".join(left))
         yield f"<p>Not shown: {names}. <code>multidrop plot --register NAME</code> shows each.</p>"
@@ -214,7 +223,7 @@ def _escape(text: str) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A column whose head begins with # has numbers, which stand to the right."""
+    """Return a table; a column whose head begins with # has numbers, aligned to the right."""
     kinds = [f' class="{_kind(column)}"' for column in zip(heads, *rows, strict=True)]
     head = "".join(
         f"<th{kind}>{_escape(text.removeprefix('#'))}</th>" for kind, text in zip(kinds, heads, strict=True)

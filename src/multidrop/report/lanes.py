@@ -1,7 +1,6 @@
-"""States as lanes: one for each drive, or for each bit of a register of bits, in the drive's own names.
+"""Draw states as lanes: one for each drive, or for each bit of a register of bits, with their names.
 
-The same count means different things to different families, so that counts of several drives never
-share an axis.
+A count has different names in different families, so that counts of several drives share no axis.
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from multidrop.report.load import Array, Selection, Series
-from multidrop.report.style import COLOURS, TEXT, days, label, line_style
+from multidrop.report.load import Array, Recording, Series
+from multidrop.report.style import COLOURS, TEXT, days, label, line_style, mark_times
 
 HATCHES = ("", "////", "....")  # the colours once more, and again
 MOST_LANES = 64  # in one panel
 NARROWEST = 1 / 1500  # of the time axis: a shorter state is drawn so wide
-LETTER = 1 / 140  # of the time axis, that a letter of a state's name takes
+LETTER = 1 / 140  # of the time axis: the width of a letter
 LANE_INCHES = 0.24
 MOST_TEXTS = 50  # with one name, in one lane
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """What one drive's register, or one bit of it, was from when to when."""
+    """The states of one drive's register, or of one bit of it, and their times."""
 
     drive: str
     title: str
-    is_bit: bool  # its title says all: it is on or off
+    is_bit: bool  # either on or off
     time: Array  # of its rows, ns UTC
     missed: Array
     state: tuple[str, ...]  # of each run of rows that are alike
@@ -41,7 +40,7 @@ class Lane:
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return the lanes of a panel, and how many had no room; bits that were never set give way first."""
+    """Return the lanes of a panel, and how many had no room, first of them bits that were never set."""
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
@@ -77,7 +76,7 @@ def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], s
     ends = np.concatenate([time[begins[1:]], time[-1:]])
     names = {one: "" if np.isnan(one) else name_of(one) for one in np.unique(value[begins]).tolist()}
     states = [names[one] if one == one else "" for one in value[begins].tolist()]
-    told = np.array([bool(state) for state in states])
+    named = np.array([bool(state) for state in states])
     return Lane(
         series.drive,
         title,
@@ -85,24 +84,24 @@ def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], s
         time,
         series.missed,
         tuple(state for state in states if state),
-        time[begins][told],
-        ends[told],
+        time[begins][named],
+        ends[named],
     )
 
 
 def lanes_inches(lanes: Sequence[Lane]) -> float:
-    """How high a panel of so many lanes is."""
+    """Return the height of a panel of these lanes."""
     return 0.45 + LANE_INCHES * len(lanes)
 
 
-def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Selection) -> None:
-    """Draw a row for each lane, its states as bars; names that fit nowhere are beside the panel."""
+def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
+    """Draw a row for each lane, its states as bars; names that fit nowhere go into a legend."""
     names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
     styles = {name: _style(number) for number, name in enumerate(names)}
-    span = max(look.end - look.begin, 1)
-    told: set[str] = set()
+    span = max(recording.end - recording.begin, 1)
+    shown: set[str] = set()
     for row, lane in enumerate(lanes):
-        bit_style = {"facecolor": line_style(look.drives.index(lane.drive))["color"]}
+        bit_style = {"facecolor": line_style(recording.drives.index(lane.drive))["color"]}
         for name in _longest_first(lane):
             begin, end = _merged(lane, name, span)
             widths = np.maximum(end - begin, span * NARROWEST)
@@ -111,13 +110,14 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Selection) -> None:
             if not lane.is_bit:
                 text = label(name).lower()
                 fitting = begin[widths > span * LETTER * (len(text) + 2)][:MOST_TEXTS]
-                told.update([name] if len(fitting) else [])
+                shown.update([name] if len(fitting) else [])
                 for at in days(fitting):
                     name_bar(axes, text, at, row)
-        _mark_misses(axes, lane, row, span)
-    untold = [name for name in names if name not in told]
-    if untold:
-        handles = [Patch(label=label(name).lower(), **styles[name]) for name in untold]
+        missed = lane.time[lane.missed]
+        mark_times(axes, missed, row + 0.4, span // 4000, color=TEXT, markersize=5, markeredgewidth=1.0)
+    hidden = [name for name in names if name not in shown]
+    if hidden:
+        handles = [Patch(label=label(name).lower(), **styles[name]) for name in hidden]
         axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, frameon=False)
     axes.set_yticks(range(len(lanes)), [label(lane.title) for lane in lanes], fontsize=8)
     axes.set_ylim(len(lanes) - 0.4, -0.6)
@@ -125,7 +125,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], look: Selection) -> None:
 
 
 def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
-    """Write a name at the begin of a bar, so that it can be read where the bar is shorter."""
+    """Write a name at the begin of a bar, readable also where the bar is shorter."""
     box = {"facecolor": "white", "alpha": 0.75, "pad": 0.8, "linewidth": 0}
     place: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
     axes.annotate(text, (at, row), fontsize=7.5, clip_on=True, bbox=box, **place)
@@ -137,7 +137,7 @@ def _style(number: int) -> dict[str, Any]:
 
 
 def _longest_first(lane: Lane) -> list[str]:
-    """The rarest states are drawn last: where states change faster than can be drawn, none is hidden."""
+    """Return the states by falling duration: drawn last, short ones are not hidden by long ones."""
     lasting = dict.fromkeys(lane.state, 0)
     for name, length in zip(lane.state, (lane.end - lane.begin).tolist(), strict=True):
         lasting[name] += length
@@ -145,16 +145,8 @@ def _longest_first(lane: Lane) -> list[str]:
 
 
 def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
-    """From when to when it was in this state, without gaps that are too narrow to be seen."""
+    """Return begins and ends of this state, without gaps that are too narrow to be seen."""
     of = np.array([state == name for state in lane.state])
     begin, end = lane.begin[of], lane.end[of]
     apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])
     return begin[apart], end[np.concatenate([apart[1:], [True]])]
-
-
-def _mark_misses(axes: Axes, lane: Lane, row: int, span: int) -> None:
-    """A tick at the foot of the lane for every row that was missed."""
-    time = np.unique(lane.time[lane.missed] // max(1, span // 4000)) * max(1, span // 4000)
-    if len(time):
-        foot = np.full(len(time), row + 0.4)
-        axes.plot(days(time), foot, "|", color=TEXT, markersize=5, markeredgewidth=1.0)

@@ -1,4 +1,4 @@
-"""A whole recording in memory, as one series for each register of each drive."""
+"""Load a whole recording, as one series for each register of each drive."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from multidrop.polling.batch import Row
 from multidrop.recording import open_reader
 
 RAW = "raw count"  # the unit where no document states the scale
-LARGEST = 1e150  # of what can be drawn: axes reckon with differences and products
-LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: beyond that no date is reckoned with
+LARGEST = 1e150  # drawable value: axes compute with differences and products
+LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC: dates beyond it cannot be computed
 LARGEST_COUNT = 2**53  # that a column of values can hold exactly
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """From when to when, in ns UTC, something was so."""
+    """A span of time, in ns UTC, and what it was a span of."""
 
     begin: int
     end: int
@@ -33,7 +33,7 @@ class TimeSpan:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One register of one drive: a value, or NaN where it was missed, for each time it was due."""
+    """One register of one drive: a value, or NaN for a miss, for each time it was due."""
 
     drive: str
     register: str
@@ -42,7 +42,7 @@ class Series:
     uncertainty: Array  # float64, ns
     status: Array  # int, into `statuses`
     statuses: tuple[str, ...]
-    meaning: Mapping[str, Any]
+    metadata: Mapping[str, Any]  # of the register
 
     @cached_property
     def missed(self) -> Array:
@@ -54,38 +54,42 @@ class Series:
 
     @cached_property
     def drawable(self) -> Array:
-        """Its values, and NaN also for those that are too large for a picture."""
+        """The values, with NaN for misses and for those that are too large for a picture."""
         return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
 
     @cached_property
     def names(self) -> dict[int, str]:
-        """What its counts mean, where they have names."""
-        names: Mapping[str, int] = self.meaning.get("values") or {}
+        """The names of its counts, if they have some."""
+        names: Mapping[str, int] = self.metadata.get("values") or {}
         return {number: name for name, number in names.items()}
 
     @property
     def is_bits(self) -> bool:
-        """Its count is a sum of bits, each with a meaning of its own."""
-        return bool(self.names) and self.meaning.get("bits") is True
+        """True where a count is a sum of bits, each with a name of its own."""
+        return bool(self.names) and self.metadata.get("bits") is True
 
     @property
     def unit(self) -> str:
-        """As it stands beside an axis; a register whose scale no document states has raw counts."""
+        """The unit beside an axis; "raw count" where no document states the scale."""
         if self.names:
             return ""
-        if "step" in self.meaning and self.meaning["step"] is None:
+        if "step" in self.metadata and self.metadata["step"] is None:
             return RAW
-        return str(self.meaning.get("unit") or "")
+        return str(self.metadata.get("unit") or "")
 
     def reasons(self) -> Counter[str]:
-        """Misses by reason."""
+        """Count misses by reason."""
         numbers, counts = np.unique(self.status[self.missed], return_counts=True)
         return Counter(
             {self.statuses[number]: int(count) for number, count in zip(numbers, counts, strict=True)}
         )
 
+    def times_of(self, reason: str) -> Array:
+        """Return the times of the misses for this reason."""
+        return np.asarray(self.time[self.missed & (self.status == self.statuses.index(reason))])
+
     def faults(self) -> list[TimeSpan]:
-        """When it was not 0, for a register of faults; a miss says nothing, and ends no fault."""
+        """Return the spans in which a register of faults was not 0; a miss ends no fault."""
         there = ~self.missed
         time, value = self.time[there], self.value[there]
         if not len(time):
@@ -100,7 +104,7 @@ class Series:
         ]
 
     def name_of(self, value: float) -> str:
-        """The name of a count; of bits those that are set; or the number itself."""
+        """Return the name of a count, the names of the bits that are set, or the number itself."""
         if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
             return f"code {value:g}"
         number = int(value)
@@ -114,7 +118,7 @@ class Series:
 
 
 @dataclass(frozen=True, eq=False)
-class Selection:
+class Recording:
     """A recording: its metadata, and its series in the order in which they first appear.
 
     Drives are in the order of their plant file.
@@ -126,55 +130,51 @@ class Selection:
     truncated: int  # bytes at the recording's end that were left out
 
     @property
+    def statuses(self) -> tuple[str, ...]:
+        return self.series[0].statuses
+
+    @property
     def rows(self) -> int:
-        return sum(len(it.time) for it in self.series)
+        return sum(len(series.time) for series in self.series)
 
     @property
     def drives(self) -> tuple[str, ...]:
-        there = {it.drive for it in self.series}
+        there = dict.fromkeys(series.drive for series in self.series)
         known = [drive for drive in self.metadata.get("drives", {}) if drive in there]
-        return tuple(dict.fromkeys([*known, *(it.drive for it in self.series)]))
+        return tuple(dict.fromkeys([*known, *there]))
 
     @cached_property
     def begin(self) -> int:
-        return min(int(it.time.min()) for it in self.series)
+        return min(int(series.time.min()) for series in self.series)
 
     @cached_property
     def end(self) -> int:
-        return max(int(it.time.max()) for it in self.series)
+        return max(int(series.time.max()) for series in self.series)
 
     @property
     def seconds(self) -> float:
         return (self.end - self.begin) / 1e9
 
     def about(self, drive: str) -> Mapping[str, Any]:
-        """What the metadata says of a drive."""
+        """Return the metadata of a drive."""
         found: Mapping[str, Any] = self.metadata.get("drives", {}).get(drive, {})
         return found
 
     def of(self, drive: str, register: str = "") -> tuple[Series, ...]:
-        """A drive's series; of one register, where one is named."""
-        return tuple(
-            it for it in self.series if it.drive == drive and it.register == (register or it.register)
-        )
+        """Return a drive's series, or that of one register."""
+        of_drive = (series for series in self.series if series.drive == drive)
+        return tuple(series for series in of_drive if register in ("", series.register))
 
 
-def load(path: str | Path) -> Selection:
-    """Read a recording. Raises ValueError for what is not one or has no rows, and OSError."""
+def load(path: str | Path) -> Recording:
+    """Load a recording. Raises ValueError for a file without rows or of another kind, and OSError."""
     reader = open_reader(path)
     names: dict[str, list[str]] = {"drive": [], "register": [], "status": []}
     parts: list[list[Array]] = []
     for rows in reader:
         children = dict(zip(Row._fields, rows.arrow().view().children, strict=True))
         codes = [_codes(children[name], known) for name, known in names.items()]
-        parts.append(
-            [
-                *codes,
-                _numbers(children["time"]),
-                _numbers(children["value"]),
-                _numbers(children["uncertainty_ns"]),
-            ]
-        )
+        parts.append(codes + [_numbers(children[name]) for name in ("time", "value", "uncertainty_ns")])
     if not parts or not any(len(part[0]) for part in parts):
         raise ValueError(f"{path} holds no rows: nothing was polled while it was recorded")
     drive, register, status, time, value, uncertainty = (
@@ -191,7 +191,7 @@ def load(path: str | Path) -> Selection:
         rows_of = rows_of[np.argsort(time[rows_of], kind="stable")]
         drive_name = names["drive"][key // len(names["register"])]
         register_name = names["register"][key % len(names["register"])]
-        meaning = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})
+        about = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})
         series.append(
             Series(
                 drive_name,
@@ -201,17 +201,17 @@ def load(path: str | Path) -> Selection:
                 uncertainty[rows_of].astype(float),
                 status[rows_of],
                 statuses,
-                meaning,
+                about,
             )
         )
-    return Selection(Path(path), metadata, tuple(series), reader.truncated)
+    return Recording(Path(path), metadata, tuple(series), reader.truncated)
 
 
 def _described(drives: object) -> dict[str, Any]:
-    """What the metadata says of drives and registers, without what `Plant.metadata` would not write."""
+    """Return the metadata of drives and registers, without what `Plant.metadata` would not write."""
     found = {}
     for name, about in _tables(drives):
-        registers = {register: _meaning(meaning) for register, meaning in _tables(about.get("registers"))}
+        registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
         found[name] = {**about, "registers": registers}
     return found
 
@@ -222,11 +222,11 @@ def _tables(tables: object) -> list[tuple[str, dict[str, Any]]]:
     return [(name, table) for name, table in tables.items() if isinstance(table, dict)]
 
 
-def _meaning(meaning: dict[str, Any]) -> dict[str, Any]:
-    values = meaning.get("values")
+def _checked(register: dict[str, Any]) -> dict[str, Any]:
+    values = register.get("values")
     if not isinstance(values, dict):
-        return {**meaning, "values": None}
-    return {**meaning, "values": {name: count for name, count in values.items() if _is_count(count)}}
+        return {**register, "values": None}
+    return {**register, "values": {name: count for name, count in values.items() if _is_count(count)}}
 
 
 def _is_count(count: object) -> bool:
@@ -234,7 +234,7 @@ def _is_count(count: object) -> bool:
 
 
 def _numbers(column: Any) -> Array:
-    """NaN where there is none."""
+    """Return a column of numbers, with NaN for nulls."""
     numbers = np.array(column.buffer(1))[: column.length]
     if not column.null_count:
         return numbers
@@ -243,7 +243,7 @@ def _numbers(column: Any) -> Array:
 
 
 def _codes(column: Any, known: list[str]) -> Array:
-    """The number of each row's text in `known`, which grows by what is new."""
+    """Return the index of each row's text in `known`, which grows by new ones."""
     ends = np.array(column.buffer(1))[: column.length + 1]
     lengths = np.diff(ends)
     width = int(lengths.max(initial=1)) or 1

@@ -1,4 +1,4 @@
-"""How pictures look: colours that can be told apart by everyone, few lines, time in UTC."""
+"""The style of all pictures: colours for everyone's eyes, few lines, time in UTC."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
-FEWEST_BUCKETS, MOST_BUCKETS = 10, 120  # of the time axis
-BUCKET_NS = 2_000_000_000  # the width of one, between these
+FEWEST_BINS, MOST_BINS = 10, 120  # of the time axis
+BIN_NS = 2_000_000_000  # the width of one, between these
 SHORTEST_NS = 1_000_000_000  # time axis
 WIDTH = 11.0  # inches
 DPI = 110
@@ -30,14 +30,33 @@ DPI = 110
 _DATES: Any = dates  # it has no types
 
 
+class TimeBins:
+    """The bins into which a picture cuts the time of a recording, given in ns UTC."""
+
+    def __init__(self, begin: int, end: int) -> None:
+        bins = int(np.clip((end - begin) / BIN_NS, FEWEST_BINS, MOST_BINS))
+        self._edges = np.linspace(begin, max(end, begin + SHORTEST_NS), bins + 1)
+        self._seconds = (self._edges[1] - self._edges[0]) / 1e9
+        self.middles = days(((self._edges[1:] + self._edges[:-1]) / 2).astype(np.int64))
+
+    def rates(self, time: Array, weights: Array | None = None) -> Array:
+        """Return for each bin how many times a second, or their weights a second, lie in it."""
+        return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
+
+    def label(self, axes: Axes) -> None:
+        """Label the x axis, and let it begin and end with the bins."""
+        label_time(axes)
+        axes.set_xlim(*days(self._edges[[0, -1]].astype(np.int64)))
+
+
 def label(text: str) -> str:
-    """A name as a picture shows it: no mathematics, and never left out of a legend."""
+    """Return a name for a picture: without mathematics, and never left out of a legend."""
     shown = printable(text).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Of the number-th drive, in every picture."""
+    """Return colour and dashes of the drive with this number, the same in every picture."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "linestyle": DASHES[number // len(COLOURS) % len(DASHES)],
@@ -45,7 +64,7 @@ def line_style(number: int) -> dict[str, Any]:
 
 
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """A figure of axes below each other, as high in inches as said."""
+    """Make a figure of axes below each other with these heights in inches."""
     figure = Figure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:
@@ -55,14 +74,23 @@ def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[A
     return figure, list(axes)
 
 
-def time_edges(begin: int, end: int) -> Array:
-    """Of the buckets into which a picture cuts the time, in ns UTC."""
-    buckets = int(np.clip((end - begin) / BUCKET_NS, FEWEST_BUCKETS, MOST_BUCKETS))
-    return np.linspace(begin, max(end, begin + SHORTEST_NS), buckets + 1)
+def set_title(axes: Axes, text: str) -> None:
+    axes.set_title(text, loc="left", fontsize=10)
+
+
+def add_legend(figure: Figure, handles: Sequence[Any], columns: int = 6) -> None:
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns, frameon=False)
+
+
+def mark_times(axes: Axes, time: Array, height: float, apart: int, **details: Any) -> None:
+    """Draw a tick at each time; those of the same `apart` ns, which would overlap, are one."""
+    if len(time):
+        time = np.unique(time // max(1, apart)) * max(1, apart)
+        axes.plot(days(time), np.full(len(time), height), "|", **details)
 
 
 def days(time: Array) -> Array:
-    """Times in ns UTC as matplotlib counts them."""
+    """Return times in ns UTC as matplotlib counts them."""
     return np.asarray(_DATES.date2num(np.asarray(time, dtype="datetime64[ns]")))
 
 
@@ -70,8 +98,8 @@ def day(time: int) -> float:
     return float(days(np.array(time)))
 
 
-def tell_time(axes: Axes) -> None:
-    """Its x axis says the time of day in UTC, and the date where that is not clear."""
+def label_time(axes: Axes) -> None:
+    """Label the x axis with the time of day in UTC, and the date where that is not clear."""
     locator = _DATES.AutoDateLocator(tz=UTC)
     axes.xaxis.set_major_locator(locator)
     formatter = _DATES.ConciseDateFormatter(

@@ -1,22 +1,15 @@
 """Find the drives on a line whose settings nobody knows, by reading only."""
 
-from multidrop.scan.plant_writer import plant_text
-from multidrop.scan.results import Crowd, Finding, Found, Noise, Progress, Untried
-from multidrop.scan.scanner import scan
-from multidrop.scan.sweep import ADDRESSES, ScanRequest, Sweep, one_of_each_framing, sweeps
-
-__all__ = [
-    "ADDRESSES",
-    "Crowd",
-    "Finding",
-    "Found",
-    "Noise",
-    "Progress",
-    "ScanRequest",
-    "Sweep",
-    "Untried",
-    "one_of_each_framing",
-    "plant_text",
-    "scan",
-    "sweeps",
-]
+from multidrop.scan.plant_writer import plant_text as plant_text
+from multidrop.scan.results import Crowd as Crowd
+from multidrop.scan.results import Finding as Finding
+from multidrop.scan.results import Found as Found
+from multidrop.scan.results import Noise as Noise
+from multidrop.scan.results import Progress as Progress
+from multidrop.scan.results import Untried as Untried
+from multidrop.scan.scanner import scan as scan
+from multidrop.scan.sweep import ADDRESSES as ADDRESSES
+from multidrop.scan.sweep import ScanRequest as ScanRequest
+from multidrop.scan.sweep import Sweep as Sweep
+from multidrop.scan.sweep import one_of_each_framing as one_of_each_framing
+from multidrop.scan.sweep import sweeps as sweeps

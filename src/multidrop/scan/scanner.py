@@ -68,8 +68,6 @@ class _Scan:
         """Add to the sweep's patience where an adapter or a long way has been seen to be slow."""
         return replace(sweep, patience=sweep.patience + min(2 * self._excess, MOST_TIMEOUT))
 
-    # ---- one sweep ----
-
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
         garbled: list[int] = []
@@ -110,8 +108,6 @@ class _Scan:
             if _key(sweep, address) not in self._crowded:
                 self._crowded.add(_key(sweep, address))
                 yield Crowd(address, sweep.settings, sweep.framing)
-
-    # ---- exchanges ----
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion:
         """Carry out an exchange; an echo of the request is no reply."""

@@ -1,31 +1,19 @@
-"""Drives that behave as their documents say, on ptys and TCP ports, at the pace of a real wire."""
+"""Simulated drives that behave as their documents say, on ptys and TCP ports, at the pace of a wire."""
 
-from multidrop.sim.drive import DriveCounters, SimulatedDrive, Written
-from multidrop.sim.encoded import EncodedDrive, encoded, proof
-from multidrop.sim.families import simulated
-from multidrop.sim.faults import Faults, load_faults
-from multidrop.sim.faulty_wire import FaultyWire
-from multidrop.sim.motor import Motor, Phase, Rating
-from multidrop.sim.motor_drive import MotorDrive
-from multidrop.sim.simulator import Simulator, serve
-from multidrop.sim.wire import Wire
-
-__all__ = [
-    "DriveCounters",
-    "EncodedDrive",
-    "Faults",
-    "FaultyWire",
-    "Motor",
-    "MotorDrive",
-    "Phase",
-    "Rating",
-    "SimulatedDrive",
-    "Simulator",
-    "Wire",
-    "Written",
-    "encoded",
-    "load_faults",
-    "proof",
-    "serve",
-    "simulated",
-]
+from multidrop.sim.drive import DriveCounters as DriveCounters
+from multidrop.sim.drive import SimulatedDrive as SimulatedDrive
+from multidrop.sim.drive import Written as Written
+from multidrop.sim.encoded import EncodedDrive as EncodedDrive
+from multidrop.sim.encoded import encoded as encoded
+from multidrop.sim.encoded import proof as proof
+from multidrop.sim.families import simulated as simulated
+from multidrop.sim.faults import Faults as Faults
+from multidrop.sim.faults import load_faults as load_faults
+from multidrop.sim.faulty_wire import FaultyWire as FaultyWire
+from multidrop.sim.motor import Motor as Motor
+from multidrop.sim.motor import Phase as Phase
+from multidrop.sim.motor import Rating as Rating
+from multidrop.sim.motor_drive import MotorDrive as MotorDrive
+from multidrop.sim.simulator import Simulator as Simulator
+from multidrop.sim.simulator import serve as serve
+from multidrop.sim.wire import Wire as Wire

@@ -6,7 +6,7 @@ from multidrop.core import Message
 from multidrop.drive.register import HOLDING
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.protocol import MODBUS, Reason, Refusal
 
 CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
@@ -20,23 +20,19 @@ def _signed(raw: int) -> int:
 
 
 class SimulatedCHE(MotorDrive):
-    """The setpoint is a percentage of P0.04, which is the drive's option `maximum_frequency`.
+    """INVT CHE. The setpoint is a percentage of P0.04, the drive's option `maximum_frequency`.
 
-    `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or the
-    jog's own stop do to a jog and to a run: here both stops end both, and a start ends a jog.
+    For `storing` s after a write to the EEPROM the drive is busy. No manual says what a stop, a start or
+    the jog's own stop do to a jog and to a run: here both stops end both, and a start ends a jog.
     """
 
     functions = (0x03, 0x06)
     needs_silence = True  # 11.5
     codes = {
-        Reason.FUNCTION: 1,
-        Reason.READ_ADDRESS: 2,
-        Reason.WRITE_ADDRESS: 2,
-        Reason.COUNT: 3,
+        **MODBUS.codes,
         Reason.VALUE: 0x12,
         Reason.LOCKED: 0x12,
         Reason.CANNOT: 1,  # "or drive in fault"
-        Reason.BUSY: 6,
         Reason.DAMAGED: 0x11,  # 11.1: a receive error is answered with a fault frame
     }
 

@@ -13,14 +13,14 @@ UNDER_VOLTAGE = 7  # fault number, POFF
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # by the codes of P04.28
 MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # of P04.29, first ASCII, then RTU
 NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-COMMANDS, STARTS = range(1, 5), (2, 3)  # what K = 02 may command
+COMMANDS, STARTS = range(1, 5), (2, 3)  # of K = 02
 RUN_SOURCE, FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
 BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
 RECORDS = (0x020D, 0x020E, 0x020F, 0x0210)  # P05.25 to P05.28
 
 
 class SimulatedDelixi(MotorDrive):
-    """Standard Modbus: the document has no exceptions, so what cannot be done is not answered.
+    """Delixi by standard Modbus. The document has no exceptions: what cannot be done is not answered.
 
     Not in the document: a run command is confirmed and has no effect in a fault and where P00.00 is not 2,
     and the setpoint is 0 where P00.01 is not 1; a start ends a jog. Gaps are those of part 3.
@@ -58,12 +58,12 @@ class SimulatedDelixi(MotorDrive):
 
 
 class SimulatedDelixiNative(MotorDrive):
-    """Delixi's own protocol: a set is answered with its copy, a query with what was asked for.
+    """Delixi by its own protocol: a set is answered with its copy, a query with the value.
 
-    While `locked` is set, no parameter may be written: FEH. A run command cannot be executed (F0H) in a
-    fault, for a start, nor where P00.00 is not 2; of the latter the document says nothing. Nor does it say
-    what P00.01 does to K = 04: here the setpoint that was written last counts. Faults from 10 on are
-    shown as they are printed, as decimal digits, in their records too.
+    While `locked` is set, no parameter may be written: FEH. F0H refuses a start in a fault, and any run
+    command where P00.00 is not 2, of which the document says nothing. Nor does it say what P00.01 does to
+    K = 04: here the setpoint that was written last counts. Faults from 10 on are shown in decimal digits,
+    as they are printed, in their records too.
     """
 
     begins = BY_LINE
@@ -84,7 +84,7 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        if cell.name == "stored_frequency":  # whichever was written last counts
+        if cell.name == "stored_frequency":  # the last setpoint counts
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
@@ -118,5 +118,5 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """The count whose hex digits are the fault's decimal ones: 10 is printed 00000010."""
+    """Return the count whose hex digits are the fault's decimal ones: 10 is printed 00000010."""
     return int(str(fault), 16)

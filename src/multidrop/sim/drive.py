@@ -1,7 +1,7 @@
-"""SimulatedDrive: answers requests out of its memory, as the drive's class declares it.
+"""SimulatedDrive: answers requests from its memory, as the drive's class declares it.
 
-It knows neither ports nor clocks: a request and the time at which it was understood come in, the
-reply or nothing comes out. What one family does differently is in that family's file.
+It knows neither ports nor clocks: a request and its time come in, the reply or nothing comes out. What
+one family does differently is in that family's file.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
 MOST_CELLS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}  # in any reply
-_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # as many are written at once as are read
+_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
 
 
 class Written(NamedTuple):
-    """One write that was carried out."""
+    """A write that was carried out."""
 
     time: float
     name: str  # of the register
@@ -35,24 +35,24 @@ class Written(NamedTuple):
 
 @dataclass
 class DriveCounters:
-    """What a drive has seen since it was made."""
+    """Counts of one drive since it was made."""
 
     requests: int = 0  # addressed to it alone
     replies: int = 0  # of which refusals
     refusals: int = 0
     broadcasts: int = 0
-    damaged: int = 0  # frames that seemed to be for it
-    early: int = 0  # frames for it before the silence after a reply was over
+    damaged: int = 0  # frames with its address
+    early: int = 0  # frames that did not keep the silence after a reply
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
 
 
 def _most_cells(drive: Drive) -> dict[int, int]:
-    """Cells in one request, by the function code that reads them: never less than a register takes."""
+    """Return the most cells of a request by the code that reads them: at least those of one register."""
     most: dict[int, int] = {}
     for table in dict.fromkeys(register.table for register in drive.registers.values()):
-        longest = max(it.words for it in drive.registers.values() if it.table == table)
+        longest = max(register.words for register in drive.registers.values() if register.table == table)
         limit = min(max(drive.most_registers.get(table, 1), longest), MOST_CELLS[table.carrier])
         for code in {table.read, _COUNTED_AS.get(table.write or 0)} - {None}:
             most[code or 0] = max(most.get(code or 0, 1), limit)
@@ -62,12 +62,12 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 class SimulatedDrive:
     """A drive of any class: its registers hold what is written to them.
 
-    `drive[name]` is a register's value in its own unit, to be read and set from outside.
+    `drive[name]` gets and sets a register's value in its own unit.
     """
 
-    functions: ClassVar[Collection[int] | None] = None  # None: all that its protocol has
+    functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
     codes: ClassVar[Mapping[Reason, int] | None] = None  # of refusal; None: the protocol's own
-    needs_silence: ClassVar[bool] = False  # the document says that a frame within it is not understood
+    needs_silence: ClassVar[bool] = False  # the document says that a frame without it is ignored
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
@@ -76,7 +76,7 @@ class SimulatedDrive:
         self.memory = Memory(type(drive), drive.framing)
         self.counters = DriveCounters()
         self.now = 0.0  # of the last request
-        self.deaf_until = 0.0  # it hears nothing before; inf: a dead drive
+        self.deaf_until = 0.0  # ignores all frames before; inf: a dead drive
         self.most = _most_cells(drive)
 
     def __repr__(self) -> str:
@@ -94,16 +94,14 @@ class SimulatedDrive:
         for cell in self.memory.of(register):
             self.changed(cell)
 
-    # ---- what a family may replace ----
-
     def pass_time(self, now: float) -> None:
         """Bring the drive to the time `now`."""
 
     def refresh(self, cell: MemoryCell) -> None:
-        """Make the cell hold what is to be read from it now."""
+        """Give the cell the value that is read from it now."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
-        """What is stored when this is written; raises Refusal."""
+        """Return the count that is stored when this one is written. Raises Refusal."""
         register = cell.register
         if register is None or register.words > 1:
             return raw
@@ -112,7 +110,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Refuse a value of several words that is outside its span, where all of them are written."""
+        """Refuse a value of several words that is outside its span, if all of them are written."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -121,33 +119,31 @@ class SimulatedDrive:
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:
-        """The cell was written, by the line or from outside: act on it."""
+        """Act on a write to the cell, by the line or from outside."""
 
     def wore(self) -> None:
-        """The EEPROM was written."""
+        """Act on a write to the EEPROM."""
 
     def takes_broadcast(self, request: Message) -> bool:
         return self.drive.broadcasts
 
-    # ---- the line's side ----
-
     @property
     def delay(self) -> float:
-        """From the request's end to the reply's begin: never within the silence after an RTU frame."""
+        """Seconds from the request's end to the reply's begin, at least the silence after an RTU frame."""
         return max(self.response_delay, self.silence)
 
     @property
     def silence(self) -> float:
-        """What the drive demands on both sides of an RTU frame, in s; text frames need none."""
+        """Seconds of silence that the drive needs around an RTU frame; text frames need none."""
         return self.drive.needed_silence() if self.drive.framing is Framing.RTU else 0.0
 
     @property
     def most_gap(self) -> float:
-        """Silence in s within a frame that makes the drive throw away what came before it."""
+        """Seconds of silence within a frame after which the drive discards its beginning."""
         return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
-    def hear(self, frame: Frame) -> Message | None:
-        """The reply to a frame of the line that is for this drive, or for all."""
+    def receive(self, frame: Frame) -> Message | None:
+        """Return the reply to a frame for this drive or for all, if there is one."""
         if not frame.intact:
             self.counters.damaged += 1
             return self._answer_damaged(frame)
@@ -161,7 +157,7 @@ class SimulatedDrive:
         return function in (self.protocol.answers if self.functions is None else self.functions)
 
     def _answer_damaged(self, frame: Frame) -> Message | None:
-        """The few that have a code for a wrong checksum answer what looks like a request of theirs."""
+        """Refuse a damaged request, if the family has a code for wrong checksums."""
         code = self._code(Reason.DAMAGED)
         whole = len(frame.body) == self.protocol.octets and self._knows(frame.function)
         if code is None or not whole or not frame.address:
@@ -172,55 +168,46 @@ class SimulatedDrive:
         return (self.protocol.codes if self.codes is None else self.codes).get(reason)
 
     def answer(self, request: Message, now: float) -> Message | None:
-        """Carry out a request; its reply, or None where the drive keeps silent."""
+        """Carry out a request; return its reply, or None where the drive keeps silent."""
         if now < self.deaf_until:
             return None
         self.now = now
-        if request.address == 0:
-            self._obey_broadcast(request, now)
+        is_broadcast = request.address == 0
+        if is_broadcast and self.takes_broadcast(request):
+            self.counters.broadcasts += 1
+        elif request.address == self.drive.address:
+            self.counters.requests += 1
+            self.counters.functions[request.function] += 1
+        else:
             return None
-        if request.address != self.drive.address:
-            return None
-        self.counters.requests += 1
-        self.counters.functions[request.function] += 1
         self.pass_time(now)
         try:
             reply = self._carry_out(request)
         except Refusal as refusal:
             self.counters.refusals += 1
             code = self._code(refusal.reason)
-            if code is None:
+            if code is None or is_broadcast:
                 return None
             reply = self.refused(request, code)
+        if is_broadcast:
+            return None
         self.counters.replies += 1
         return reply
 
-    def _obey_broadcast(self, request: Message, now: float) -> None:
-        if not self.takes_broadcast(request):
-            return
-        self.counters.broadcasts += 1
-        self.pass_time(now)
-        try:
-            self._carry_out(request)
-        except Refusal:
-            self.counters.refusals += 1
-
     def refused(self, request: Message, code: int) -> Message:
-        return Message(request.address, request.function, data=self.protocol.nothing, exception=code)
+        return Message(request.address, request.function, data=self.protocol.no_data, exception=code)
 
     def _carry_out(self, request: Message) -> Message:
         if not self._knows(request.function):
             raise Refusal(Reason.FUNCTION)
         return self.protocol.answers[request.function](self, request)
 
-    # ---- the dialect's side ----
-
     def check_count(self, function: int, count: int) -> None:
         if not 1 <= count <= self.most.get(function, 1):
             raise Refusal(Reason.COUNT)
 
     def read(self, function: int, start: int, count: int) -> list[int]:
-        """What neighbouring cells hold."""
+        """Return the counts of neighbouring cells. Raises Refusal."""
         self.check_count(function, count)
         return [self._read_one(self.memory.readable(function, start + at)) for at in range(count)]
 
@@ -231,7 +218,7 @@ class SimulatedDrive:
         return cell.raw
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
-        """Write neighbouring cells: all of them, or none when one is refused."""
+        """Write neighbouring cells: all, or none when one is refused. Raises Refusal."""
         cells: list[MemoryCell] = []
         for at in range(len(raws)):
             cell = self.memory.writable(function, start + at)
@@ -250,7 +237,7 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Whether such a write wears the EEPROM; one to a setting of which nothing is known does."""
+        """Tell whether a write there wears the EEPROM; one to a setting of unknown memory does."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False

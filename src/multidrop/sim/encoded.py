@@ -1,4 +1,4 @@
-"""EncodedDrive: a drive whose values say where they come from, to prove that none is misattributed."""
+"""EncodedDrive: a drive whose values name their source, to prove that none is misattributed."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from multidrop.sim.memory import MemoryCell
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """What an EncodedDrive holds there: it names drive, table and register (a coil has its lowest bit)."""
+    """Return the count of an EncodedDrive: it names drive, table and register (a coil: its lowest bit)."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """The register's value on an EncodedDrive, as a row has it."""
+    """Return the register's value on an EncodedDrive, as a row has it."""
     if register in drive.known_counts():
         return _known(drive, register) * register.scale.numerator / register.scale.denominator
     at = range(register.address, register.address + register.words)
     size = 2 if register.table.carrier is Carrier.WORD else 4
-    data = b"".join(encoded(drive.address, register.table, it).to_bytes(size) for it in at)
+    data = b"".join(encoded(drive.address, register.table, one).to_bytes(size) for one in at)
     raw = raw_value(data, 0, register.number_format)
     return raw * register.scale.numerator / register.scale.denominator
 
 
 def _known(drive: Drive, register: Register[Any]) -> int:
-    """The raw count that the family's document says it holds, as far as that leaves a choice."""
+    """Return a raw count within the range that the family's document states."""
     least, most = drive.known_counts()[register]
     raw = encoded(drive.address, register.table, register.address)
     return least + raw % (most - least + 1)
 
 
 class EncodedDrive(SimulatedDrive):
-    """A drive whose every register holds what names drive, table and register: see `encoded`.
+    """A drive whose every count names drive, table and register: see `encoded`.
 
-    What is written to it is confirmed and forgotten. No value of it can be taken for another's.
+    Writes are confirmed and forgotten.
     """
 
     def refresh(self, cell: MemoryCell) -> None:

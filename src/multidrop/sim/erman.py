@@ -8,7 +8,7 @@ from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import Reason
 
-COILS = range(13)  # 3 to 8 and 10 to 12 are reserved; a library keeps away from them, the drive does not
+COILS = range(13)  # with reserved ones, 3 to 8 and 10 to 12
 START, STOP, EMERGENCY_STOP, FAULT_RESET = 0, 1, 2, 9
 EMERGENCY_STOPPED = 1 << 0  # in the last fault
 OVERLOADED = 1 << 5  # in the state
@@ -16,12 +16,12 @@ _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DEC
 
 
 class SimulatedERMAN(MotorDrive):
-    """Coils keep what is written; START acts when it is written while neither stop is on.
+    """ERMAN. Coils keep their state; START acts when it is written while neither stop is on.
 
-    The manual does not say whether a coil is a level or a pulse. Here clearing START stops as
-    well, and neither clearing a stop nor a reset starts anything. Nor does it say when the motor counts as
-    overloaded (here above 1.2 times its rated current), or what the line's commands do where b.001
-    is not 2: here they are always obeyed.
+    The manual does not say whether a coil is a level or a pulse. Here clearing START stops as well, and
+    neither clearing a stop nor a reset starts anything. Nor does it say when the motor counts as
+    overloaded (here above 1.2 times its rated current), or what the line's commands do where b.001 is
+    not 2: here they are always obeyed.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)

@@ -1,4 +1,4 @@
-"""Which family a drive's class belongs to, and how that family is simulated."""
+"""The simulation of each family."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """The drive, simulated as its family's document says; a class of one's own, as it declares."""
+    """Simulate a drive as its family's document says, or as a class of one's own declares."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
     return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

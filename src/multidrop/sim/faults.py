@@ -1,4 +1,4 @@
-"""Faults: what befalls the bytes of a hostile line, and how often; read from a TOML file."""
+"""Faults of a line and their rates, read from a TOML file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.plant.toml_check import Key, TomlPlace, read_document
 
 
 def _rate(means: str) -> Any:
-    """From 0, never, to 1, always."""
+    """A field from 0, never, to 1, always."""
     return field(default=0.0, metadata={"means": means, "example": "0.01"})
 
 
@@ -22,10 +22,10 @@ def _most(default: float, example: str, means: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Rates are shares of what they befall; of `drop`, `flip` and `repeat` at most one befalls a frame.
+    """Rates of faults; of `drop`, `flip` and `repeat` at most one happens to a frame.
 
-    So a frame's damage is always such that any of the three checksums shows it. A reply that comes
-    later than its family's response time-out nobody can tell from the next one of the same kind.
+    So any of the three checksums shows the damage. A reply later than its family's response time-out
+    cannot be told from the next one of the same kind.
     """
 
     seed: int = field(default=0, metadata={"means": "the same one brings the same faults", "example": "7"})
@@ -47,32 +47,32 @@ class Faults:
     rename: float = _rate("of the returns are under another name; the link follows")
 
     def __post_init__(self) -> None:
-        for it in fields(self):
-            value = getattr(self, it.name)
-            if it.name in RATES and not 0 <= value <= 1:
-                raise ValueError(f"{it.name} = {value!r} is not a rate; write one from 0 to 1, such as 0.01")
+        for name in RATES:
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} = {value!r} is not a rate; write one from 0 to 1, such as 0.01")
         if not 1 <= self.burst <= MOST_BURST:
             raise ValueError(f"burst = {self.burst!r} is not from 1 to {MOST_BURST} characters")
 
 
 MOST_BURST = 4096
 _DURATIONS = ("late", "pause", "away")
-RATES = tuple(it.name for it in fields(Faults) if it.name not in ("seed", "burst", *_DURATIONS))
+RATES = tuple(one.name for one in fields(Faults) if one.name not in ("seed", "burst", *_DURATIONS))
 
 
 def _kind(name: str) -> Any:
     return str if name in _DURATIONS else (int, float) if name in RATES else int
 
 
-_EXAMPLES = {it.name: f"{it.name} = {it.metadata['example']}" for it in fields(Faults)}
+_EXAMPLES = {one.name: f"{one.name} = {one.metadata['example']}" for one in fields(Faults)}
 _KEYS = {name: Key(_kind(name), example) for name, example in _EXAMPLES.items()}
 HELP = "The faults' file has these lines, all of which may be left out:\n" + "".join(
-    f"  {_EXAMPLES[it.name]:<20}{it.metadata['means']}\n" for it in fields(Faults)
+    f"  {_EXAMPLES[one.name]:<20}{one.metadata['means']}\n" for one in fields(Faults)
 )
 
 
 def load_faults(path: Path | str) -> Faults:
-    """The faults that the file describes; ValueError with all that is wrong in it."""
+    """Read the faults of a file. Raises ValueError with all that is wrong in it."""
     path = Path(path)
     place = TomlPlace(path)
     document = place.attempt(read_document, path, "faults' file")
@@ -82,4 +82,4 @@ def load_faults(path: Path | str) -> Faults:
     faults = {name: place.attempt(partial(Faults, **{name: value})) for name, value in given.items()}
     if place.mistakes:
         raise ValueError("\n".join(place.mistakes))
-    return Faults(**{name: getattr(it, name) for name, it in faults.items()})
+    return Faults(**{name: getattr(one, name) for name, one in faults.items()})

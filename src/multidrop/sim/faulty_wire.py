@@ -1,4 +1,4 @@
-"""FaultyWire: a wire between whose client and drives every byte is at the mercy of faults.
+"""FaultyWire: a wire that damages, delays and loses bytes between its client and its drives.
 
 Bytes and times come in, bytes and times come out; chance comes from one seed.
 """
@@ -25,7 +25,7 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
 
 
 class FaultyWire(Wire):
-    """A wire with `faults`, which may be changed at any time; `struck` counts what they did.
+    """A wire with `faults`, which may be changed at any time; `struck` counts them.
 
     To hang up, its port must be a link or a TCP port: a bare pty cannot come back under its name.
     """
@@ -45,7 +45,7 @@ class FaultyWire(Wire):
         self.faults = faults
         self.struck: Counter[str] = Counter()
         self._random = random.Random(f"{faults.seed} {name}")
-        self._beside: list[Transmission] = []  # what the client hears that no drive has sent
+        self._stray: list[Transmission] = []  # noise and echo on their way to the client
         self._held: Transmission | None = None  # a reply that waits for the next one
         self._back_at: float | None = None  # when the port that is gone comes back
 
@@ -56,47 +56,43 @@ class FaultyWire(Wire):
         return strikes
 
     def _damaged(self, frame: bytes) -> bytes:
-        """With one damage at most, which every checksum shows."""
+        """Return the frame with at most one damage, which every checksum shows."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
         return frame
-
-    # ---- from the client to the drives ----
 
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
         if self._strikes("hang_up"):
             self._hang_up(now)
             return
         character = next(
-            (it.receiver.character for it in self._ears if it.settings.baudrate == baudrate),
-            self._ears[0].receiver.character,
+            (group.receiver.character for group in self._groups if group.settings.baudrate == baudrate),
+            self._groups[0].receiver.character,
         )
         if self._strikes("noise"):
             self._make_noise(now, character)
         if self._strikes("echo"):
-            self._beside.append(Transmission(chunk, now, character))
+            self._stray.append(Transmission(chunk, now, character))
         super().receive(self._damaged(chunk), now, baudrate)
 
-    def _deliver(self, ears: ReceiverGroup, frames: Sequence[Frame]) -> None:
+    def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         if not frames:
             return
         before = self._running()
-        super()._deliver(ears, frames)
+        super()._deliver(group, frames)
         if self._running() - before and self._strikes("start_noise"):
-            self._make_noise(frames[-1].end, ears.receiver.character)
+            self._make_noise(frames[-1].end, group.receiver.character)
 
     def _running(self) -> set[SimulatedDrive]:
-        return {it for it in self.drives if isinstance(it, MotorDrive) and it.motor.energised}
+        return {sim for sim in self.drives if isinstance(sim, MotorDrive) and sim.motor.energised}
 
     def _make_noise(self, begin: float, character: float) -> None:
-        """On both ends of the line."""
+        """Add noise for the client and for the drives."""
         noise = self._random.randbytes(self._random.randint(1, self.faults.burst))
-        self._beside.append(Transmission(noise, begin, character))
-        for ears in self._ears:
-            super()._deliver(ears, ears.receiver.feed(noise, begin))
-
-    # ---- from the drives to the client ----
+        self._stray.append(Transmission(noise, begin, character))
+        for group in self._groups:
+            super()._deliver(group, group.receiver.feed(noise, begin))
 
     def _send(self, data: bytes, begin: float, character: float) -> None:
         data = self._damaged(data)
@@ -124,22 +120,20 @@ class FaultyWire(Wire):
         if self._held and now >= self._held.begin:
             held, self._held = self._held, None
             super()._send(held.data, held.begin, held.character)
-        heard = super().advance(now) + b"".join(it.take(now) for it in self._beside)
-        self._beside = [it for it in self._beside if it.end > now]
+        data = super().advance(now) + b"".join(stray.take(now) for stray in self._stray)
+        self._stray = [stray for stray in self._stray if stray.end > now]
         if self._back_at is None:
-            return heard
+            return data
         if now >= self._back_at:
             self._come_back()
-        return b""  # nobody listens
+        return b""  # the client is cut off
 
     @property
     def wake(self) -> float | None:
-        times = [super().wake, self._back_at, *(it.next_at for it in self._beside)]
+        times = [super().wake, self._back_at, *(stray.next_at for stray in self._stray)]
         if self._held:
             times.append(self._held.begin)
         return min((at for at in times if at is not None), default=None)
-
-    # ---- its port ----
 
     def _hang_up(self, now: float) -> None:
         self.where = self.path  # a TCP port keeps its number
@@ -158,7 +152,7 @@ class FaultyWire(Wire):
 
 
 def _ptys_up_to(name: str) -> list[int]:
-    """Ptys that stand in the way, until none made now has this name: the lowest free number is given."""
+    """Open ptys until the next one, which gets the lowest free number, cannot have this name."""
     taken: list[int] = []
     while name.startswith("/dev/pts/"):
         taken += os.openpty()

@@ -12,19 +12,19 @@ STORED_SETPOINT, FREQUENCY_SOURCE, RUN_SOURCE = 100, 101, 102  # Prb.00, .01, .0
 BY_PARAMETER, BY_LINE, RUN_BY_LINE = 0, 5, 2
 STOP, RUN, JOG = 1, 2, 3  # bits 1 and 0 of 2000H
 ALWAYS_SEEN = 1 << 11 | 1 << 12  # in PrA.22, by the manual's example
-LARGEST = {107: 36000, 108: 36000}  # of Prb.07 and Prb.08; the manual has maxima and does not give them
+LARGEST = {107: 36000, 108: 36000}  # of Prb.07 and Prb.08, whose maxima the manual does not give
 OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # bits of PrA.22 by Prd.23, .24, .25, .28
-RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # what an output may say
+RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # functions of an output
 BAUDRATES = (4800, 9600, 19200, 38400)
 FORMATS = ("8N1", "8E1", "8O1")
 
 
 class SimulatedIBD(MotorDrive):
-    """Set up for RS-485 (Prb.01 = 5, Prb.02 = 2), its outputs programmed as the manual's example.
+    """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with the outputs of the manual's example.
 
-    The manual has no exceptions: what cannot be done is not answered. A value above the largest
-    is stored as the largest, and the echo shows the value that was asked for. A run while it jogs
-    changes nothing: a jog is left by a stop and a new run (table 3).
+    The manual has no exceptions: what cannot be done is not answered. A value above the largest is
+    stored as the largest, and the echo shows the value that was written. A run while it jogs changes
+    nothing: a jog is left by a stop and a new run (table 3).
 
     Not in the manual: a command is confirmed and has no effect unless Prb.02 = 2; the setpoint is 0
     where Prb.01 is neither 5 nor 0; Prb.00 counts 0.01 Hz, as 2001H does.
@@ -60,7 +60,7 @@ class SimulatedIBD(MotorDrive):
         return self.word(source) / 100 if source is not None else 0.0
 
     def _control(self, bits: int) -> None:
-        """Direction bits as the number that BIT3, BIT2 make; the manual can be read both ways."""
+        """Obey the word; the manual is ambiguous, and BIT3 and BIT2 are read as a number here."""
         if bits & 0x10:
             self.motor.reset()
         action = bits & 0x03

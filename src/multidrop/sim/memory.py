@@ -1,7 +1,7 @@
-"""A drive's memory: what every address of its tables holds, as the drive's class declares it.
+"""A drive's memory: the cells of its tables, as the drive's class declares them.
 
-An address is reached by a function code; tables that several codes reach (03, 06 and 10) are one
-space. Cells hold what one address holds: a bit, a word, or Delixi's four bytes.
+A cell is reached by function code and address; tables that several codes reach (03, 06 and 10) are one
+space. It holds a bit, a word, or Delixi's four bytes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
 
 @dataclass(eq=False)
 class MemoryCell:
-    """One address of one table, and the register that it belongs to, if it is not a reserved one."""
+    """One address of one table, and its register; None: a reserved address."""
 
     table: Table
     address: int
@@ -46,7 +46,7 @@ class Memory:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
         self._cells: dict[tuple[Table, int], MemoryCell] = {}
-        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: not to be read, gap or not
+        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
         self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
@@ -60,7 +60,7 @@ class Memory:
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
-            if cell.register is None or register.access is not Access.READING:  # what is written has a span
+            if cell.register is None or register.access is not Access.READING:  # a writable one has a span
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
                 self._read.setdefault((table.read, cell.address), None)  # unless a reading is there too
@@ -88,7 +88,6 @@ class Memory:
                     self.aliases.add((code, address))
 
     def _codes(self, table: Table) -> set[int]:
-        """The function codes that write this table."""
         return set() if table.write is None else {table.write, self._also.get(table.write, table.write)}
 
     def readable(self, function: int, address: int) -> MemoryCell | None:
@@ -102,18 +101,16 @@ class Memory:
         return self._read[key]
 
     def writable(self, function: int, address: int) -> MemoryCell | None:
-        """The cell that a write there changes, whatever the library itself would write."""
+        """Return the cell that a write there changes, with any function that the drive takes."""
         return self._written.get((function, address))
 
-    # ---- registers as a whole ----
-
     def get(self, register: Register[Any]) -> Any:
-        """The register's value in its own unit."""
+        """Return the register's value in its own unit."""
         data = b"".join(pack(register.table, cell.raw) for cell in self.of(register))
         return register.decode(raw_value(data, 0, register.number_format))
 
     def set(self, register: Register[Any], value: float) -> None:
-        """Hold this value: rounded to the register's step, cut off where it does not fit."""
+        """Hold this value, rounded to the register's step; bits that do not fit are lost."""
         if register.is_float:
             held = nearest_or_infinite(value / register.scale)
             raw = int.from_bytes(struct.pack(">f", held))
@@ -131,20 +128,20 @@ class Memory:
             raw >>= 16
 
     def of(self, register: Register[Any]) -> list[MemoryCell]:
-        """The register's cells, in the order of their addresses."""
+        """Return the register's cells, in the order of their addresses."""
         return [self._cells[register.table, register.address + at] for at in range(register.words)]
 
 
-@cache  # a monitor's value is worked out at every request
+@cache  # needed at every request
 def _scale(register: Register[Any]) -> tuple[int, int]:
     return register.scale.as_integer_ratio()
 
 
 def pack(table: Table, raw: int) -> bytes:
-    """A raw count as a reply carries it."""
+    """Return the bytes of a raw count in a reply."""
     return raw.to_bytes(_BYTES[table.carrier])
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """The value of a raw count that one cell holds."""
+    """Return the value of a raw count that one cell holds."""
     return register.decode(raw_value(pack(register.table, raw), 0, register.number_format))

@@ -1,7 +1,7 @@
 """A motor and the power part that feeds it: ramps, volts and amperes, heat, faults.
 
-Pure physics: it knows no registers, and time comes in as an argument, never from a clock.
-Nothing but `run` and `jog` starts it, and neither does so while a fault stands.
+Pure physics: no registers, and time is an argument. Only `run` and `jog` start the motor, and neither
+does so while a fault stands.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Rating:
-    """What is written on the name plate."""
+    """The name plate of a motor."""
 
     frequency: float = 50.0  # Hz
     voltage: float = 400.0  # V, of the mains too
@@ -70,10 +70,8 @@ class Motor:
         self._goal: float | None = 0.0  # Hz; None: the target
         self._brakes = False  # by direct current
 
-    # ---- what it is told ----
-
     def run(self, direction: int | None = None) -> None:
-        """Run at `target`, which may change meanwhile; without a direction, in the one in force."""
+        """Run at `target`, which may change meanwhile; without a direction, in the present one."""
         self._start(direction, None)
 
     def jog(self, direction: int | None = None) -> None:
@@ -93,7 +91,7 @@ class Motor:
         self._brakes = False
 
     def brake(self) -> None:
-        """Hold the motor by direct current, until it is told something else."""
+        """Hold the motor by direct current until the next command."""
         if self.fault:
             return
         self.coast()
@@ -107,7 +105,7 @@ class Motor:
         self.energised = False
 
     def trip(self, code: int) -> None:
-        """A fault: coast, and stay off until it is reset."""
+        """Coast because of a fault, and stay off until it is reset."""
         self.coast()
         self.fault = code
         self.faults.appendleft(code)
@@ -115,8 +113,6 @@ class Motor:
     def reset(self) -> None:
         """Clear the fault; the motor stays off."""
         self.fault = 0
-
-    # ---- what becomes of it ----
 
     def run_to(self, now: float) -> None:
         """Let time pass until `now`."""
@@ -144,7 +140,7 @@ class Motor:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:
-        """Change the frequency for at most `seconds`; what is left of them."""
+        """Change the frequency for at most `seconds`; return those that are left."""
         distance = abs(goal - self.frequency)
         needed = distance * ramp_time / self.maximum_frequency
         if needed <= seconds:
@@ -153,15 +149,13 @@ class Motor:
         self.frequency += math.copysign(distance * seconds / needed, goal - self.frequency)
         return 0.0
 
-    # ---- what can be measured ----
-
     def fault_record(self, number: int) -> int:
-        """The latest fault is number 1; 0 where there is none."""
+        """Return the code of a fault, the latest being number 1; 0 where there is none."""
         return self.faults[number - 1] if number <= len(self.faults) else 0
 
     @property
     def goal(self) -> float:
-        """The frequency in Hz that it is on its way to, negative backwards."""
+        """The frequency in Hz at the end of the ramp, negative backwards."""
         wanted = self.target if self._goal is None else self._goal
         return self.direction * max(-self.maximum_frequency, min(wanted, self.maximum_frequency))
 
@@ -177,7 +171,7 @@ class Motor:
 
     @property
     def torque(self) -> float:
-        """As a part of the rated torque; negative while it brakes."""
+        """Part of the rated torque; negative while it brakes."""
         if not self.energised:
             return 0.0
         extra = {Phase.ACCELERATING: ACCELERATING_TORQUE, Phase.DECELERATING: -BRAKING_TORQUE}
@@ -189,7 +183,7 @@ class Motor:
 
     @property
     def voltage(self) -> float:
-        """V/f: proportional to the frequency up to the rated one."""
+        """Output in V, proportional to the frequency up to the rated one (V/f)."""
         return self.rating.voltage * min(1.0, abs(self.frequency) / self.rating.frequency)
 
     @property
@@ -205,11 +199,11 @@ class Motor:
 
     @property
     def speed(self) -> float:
-        """Of the shaft, in rpm, without direction."""
+        """Speed of the shaft in rpm, without direction."""
         return abs(self.shaft) * 60 / self.rating.pole_pairs * (1 - SLIP * max(self.torque, 0.0))
 
 
-# What a monitor register of this name shows.
+# Values of monitor registers, by their names.
 MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "output_frequency": lambda motor: abs(motor.frequency),
     "reference_frequency": lambda motor: abs(motor.target),
@@ -223,13 +217,9 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "run_hours": lambda motor: motor.run_seconds // 3600,
     "fault": lambda motor: motor.fault,
     "last_fault": lambda motor: motor.fault_record(1),
-    "fault_record_1": lambda motor: motor.fault_record(1),
-    "fault_record_2": lambda motor: motor.fault_record(2),
-    "fault_record_3": lambda motor: motor.fault_record(3),
-    "fault_record_4": lambda motor: motor.fault_record(4),
-}
+} | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# What is 100 % where the register's unit is per cent.
+# Values that are 100 % where the register's unit is per cent.
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,

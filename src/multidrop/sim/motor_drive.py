@@ -1,8 +1,8 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
-Settings of common names set the motor up, monitors of common names show what it does. What a
-family has of its own stands in two tables: `obeys`, what a write commands, and `shows`, what a
-read sees; their keys are (function code that reads the table, address).
+Settings of common names set the motor up, monitors of common names show its state. What a family has of
+its own is in two tables: `obeys`, the commands of writes, and `shows`, the counts of reads; their keys
+are (function code that reads the table, address).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A drive with a motor. A monitor that is set from outside stays at that value."""
+    """A drive with a motor. A monitor that is set from outside keeps that value."""
 
     obeys: ClassVar[Mapping[tuple[int, int], Callable[[Any, int], None]]] = {}
     shows: ClassVar[Mapping[tuple[int, int], Callable[[Any], int]]] = {}  # raw counts
@@ -51,10 +51,10 @@ class MotorDrive(SimulatedDrive):
         super().__setitem__(name, value)
 
     def prepare(self) -> None:
-        """Hold from the beginning what the document says beyond the class's declarations."""
+        """Set initial state that the class does not declare."""
 
     def trip(self, code: int) -> None:
-        """Provoke a fault; its code is the family's own."""
+        """Provoke a fault by the family's code."""
         self.motor.trip(code)
 
     def pass_time(self, now: float) -> None:
@@ -69,18 +69,18 @@ class MotorDrive(SimulatedDrive):
         self.motor.target = self.setpoint()
 
     def setpoint(self) -> float:
-        """The frequency that the motor is to reach, in Hz."""
+        """Return the frequency in Hz that the motor is to reach."""
         return self._known("frequency") or 0.0
 
     def _known(self, name: str) -> float | None:
-        """The register's value, where the class has it and its scale is known."""
+        """Return the register's value, if the class has it and its scale is known."""
         register = self.drive.registers.get(name)
         if register is None or register.step is None:
             return None
         return float(self.memory.get(register))
 
     def run_or_stop(self, action: int, direction: int | None) -> None:
-        """A control word's action, as several makes number it: 0 none, 1 stop, 2 run, 3 jog."""
+        """Carry out a control word's action, in the usual numbers: 0 none, 1 stop, 2 run, 3 jog."""
         if action == 1:
             self.motor.stop()
         elif action == 2:
@@ -91,7 +91,7 @@ class MotorDrive(SimulatedDrive):
             self.motor.direction = direction
 
     def word(self, address: int) -> int:
-        """The holding register at this address; 0 where the class has none."""
+        """Return the holding register at this address; 0 where the class has none."""
         cell = self.memory.writable(0x06, address)
         return cell.raw if cell else 0
 

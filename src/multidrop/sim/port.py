@@ -6,7 +6,6 @@ import contextlib
 import os
 import socket
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 from multidrop.control.eeprom_ledger import default_path
@@ -18,36 +17,11 @@ from multidrop.transport.simulated_ports import SimulatedPort
 MOST_READ = 4096
 
 
-class SimulatedEnd(Protocol):
-    path: str  # where a client opens it
-
-    def fileno(self) -> int:
-        """What to wait for; may be another after each read."""
-
-    def read(self) -> bytes:
-        """What came, never blocking."""
-
-    def write(self, heard: bytes) -> None:
-        """Hand over to the client, if there is one that listens; never blocking."""
-
-    def baudrate(self) -> int | None:
-        """The client's baud rate, where it can be seen."""
-
-    def close(self) -> None: ...
-
-
-def open_port(where: str, settings: Settings) -> SimulatedEnd:
-    """A port of the kind that `where` names: see Wire."""
-    if where.startswith("socket://"):
-        return TCPPort(where)
-    return PtyPort(settings, None if where == "pty" else Path(where))
-
-
 class PtyPort:
     """A pty whose other side a client opens by its path.
 
-    One descriptor of the client's side stays open here, so that the line survives a client that
-    closes. Of the client's settings only the baud rate counts: a pty keeps no parity.
+    A descriptor of the client's side stays open here, so that the pty outlives its clients. Of their
+    settings only the baud rate counts: a pty keeps no parity.
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
@@ -76,9 +50,9 @@ class PtyPort:
         except BlockingIOError:
             return b""
 
-    def write(self, heard: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # nobody reads: it is lost, as on a wire
-            os.write(self._master, heard)
+    def write(self, data: bytes) -> None:
+        with contextlib.suppress(BlockingIOError):  # nobody reads: lost, as on a wire
+            os.write(self._master, data)
 
     def baudrate(self) -> int | None:
         return get_settings(self._slave)[0]
@@ -108,11 +82,12 @@ class TCPPort:
         self.path = f"socket://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
+        """Return the descriptor to wait for; it changes when a client comes or goes."""
         return (self._client or self._listener).fileno()
 
     def read(self) -> bytes:
         if self._client is None:
-            with contextlib.suppress(BlockingIOError, ConnectionError):  # it has gone again
+            with contextlib.suppress(BlockingIOError, ConnectionError):  # the client has gone again
                 self._client, _ = self._listener.accept()
                 self._client.setblocking(False)
                 self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -132,15 +107,25 @@ class TCPPort:
             self._client.close()
             self._client = None
 
-    def write(self, heard: bytes) -> None:
+    def write(self, data: bytes) -> None:
         if self._client is not None:
             with contextlib.suppress(OSError):  # a client that has gone is noticed when reading
-                self._client.send(heard)
+                self._client.send(data)
 
-    def baudrate(self) -> int | None:
-        return None
+    def baudrate(self) -> None:
+        """Return None: a client's baud rate cannot be seen."""
 
     def close(self) -> None:
         self._hang_up()
         self._simulated.close()
         self._listener.close()
+
+
+SimulatedEnd = PtyPort | TCPPort  # neither blocks
+
+
+def open_port(where: str, settings: Settings) -> SimulatedEnd:
+    """Open a port of the kind that `where` names: see Wire."""
+    if where.startswith("socket://"):
+        return TCPPort(where)
+    return PtyPort(settings, None if where == "pty" else Path(where))

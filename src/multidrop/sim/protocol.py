@@ -1,4 +1,7 @@
-"""What each function code makes a drive do: Modbus, and Delixi's own protocol."""
+"""Function codes and what they make a drive do.
+
+Modbus (application protocol V1.1b3), and Delixi's own (RS-485 communication protocol, part 3).
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,11 @@ COIL_ON, COIL_OFF = b"\xff\x00", b"\x00\x00"
 
 # Delixi's function codes K.
 COMMAND, STATE, SETPOINT, SET, STORE, QUERY = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
-NOTHING = bytes(4)  # D3..D0 where they mean nothing
+NO_DATA = bytes(4)  # D3..D0 where they are unused
 
 
 class Reason(Enum):
-    """Why a drive refuses; each family has its own code for it, or says nothing."""
+    """A reason to refuse; each family has its own code for it, or keeps silent."""
 
     FUNCTION = "no such function"
     READ_ADDRESS = "nothing to be read there"
@@ -34,7 +37,7 @@ class Reason(Enum):
 
 
 class Refusal(Exception):
-    """The drive does not do what it was asked."""
+    """The drive refuses a request."""
 
     def __init__(self, reason: Reason) -> None:
         super().__init__(reason.value)
@@ -43,28 +46,27 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class DriveProtocol:
-    """A protocol's function codes, and its usual codes of refusal; without a code it keeps silent."""
+    """A protocol's functions, and its usual codes of refusal; without a code a drive keeps silent."""
 
     answers: Mapping[int, Callable[[SimulatedDrive, Message], Message]]
     codes: Mapping[Reason, int]
     octets: int  # of a request that reads or writes one register, without its checksum
-    nothing: bytes = b""  # the data of a refusal
+    no_data: bytes = b""  # the data of a refusal
 
 
-# ---- Modbus (application protocol V1.1b3) ----
+def _with_data(request: Message, data: bytes) -> Message:
+    return Message(request.address, request.function, request.start, request.count, data)
 
 
 def _read_words(sim: SimulatedDrive, request: Message) -> Message:
     raws = sim.read(request.function, request.start, request.count)
-    data = b"".join(raw.to_bytes(2) for raw in raws)
-    return Message(request.address, request.function, request.start, request.count, data)
+    return _with_data(request, b"".join(raw.to_bytes(2) for raw in raws))
 
 
 def _read_bits(sim: SimulatedDrive, request: Message) -> Message:
     raws = sim.read(request.function, request.start, request.count)
     bits = sum(raw << at for at, raw in enumerate(raws))
-    data = bits.to_bytes((request.count + 7) // 8, "little")
-    return Message(request.address, request.function, request.start, request.count, data)
+    return _with_data(request, bits.to_bytes((request.count + 7) // 8, "little"))
 
 
 def _write_one(sim: SimulatedDrive, request: Message) -> Message:
@@ -101,9 +103,6 @@ def _return_query_data(sim: SimulatedDrive, request: Message) -> Message:
     return request
 
 
-# ---- Delixi's own (RS-485 communication protocol, part 3) ----
-
-
 def _command(sim: SimulatedDrive, request: Message) -> Message:
     sim.write(COMMAND, 0, [request.start])
     return request
@@ -111,7 +110,7 @@ def _command(sim: SimulatedDrive, request: Message) -> Message:
 
 def _state(sim: SimulatedDrive, request: Message) -> Message:
     (raw,) = sim.read(STATE, 0, 1)
-    return Message(request.address, STATE, start=raw, data=NOTHING)
+    return Message(request.address, STATE, start=raw, data=NO_DATA)
 
 
 def _query(sim: SimulatedDrive, request: Message) -> Message:
@@ -162,6 +161,6 @@ DELIXI = DriveProtocol(
         Reason.DAMAGED: 0xFF,
     },
     octets=8,
-    nothing=NOTHING,
+    no_data=NO_DATA,
 )
 PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.DELIXI: DELIXI}

@@ -1,5 +1,6 @@
-"""Cutting what is heard on a line into requests, as a drive's receiver does: bytes and times in,
-frames out. The bytes are anyone's: garbage costs what it spoils and no more, and buffers are bounded.
+"""Cut received bytes into requests, as a drive does: bytes and times in, frames out.
+
+Garbage costs the frames that it damages and no others, and buffers are bounded.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ LEAST_RTU = 4  # address, function, CRC
 
 @dataclass(frozen=True)
 class Frame:
-    """What was sent in one go: a request where `message` is there, else something else.
+    """A frame; `message` is None unless it is a request.
 
     `body` is without start, end and checksum; `intact` says whether the checksum was right.
     """
@@ -37,9 +38,9 @@ class Frame:
 
 
 class Receiver:
-    """All that drives of one framing and baud rate hear; `most_gap` s of silence end a frame.
+    """The receiver of one framing and baud rate; `most_gap` s of silence end a frame.
 
-    `character` s is what one character takes; 0 where the line is not paced.
+    One character takes `character` s; 0 where the line is not paced.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -47,16 +48,16 @@ class Receiver:
         self.character = character
         self.most_gap = most_gap
         self._buffer = bytearray()
-        self._end = float("-inf")  # of the last bit heard
+        self._end = float("-inf")  # of the last bit received
         self._cut = self._cut_rtu if framing is Framing.RTU else self._cut_text
 
     @property
     def silent_at(self) -> float | None:
-        """When what is in the buffer will have ended by silence."""
+        """The time at which silence will end the frame in the buffer."""
         return self._end + self.most_gap if self._buffer else None
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
-        """The frames that are complete with this chunk, whose first bit came at `now` or after."""
+        """Return the frames that this chunk completes; its first bit came at `now` or after."""
         frames = self.silence(now)
         self._end = max(now, self._end) + len(chunk) * self.character
         self._buffer += chunk
@@ -65,7 +66,7 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """What silence has ended by `now`: a frame that is no request, or a part of one."""
+        """Return the frame that silence has ended by `now`: no request, or a part of one."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
@@ -79,45 +80,41 @@ class Receiver:
         self._buffer.clear()
 
     def _frame(self, body: bytes, message: Message | None, intact: bool, after: int, length: int) -> Frame:
-        """A frame of `length` characters that ended `after` characters before the last one heard."""
+        """Return a frame of `length` characters that ended `after` characters before the last one."""
         end = self._end - after * self.character
         return Frame(body, message, intact, end - length * self.character, end)
 
-    # ---- RTU: found by length and CRC ----
-
     def _cut_rtu(self) -> Frame | None:
-        """The next request; the first byte from which a good one begins wins.
+        """Return the next request: the first byte at which a good one begins wins.
 
-        While one may still be under way, a later one counts only if it ends with the last byte.
+        While one may still be incomplete, a later one counts only if it ends with the last byte.
         """
         pending = False
-        heard = bytes(self._buffer[-MOST_RTU:])
-        for at in range(len(heard)):
-            used, message = parse_request(Framing.RTU, heard[at:])
-            after = len(heard) - at - used
+        data = bytes(self._buffer[-MOST_RTU:])
+        for at in range(len(data)):
+            used, message = parse_request(Framing.RTU, data[at:])
+            after = len(data) - at - used
             if message is not None and not (pending and after):
-                frame = self._frame(heard[at : at + used - 2], message, True, after, used)
-                self._buffer = bytearray(heard[at + used :])
+                frame = self._frame(data[at : at + used - 2], message, True, after, used)
+                self._buffer = bytearray(data[at + used :])
                 return frame
             pending = pending or used == 0
-        self._buffer = bytearray(heard)
+        self._buffer = bytearray(data)
         return None
 
-    # ---- text: from ':' to line feed ----
-
     def _cut_text(self) -> Frame | None:
-        heard = self._buffer
-        while (end := heard.find(b"\n") + 1) > 0:
-            start = heard.rfind(b":", 0, end)
-            text = bytes(heard[start:end])
-            del heard[:end]
-            if start >= 0 and (frame := self._open_text(text, len(heard))) is not None:
+        data = self._buffer
+        while (end := data.find(b"\n") + 1) > 0:
+            start = data.rfind(b":", 0, end)
+            text = bytes(data[start:end])
+            del data[:end]
+            if start >= 0 and (frame := self._open_text(text, len(data))) is not None:
                 return frame
-        start = heard.rfind(b":")
-        if start < 0 or len(heard) - start > MOST_TEXT:
-            heard.clear()
+        start = data.rfind(b":")
+        if start < 0 or len(data) - start > MOST_TEXT:
+            data.clear()
         else:
-            del heard[:start]
+            del data[:start]
         return None
 
     def _open_text(self, text: bytes, after: int) -> Frame | None:

@@ -1,4 +1,4 @@
-"""Simulator: runs any number of wires in one thread; the only file here that reads a clock."""
+"""Simulator: run any number of wires in one thread; no other file here reads a clock."""
 
 from __future__ import annotations
 
@@ -11,34 +11,29 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from time import monotonic
-from types import TracebackType
+from typing import Self
 
 from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 
 
 class Simulator:
-    """Wires that run while the context lasts: `with Simulator([wire]) as sim: sim.wires[0].path`."""
+    """Run wires while the context lasts: `with Simulator([wire]) as sim: sim.wires[0].path`."""
 
     def __init__(self, wires: Sequence[Wire]) -> None:
         self.wires = tuple(wires)
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self._failure: BaseException | None = None
         self._wakes: list[tuple[float, int]] = []  # a heap of (time, number of the wire)
-        self._planned: dict[int, float] = {}  # of each wire, the wake that counts
-        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is listened to
+        self._planned: dict[int, float] = {}  # of each wire, the wake-up that counts
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # of each wire, the port that is waited for
 
-    def __enter__(self) -> Simulator:
+    def __enter__(self) -> Self:
         self.open()
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.interrupt()
         self._thread.join()
         self.close()
@@ -52,11 +47,11 @@ class Simulator:
             self._failure = failure
 
     def open(self) -> None:
-        """Open every wire's port, or none; the paths are known then."""
+        """Open every wire's port, or none; then the paths are known."""
         self._selector = selectors.DefaultSelector()
-        self._ears, self.wakeup = os.pipe()
+        self._interrupted, self.wakeup = os.pipe()
         os.set_blocking(self.wakeup, False)
-        self._selector.register(self._ears, selectors.EVENT_READ, None)
+        self._selector.register(self._interrupted, selectors.EVENT_READ, None)
         try:
             for number, wire in enumerate(self.wires):
                 wire.open()
@@ -69,7 +64,7 @@ class Simulator:
         for wire in self.wires:
             wire.close()
         self._selector.close()
-        os.close(self._ears)
+        os.close(self._interrupted)
         os.close(self.wakeup)
 
     def interrupt(self) -> None:
@@ -83,38 +78,38 @@ class Simulator:
             for key, _ in self._selector.select(0):
                 if key.data is None:
                     return
-                self._listen(key.data)
+                self._receive(key.data)
             now = monotonic()
             while self._wakes and self._wakes[0][0] <= now:
                 at, number = heapq.heappop(self._wakes)
                 if self._planned.get(number) == at:
                     del self._planned[number]
-                    self._speak(number)
+                    self._advance(number)
 
     def _sleep(self) -> None:
-        """Wait for bytes or the next wake.
+        """Wait for bytes or the next wake-up.
 
-        The selector itself is waited for, because select() keeps time to the microsecond and
-        epoll_wait() only to the millisecond.
+        The selector itself is waited for: select() keeps time to the microsecond, epoll_wait() only to
+        the millisecond.
         """
         limit = max(0.0, self._wakes[0][0] - monotonic()) if self._wakes else None
         select.select([self._selector], [], [], limit)
 
-    def _listen(self, number: int) -> None:
+    def _receive(self, number: int) -> None:
         wire = self.wires[number]
         now = monotonic()
         chunk = wire.port.read() if wire.port else b""
         self._attend(number)
         if chunk and wire.port:
             wire.receive(chunk, now, wire.port.baudrate())
-            self._speak(number)
+            self._advance(number)
 
-    def _speak(self, number: int) -> None:
-        """Hand over what the client hears by now, and plan the wire's next wake."""
+    def _advance(self, number: int) -> None:
+        """Send the bytes that have reached the client by now, and plan the wire's next wake-up."""
         wire = self.wires[number]
-        heard = wire.advance(monotonic())
-        if heard and wire.port:
-            wire.port.write(heard)
+        data = wire.advance(monotonic())
+        if data and wire.port:
+            wire.port.write(data)
         self._attend(number)
         wake = wire.wake
         if wake is not None and wake < self._planned.get(number, math.inf):
@@ -122,7 +117,7 @@ class Simulator:
             heapq.heappush(self._wakes, (wake, number))
 
     def _attend(self, number: int) -> None:
-        """Listen to the wire's port as it is now: it may be gone, or another, or wait for another client."""
+        """Wait for the wire's port as it is now: closed, reopened, or with another client."""
         port, before = self.wires[number].port, self._attended.get(number)
         now = (port, port.fileno()) if port else None
         if now == before:
@@ -143,7 +138,7 @@ def serve(wires: Sequence[Wire], announce: Callable[[Simulator], None] = lambda 
     simulator = Simulator(wires)
     simulator.open()
     before = signal.signal(signal.SIGTERM, lambda *_: None)
-    # A signal that comes just before it sleeps has no handler called until it wakes: it rings the wakeup.
+    # A signal just before the sleep runs no handler until the sleep ends: its byte on this pipe ends it.
     wakeup = signal.set_wakeup_fd(simulator.wakeup)
     try:
         announce(simulator)

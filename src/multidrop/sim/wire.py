@@ -1,6 +1,6 @@
-"""Wire: the pair of a line with its drives, and how long everything takes on it.
+"""Wire: the two wires of a line with its drives, and the time that everything takes on them.
 
-Bytes and times come in, bytes and times come out; the port at its end is port.py's business.
+Bytes and times come in, bytes and times come out; the port at its end is in port.py.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # s; characters that end within it are handed over together
-ROUNDING = 1e-6  # of a character, so that a wake finds the byte that it was for
+CHUNK = 1e-3  # s; characters that end within it are sent to the client together
+ROUNDING = 1e-6  # of a character: a wake-up finds the byte that it was planned for
 UNPACED_GAP = 20e-3  # s of silence that end a frame where characters take no time
 
 
@@ -40,7 +40,7 @@ class Transmission:
         return self.begin + min(len(self.data), self.sent + group) * self.character
 
     def take(self, now: float) -> bytes:
-        """What has ended by now and was not taken yet."""
+        """Return the characters that have ended by now and were not taken yet."""
         if now < self.begin:
             return b""
         passed = len(self.data)
@@ -52,14 +52,14 @@ class Transmission:
 
 
 class ReceiverGroup:
-    """Drives that hear alike: of one framing and baud rate, with one idea of a frame's end."""
+    """Drives that share a receiver: of one framing, one baud rate and one longest gap in a frame."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
         self.receiver = receiver
         self.settings = settings
         self.drives: dict[int, SimulatedDrive] = {}
 
-    def listeners(self, frame: Frame) -> Sequence[SimulatedDrive]:
+    def addressed(self, frame: Frame) -> Sequence[SimulatedDrive]:
         if frame.address == 0:
             return list(self.drives.values())
         return [self.drives[frame.address]] if frame.address in self.drives else []
@@ -68,8 +68,8 @@ class ReceiverGroup:
 class Wire:
     """One line of simulated drives.
 
-    `port` is "pty", a path at which a link to the pty is put, or "socket://host:port" (port 0: any
-    free one). `path` is where a client opens it. An `unpaced` wire has no waits at all.
+    `port` is "pty", a path for a link to the pty, or "socket://host:port" (port 0: any free one). A
+    client opens `path`. An `unpaced` wire has no waits at all.
     """
 
     def __init__(
@@ -85,9 +85,9 @@ class Wire:
         self.drives = tuple(drives)
         self.name = name
         self.where = port
-        self.port: SimulatedEnd | None = None  # there while it is open
+        self.port: SimulatedEnd | None = None  # None while it is closed
         self._pace = 0.0 if unpaced else 1.0  # every duration is multiplied by it
-        self._ears = self._group()
+        self._groups = self._group()
         self._outgoing: list[Transmission] = []  # by their begin
         self._quiet_since = -math.inf  # the end of the last reply
         self._baudrate: int | None = None
@@ -95,91 +95,86 @@ class Wire:
     def _group(self) -> list[ReceiverGroup]:
         groups: dict[tuple[Framing, Settings, float], ReceiverGroup] = {}
         taken: dict[tuple[int, Framing, int], SimulatedDrive] = {}
-        for it in self.drives:
-            drive = it.drive
-            other = taken.setdefault((drive.address, drive.framing, drive.settings.baudrate), it)
-            if other is not it:
+        for sim in self.drives:
+            drive = sim.drive
+            other = taken.setdefault((drive.address, drive.framing, drive.settings.baudrate), sim)
+            if other is not sim:
                 raise ValueError(f"{self.name}: {other.drive.name} and {drive.name} have the same address")
-            key = (drive.framing, drive.settings, it.most_gap)
+            key = (drive.framing, drive.settings, sim.most_gap)
             if key not in groups:
-                gap = it.most_gap if self._pace else UNPACED_GAP
+                gap = sim.most_gap if self._pace else UNPACED_GAP
                 character = drive.settings.character * self._pace
                 groups[key] = ReceiverGroup(Receiver(drive.framing, character, gap), drive.settings)
-            groups[key].drives[drive.address] = it
+            groups[key].drives[drive.address] = sim
         return list(groups.values())
 
     def __repr__(self) -> str:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
-    # ---- what happens on the pair ----
-
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        """Take what the client sent, at its baud rate where it can be seen."""
+        """Take bytes of the client, at its baud rate where that can be seen."""
         if baudrate != self._baudrate:
-            for ears in self._ears:
-                ears.receiver.forget()
+            for group in self._groups:
+                group.receiver.forget()
             self._baudrate = baudrate
-        for ears in self._ears:
-            if baudrate is None or ears.settings.baudrate == baudrate:
-                self._deliver(ears, ears.receiver.feed(chunk, now))
+        for group in self._groups:
+            if baudrate is None or group.settings.baudrate == baudrate:
+                self._deliver(group, group.receiver.feed(chunk, now))
 
     def advance(self, now: float) -> bytes:
-        """Let time pass until `now`; what the client hears meanwhile."""
-        for ears in self._ears:
-            self._deliver(ears, ears.receiver.silence(now))
-        heard = bytearray()
+        """Let time pass until `now`; return the bytes that reach the client meanwhile."""
+        for group in self._groups:
+            self._deliver(group, group.receiver.silence(now))
+        received = bytearray()
         while self._outgoing:
-            heard += self._outgoing[0].take(now)
+            received += self._outgoing[0].take(now)
             if now < self._outgoing[0].end:
                 break
             self._quiet_since = self._outgoing.pop(0).end
-            if self._outgoing:  # two at once cannot be read: the second waits
+            if self._outgoing:  # two replies never overlap: the second waits
                 self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
-        return bytes(heard)
+        return bytes(received)
 
     @property
     def wake(self) -> float | None:
-        """When `advance` will have something to do; None: not before the next bytes come."""
-        silences = [ears.receiver.silent_at for ears in self._ears]
+        """The time of the next call to `advance`; None: when the next bytes have come."""
+        silences = [group.receiver.silent_at for group in self._groups]
         times = [at for at in silences if at is not None]
         if self._outgoing:
             times.append(self._outgoing[0].next_at)
         return min(times, default=None)
 
     def distort(self, reply: bytes) -> bytes:
-        """What becomes of a reply on its way; a test of noise replaces it."""
+        """Return the reply as it reaches the client; tests of noise replace this."""
         return reply
 
-    def _deliver(self, ears: ReceiverGroup, frames: Sequence[Frame]) -> None:
+    def _deliver(self, group: ReceiverGroup, frames: Sequence[Frame]) -> None:
         for frame in frames:
-            for it in ears.listeners(frame):
-                if self._may_hear(it, frame) and (reply := it.hear(frame)) is not None:
-                    data = self.distort(build_reply(it.drive.framing, reply))
-                    self._send(data, frame.end + it.delay * self._pace, ears.receiver.character)
+            for sim in group.addressed(frame):
+                if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
+                    data = self.distort(build_reply(sim.drive.framing, reply))
+                    self._send(data, frame.end + sim.delay * self._pace, group.receiver.character)
 
     def _send(self, data: bytes, begin: float, character: float) -> None:
-        bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda it: it.begin)
+        bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
 
-    def _may_hear(self, it: SimulatedDrive, frame: Frame) -> bool:
-        """Count a frame that came before its silence was over, and say whether it is heard all the same.
+    def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
+        """Tell whether a drive takes a frame; count one that came before the drive's silence was over.
 
-        What begins within a reply is lost. Silence is counted from the end of a reply only: that is
-        known here to the bit, so that a client that keeps the silence is never found guilty because
-        this process woke late.
+        A frame that begins within a reply is lost. Silence is counted from the end of a reply only: that
+        is known here to the bit, so that a client is never blamed because this process woke late.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)
-        bit = it.drive.settings.bit * self._pace
-        if silent_for >= it.silence * self._pace - bit:
+        bit = sim.drive.settings.bit * self._pace
+        if silent_for >= sim.silence * self._pace - bit:
             return True
-        it.counters.early += 1
-        return not it.needs_silence and silent_for >= -bit
-
-    # ---- its port ----
+        sim.counters.early += 1
+        return not sim.needs_silence and silent_for >= -bit
 
     @property
     def path(self) -> str:
-        """Where a client opens the line, while a simulator runs it."""
+        """The path that a client opens while a simulator runs the line."""
         if self.port is None:
             raise RuntimeError(f"{self.name} is not open: run it in a Simulator")
         return self.port.path

@@ -19,40 +19,32 @@ PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # of the preset spee
 PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # Sr1 to Sr7
 PANEL_ONLY = (0x0001, 0x0007, 0x0015)
 BAUDRATES = (1200, 2400, 4800, 9600)  # by the codes of F800
-RESTART_TIME = 2.0  # s without ears after a reset
+RESTART_TIME = 2.0  # s after a reset, in which the line is ignored
 EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
 HELD = (0x1200, 0x1201)  # frozen at a trip until the reset
 
 
 class SimulatedYD1000(MotorDrive):
-    """Without bit 15 the panel is in command: it runs the motor when `panel_runs` says so.
+    """YD1000. Without bit 15 the panel is in command: it runs the motor if `panel_runs` is set.
 
-    A value outside its limits in section 6 is refused, also where such a limit is another parameter. What
-    is effective from the panel only is confirmed and not kept (6.1; section 8.1 has 0007H initialise).
+    A value outside its limits in section 6 is refused, also where such a limit is another parameter. A
+    parameter that works from the panel only is confirmed and not kept (6.1; section 8.1 has 0007H
+    initialise).
 
-    The notes do not say the following, which is as relatives do: the exception codes (VF-S15); the codes
-    of faults, that an emergency stop is one, and that a reset restarts the drive, deaf for 2 s, with its
-    commands gone (VF-S11); that the preset speeds' bits are the bits of a number. The ramp times of the
-    second ramp are not in the notes: it has those of the first. That the brake takes the frequency to 0 at
-    once, and goes before run, is this simulator's own.
+    Not in the notes, and taken from relatives: the exception codes, which are Modbus's (VF-S15); the codes
+    of faults, that an emergency stop is one, and that a reset restarts the drive, which ignores the line
+    for 2 s and forgets its commands (VF-S11); that the preset speeds' bits are those of a number. The
+    second ramp has the times of the first. That the brake takes the frequency to 0 at once, and goes
+    before run, is this simulator's own.
     """
 
     functions = (0x03, 0x06)
     needs_silence = True  # 4.3
-    codes = {
-        Reason.FUNCTION: 1,
-        Reason.READ_ADDRESS: 2,
-        Reason.WRITE_ADDRESS: 2,
-        Reason.COUNT: 3,
-        Reason.VALUE: 3,
-        Reason.LOCKED: 4,
-        Reason.CANNOT: 4,
-    }
 
     def prepare(self) -> None:
         self.panel_runs = False
-        self._in_force = 0  # the control word that it obeys
-        self._heard_at = math.inf  # the watch begins with the first message
+        self._in_force = 0  # the control word in force
+        self._message_at = math.inf  # the time-out begins with the first message
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property
@@ -86,14 +78,14 @@ class SimulatedYD1000(MotorDrive):
 
     def pass_time(self, now: float) -> None:
         limit = self.word(TIMEOUT_SETTING) or math.inf  # F803, 0 is off
-        if now > self._heard_at + limit and not self.motor.fault:
-            self.motor.run_to(self._heard_at + limit)
+        if now > self._message_at + limit and not self.motor.fault:
+            self.motor.run_to(self._message_at + limit)
             self.trip(COMMUNICATION_LOST)
-        self._heard_at = now
+        self._message_at = now
         super().pass_time(now)
 
     def trip(self, code: int) -> None:
-        """A fault: what 1200H and 1201H show is frozen."""
+        """Freeze 1200H and 1201H, then trip."""
         for address in HELD:
             cell = self.memory.readable(0x03, address)
             if cell:
@@ -127,11 +119,11 @@ class SimulatedYD1000(MotorDrive):
         self._in_force = word if word & COMMANDED else 0
 
     def _restart(self) -> None:
-        """Everything that is not in the EEPROM is gone, and the drive is deaf for a while."""
+        """Forget all that is not in the EEPROM, and ignore the line for a while."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
-        self._heard_at = math.inf  # the watch begins anew with the first message
+        self._message_at = math.inf  # the time-out begins anew with the first message
         for address in (CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY):
             cell = self.memory.writable(0x06, address)
             if cell:
