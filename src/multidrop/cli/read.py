@@ -1,4 +1,4 @@
-"""`multidrop read`: values of one drive, with their units."""
+"""`multidrop read`: reads values of one drive and prints them with their units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned, as_json, as_row
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -34,15 +34,15 @@ def run(arguments: argparse.Namespace) -> int:
         bus.attach(drive)
         values = _read(bus, drive, wanted)
     refused = [answer for answer in values.values() if isinstance(answer, DriveRefused)]
-    say(_json(drive, values) if arguments.json else _text(drive, values))
+    print_text(_json(drive, values) if arguments.json else _text(drive, values))
     return 1 if refused else 0
 
 
 def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Every register's value, or the drive's refusal to tell it."""
+    """Return each register's value, or the drive's refusal."""
     try:
         found = bus.read_many(drive, wanted)
-    except DriveRefused:  # one of them; which one, only asking singly tells
+    except DriveRefused:  # which register, only single reads show
         return {register: _read_one(bus, drive, register) for register in wanted}
     return {register: found[register.name] for register in wanted}
 
@@ -65,12 +65,12 @@ def _text(drive: Drive, values: dict[Register[Any], Any]) -> str:
 
 
 def _json(drive: Drive, values: dict[Register[Any], Any]) -> str:
-    told = {
+    shown = {
         register.name: {"value": None, "refused": value.meaning, "code": value.code}
         if isinstance(value, DriveRefused)
         else as_json(register, value)
         for register, value in values.items()
     }
     return json.dumps(
-        {"drive": drive.name, "model": drive.model, "address": drive.address, "values": told}, indent=2
+        {"drive": drive.name, "model": drive.model, "address": drive.address, "values": shown}, indent=2
     )

@@ -12,7 +12,7 @@ from typing import Any, TextIO
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import check_writable
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.drive.family import Drive
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -77,11 +77,11 @@ def run(arguments: argparse.Namespace) -> int:
     plant = _write(arguments.out, arguments.port, found, families)
     told = {"port": arguments.port, "seconds": round(time.monotonic() - begun, 3), "finished": finished}
     if arguments.json:
-        say(json.dumps(told | _as_json(found) | {"plant": plant}, indent=2))
+        print_text(json.dumps(told | _as_json(found) | {"plant": plant}, indent=2))
     else:
-        say(_summary(found, told["seconds"], arguments.addresses))
+        print_text(_summary(found, told["seconds"], arguments.addresses))
         if plant:
-            say(f"{plant} is ready: multidrop poll {plant}")
+            print_text(f"{plant} is ready: multidrop poll {plant}")
     if not finished:
         raise KeyboardInterrupt
     return 0 if any(isinstance(it, Found) for it in found) else 1
@@ -125,7 +125,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
         if said and sys.stderr.isatty():
             print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
         if not silent:
-            say(sentence(finding), flush=True)
+            print_text(sentence(finding), flush=True)
         yield finding
     if said and sys.stderr.isatty():
         print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
@@ -138,7 +138,7 @@ def _tell(progress: Progress, said: str, stream: TextIO) -> str:
         text = f"{setting}, address {progress.address}; {_duration(progress.left)} left"
         print(f"{_CLEAR_LINE}{text}", end="", file=stream, flush=True)
     elif setting != said:
-        say(f"{setting}; {_duration(progress.left)} left", file=stream, flush=True)
+        print_text(f"{setting}; {_duration(progress.left)} left", file=stream, flush=True)
     return setting
 
 

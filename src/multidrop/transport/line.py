@@ -156,7 +156,7 @@ class Line:
 
     def _drive(self, port: serial.SerialBase) -> Port:
         if type(port).read is serial.Serial.read:
-            pseudo = os.ttyname(port.fileno()).startswith(("/dev/pts/", "/dev/ttys"))
+            pseudo = port_identity.is_pseudo_terminal(os.ttyname(port.fileno()))
             # A pty stays at 8 bits without parity whatever it is told.
             return Port(port.fileno(), _BAUDRATE if pseudo else _ALL_SETTINGS)
         if connection := getattr(port, "_socket", None):
