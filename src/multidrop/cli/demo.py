@@ -72,9 +72,10 @@ def _plant_file(port: Path) -> str:
     for address, (name, model, framing) in enumerate(DRIVES, 1):
         family = MODELS[model]
         options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+        polled = [register for register in POLLED if register in family.registers]
         tables.append(
             f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
-            f"address = {address}\n{options}poll = {[name for name in POLLED if name in family.registers]}\n"
+            f"address = {address}\n{options}poll = {polled}\n"
         )
     return "\n".join(tables)
 

@@ -156,13 +156,12 @@ def _registers(family: type[Drive], table: Table) -> Iterator[str]:
 
 
 def _row(register: Register[Any]) -> tuple[str, ...]:
-    what = (
-        f"{register.step:g} {register.unit}"
-        if register.step is not None
-        else f"{register.unit} scale not stated"
-    )
     if register.values is not None:
         what = "names"
+    elif register.step is None:
+        what = f"{register.unit} scale not stated"
+    else:
+        what = f"{register.step:g} {register.unit}"
     span = f"{register.span[0]:g} to {register.span[1]:g}" if register.span else ""
     return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, add_plant_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import Row, aligned, shortened, wrapped
 from multidrop.planning.prediction import Prediction, Rate, predict
@@ -24,7 +24,7 @@ _NAMES = 3  # registers named in a sentence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_plant_argument(parser)
     add_json_argument(parser)
 
 

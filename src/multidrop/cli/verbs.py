@@ -7,7 +7,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli.support.arguments import (
@@ -21,14 +21,13 @@ from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
 from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
 _STOPS = ("stop", "coast", "emergency-stop")
-_SAYING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
+_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
 _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
@@ -79,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
             drive.set_frequency(hz)
         state = verb(*parameters, **limit)
         known.append(f"{drive.name}: {arguments.command} is done")
-        watchdog = bus.watchdog(drive) if arguments.command in _SAYING_WATCHDOG else ""
+        watchdog = bus.watchdog(drive) if arguments.command in _SHOWING_WATCHDOG else ""
         if not isinstance(state, State):
             try:
                 state = drive.state()
@@ -88,13 +87,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         record = {"drive": drive.name, "done": arguments.command, "state": _as_json(state)}
         if setpoint:
-            record["setpoint"] = {"register": setpoint.register.name} | as_json(*setpoint)
+            register, value = setpoint.register, setpoint.value
+            record["setpoint"] = {"register": register.name} | as_json(register, value)
         print_text(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
         print_text(state)
         print_text(f"watchdog: {watchdog}")
     else:
-        at = f" at {setpoint}" if setpoint else ""
+        at = f" at {setpoint.register.name} = {setpoint.register.format(setpoint.value)}" if setpoint else ""
         done = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
         print_text(done + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
@@ -123,20 +123,12 @@ def _stop_line(arguments: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-class _Setpoint(NamedTuple):
-    register: Register[float]
-    value: float
-
-    def __str__(self) -> str:
-        return f"{self.register.name} = {self.register.format(self.value)}"
-
-
-def _setpoint(drive: Drive, hz: float) -> _Setpoint | None:
+def _setpoint(drive: Drive, hz: float) -> Write | None:
     """Return what set_frequency writes; None where its script begins with a read."""
     step = next(drive.set_frequency.script(hz))
     if not isinstance(step, Write):
         return None
-    return _Setpoint(step.register, nearest_value(step.register, step.value))
+    return Write(step.register, nearest_value(step.register, step.value))
 
 
 def _rehearse(script: Script[Any]) -> None:

@@ -22,7 +22,7 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, add_port_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import wrapped
 from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request
@@ -44,7 +44,7 @@ SETTING_UP = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("port", metavar="PORT", help="device such as /dev/ttyUSB0, or pyserial URL")
+    add_port_argument(parser)
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
     parser.add_argument("--address", type=int, metavar="N", help="its address")
     parser.add_argument(

@@ -17,6 +17,7 @@ from typing import Any
 
 from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.monitor.side_reads import SideReader
+from multidrop.cli.support.arguments import add_plant_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
@@ -32,7 +33,7 @@ PAGE = 10  # lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_plant_argument(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help="record what is polled as well")
 
 

@@ -65,14 +65,10 @@ def page(
     drive = shown.polled.drive
     head = f" {shown.name}  {drive.title or drive.model}  address {drive.address}  "
     head += f"{drive.settings} {drive.framing}"
+    state = f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}"
     top = [
         Text(head[:width].ljust(width), style="reverse"),
-        Text(
-            _cut(
-                f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}",
-                width,
-            )
-        ),
+        Text(_cut(state, width)),
         Text(_cut(f" {_pace(shown)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
@@ -98,15 +94,13 @@ def _title(plant: LivePlant, width: int, now_ns: int) -> Text:
 
 
 def _line_states(plant: LivePlant, width: int) -> list[Text]:
-    found = []
+    lines = []
     for line in plant.plant.lines:
         lately = plant.lately[line.name]
-        text = (
-            f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
-            f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
-        )
-        found.append(Text(_cut(text, width)))
-    return found
+        text = f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
+        text += f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
+        lines.append(Text(_cut(text, width)))
+    return lines
 
 
 def _misses(reasons: Mapping[str, int]) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
 from multidrop.cli.poll.comparison import compare, comparison_text
 from multidrop.cli.poll.live_table import LiveTable
-from multidrop.cli.support.arguments import add_json_argument, duration
+from multidrop.cli.support.arguments import add_json_argument, add_plant_argument, duration
 from multidrop.cli.support.files import check_capture, refuse_overwriting
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.polling import polling_session
@@ -28,7 +28,7 @@ _TAKE_S = 0.1  # between looks for new rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_plant_argument(parser)
     add_polling_arguments(parser, out=None, seconds=None)
 
 

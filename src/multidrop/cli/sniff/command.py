@@ -12,7 +12,7 @@ from pathlib import Path
 from multidrop.capture import Capture, CaptureWriter
 from multidrop.capture.lookup import line_of
 from multidrop.cli.sniff.listener import Listener
-from multidrop.cli.support.arguments import add_json_argument, duration
+from multidrop.cli.support.arguments import add_json_argument, add_port_argument, duration
 from multidrop.cli.support.files import check_capture
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import noting_signals
@@ -26,9 +26,7 @@ _GIVEN_UP_S = 1.5  # longer than any master waits for a reply
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "port", metavar="PORT", nargs="?", help="device such as /dev/ttyUSB0, or pyserial URL"
-    )
+    add_port_argument(parser, nargs="?")
     parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")

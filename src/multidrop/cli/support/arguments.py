@@ -8,9 +8,19 @@ from multidrop.drive.family import Drive
 from multidrop.drives.registry import find_model
 
 
+def add_port_argument(parser: argparse.ArgumentParser, nargs: str | None = None) -> None:
+    parser.add_argument(
+        "port", metavar="PORT", nargs=nargs, help="device such as /dev/ttyUSB0, or pyserial URL"
+    )
+
+
+def add_plant_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+
+
 def add_target_arguments(parser: argparse.ArgumentParser) -> None:
     """Add PORT MODEL ADDRESS, and options for a drive that differs from the family's defaults."""
-    parser.add_argument("port", metavar="PORT", help="device such as /dev/ttyUSB0, or pyserial URL")
+    add_port_argument(parser)
     parser.add_argument("model", metavar="MODEL", help="see `multidrop models`; or file.py:Class")
     parser.add_argument("address", metavar="ADDRESS", type=_address, help="the drive's address on the line")
     parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
