@@ -23,7 +23,7 @@ from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, 
 from multidrop.capture import flight_recorder as flight
 from multidrop.capture.anomalies import AnomalyWatch
 from multidrop.capture.pcapng_writer import WRAPPINGS
-from multidrop.cli.poll.tapping import tapping_text
+from multidrop.cli.poll.command import tap_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
 from multidrop.drives import InnovertIBD
 from multidrop.plant.model import PolledDrive
@@ -234,7 +234,7 @@ def test_what_is_not_collected_in_time_is_counted() -> None:
     packets = b"".join(tap.take(WRAPPINGS, 0, 0))
     assert packets.count(b"\xff" * 4000) == told // 4000 - 1
     assert list(tap.take(WRAPPINGS, 0, 0)) == []
-    assert tapping_text({"untapped_bytes": tap.lost}) == [
+    assert list(tap_text({"untapped_bytes": tap.lost})) == [
         "4000 bytes were not captured: this machine was too slow"
     ]
 

@@ -14,7 +14,7 @@ import pytest
 from commands import TOY, Run
 
 from multidrop.cli import COMMANDS, main
-from multidrop.cli.support.signals import Interruption
+from multidrop.cli.support.signals import noting_signals
 from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 
@@ -425,7 +425,7 @@ def test_a_thread_that_is_not_the_main_one_can_run_a_command(capsys: pytest.Capt
 
 
 def test_a_second_signal_breaks_off_what_the_first_one_asked_to_end() -> None:
-    with Interruption() as interruption:
+    with noting_signals() as interruption:
         assert not interruption.came
         signal.raise_signal(signal.SIGINT)
         assert interruption.came

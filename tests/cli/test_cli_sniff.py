@@ -9,7 +9,7 @@ import pty
 import socket
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from taps import tapped
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.capture.pairing import Pairing
-from multidrop.cli.sniff.listening import Listener
+from multidrop.cli.sniff.listener import Listener
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
 from multidrop.drive.timing import Settings
 from multidrop.drives.delixi_native import DelixiNative
@@ -102,7 +102,10 @@ def test_a_poll_s_values_are_heard_captured_and_decoded(
 
 
 def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
-    with Listener(line[1], Settings(9600, "8N1")) as listener, pytest.raises(OSError, match="Bad file"):
+    with (
+        closing(Listener(line[1], Settings(9600, "8N1"))) as listener,
+        pytest.raises(OSError, match="Bad file"),
+    ):
         os.write(listener.fileno(), b"\x01")
 
 
@@ -173,8 +176,8 @@ def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) 
 
 def test_a_url_s_port_has_no_write() -> None:
     far = ResponderLine(b"")
-    with Listener(far.url, Settings(9600, "8N1")) as listener:
-        (port,) = (it for it in vars(listener._source).values() if hasattr(it, "write"))
+    with closing(Listener(far.url, Settings(9600, "8N1"))) as listener:
+        port = listener._source
         with pytest.raises(OSError, match="only listened to: 01 is not sent"):
             port.write(b"\x01")
     assert far.close() == b""
@@ -367,7 +370,7 @@ def test_no_permission_is_told_in_a_sentence(run: Run, monkeypatch: pytest.Monke
     def refuse(path: str, flags: int) -> int:
         raise PermissionError(13, "Permission denied", path)
 
-    monkeypatch.setattr("multidrop.cli.sniff.listening.os.open", refuse)
+    monkeypatch.setattr("multidrop.cli.sniff.listener.os.open", refuse)
     assert run("sniff", "/dev/ttyS0") == (
         1,
         "",

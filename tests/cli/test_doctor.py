@@ -352,7 +352,7 @@ def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, re
 def test_only_what_was_sent_is_counted(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive is not asked again while its late answer may come; that was no request."""
     end = responder(lambda request: b"")
-    monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
+    monkeypatch.setattr("multidrop.cli.doctor.command.MOST_S", 1.0)
     status, out, _ = run("doctor", end.path, "--model", "invt-che", "--address", "9")
     told = " ".join(out.split())
     assert status == 1

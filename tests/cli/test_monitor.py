@@ -16,11 +16,13 @@ from lines import PATIENCE
 from rich.console import Console
 from terminals import on_terminal
 
-import multidrop.cli.support.extra
-from multidrop.cli.monitor import PAGE, _Monitor
+import multidrop.cli.support.extras
+from multidrop.cli.monitor.command import PAGE, Monitor
 from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP, next_key
 from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
-from multidrop.cli.monitor.watched import WatchedPlant
+from multidrop.cli.support.live_plant import LivePlant
+from multidrop.cli.support.polling import PollingSession
+from multidrop.cli.support.signals import Interruption
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.core import Counters, Status
 from multidrop.plant.loader import load_plant
@@ -68,9 +70,9 @@ def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) ->
 
 
 @pytest.fixture
-def watched(tmp_path: Path) -> WatchedPlant:
+def watched(tmp_path: Path) -> LivePlant:
     """One drive that runs, one with a fault, one that never answered."""
-    it = WatchedPlant(a_plant(tmp_path))
+    it = LivePlant(a_plant(tmp_path))
     rows = [
         row("drive-1", "output_frequency", 42.5),
         row("drive-1", "output_current", 2.5),
@@ -94,7 +96,7 @@ def texts(lines: list[Any]) -> list[str]:
 # ---- what it knows ----
 
 
-def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
+def test_states_are_what_is_polled_anyway(watched: LivePlant) -> None:
     assert [(it.state, it.fault, it.why_silent) for it in watched.drives] == [
         ("forward", "", ""),
         ("fault", "oc1_overcurrent_accelerating", ""),
@@ -104,20 +106,20 @@ def test_states_are_what_is_polled_anyway(watched: WatchedPlant) -> None:
     assert [it.so_far.misses.total() for it in watched.drives] == [12, 0, 0]
 
 
-def test_a_rested_drive_tells_why_it_is_rested(watched: WatchedPlant) -> None:
+def test_a_rested_drive_tells_why_it_is_rested(watched: LivePlant) -> None:
     watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
     assert watched.drives[2].why_silent == "no reply"
 
 
 def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
-    it = WatchedPlant(a_plant(tmp_path, 1))
+    it = LivePlant(a_plant(tmp_path, 1))
     it.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
     assert it.drives[0].state == ""
     it.add(from_rows([row("drive-1", "output_frequency", 3.0)]))
     assert it.drives[0].state == "turns"
 
 
-def test_rates_are_those_of_the_last_seconds(watched: WatchedPlant) -> None:
+def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
     lately = watched.lately["hall-1"]
     assert lately.exchanges_per_second == pytest.approx(50)
     assert lately.utilisation == pytest.approx(0.9)
@@ -129,7 +131,7 @@ def test_rates_are_those_of_the_last_seconds(watched: WatchedPlant) -> None:
     assert watched.drives[0].lately.exchanges == 0
 
 
-def test_history_has_a_gap_where_a_value_was_missed(watched: WatchedPlant) -> None:
+def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
     assert [list(it.history) for it in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
     assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
     assert sparkline([50, 50, 50], 2) == "██"
@@ -141,7 +143,7 @@ def test_history_has_a_gap_where_a_value_was_missed(watched: WatchedPlant) -> No
 # ---- how it looks ----
 
 
-def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
+def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
     lines = texts(overview(watched, Position(), (80, 24), NOW, BLOCKS))
     assert lines[0].startswith(" multidrop monitor  hall.toml")
     assert lines[0].endswith("09:30:00 UTC ")
@@ -157,7 +159,7 @@ def test_the_overview_says_it_in_words(watched: WatchedPlant) -> None:
 @pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @pytest.mark.parametrize("drives", [1, 31, 247])
 def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
-    it = WatchedPlant(a_plant(tmp_path, min(drives, 247)))
+    it = LivePlant(a_plant(tmp_path, min(drives, 247)))
     it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     it.tick(1.0, told(1, 1, 1.0, drives))
     for chosen in (0, drives - 1):
@@ -179,7 +181,7 @@ def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], 
         assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
 
 
-def test_the_page_has_every_register(watched: WatchedPlant) -> None:
+def test_the_page_has_every_register(watched: LivePlant) -> None:
     it = watched.drives[1]
     others = {"motor_speed": "0 rpm"}
     lines = texts(page(it, others, Position(1, page=True), (80, 40), NOW))
@@ -196,19 +198,19 @@ def test_the_page_has_every_register(watched: WatchedPlant) -> None:
 @pytest.mark.parametrize(
     ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
 )
-def test_an_age_is_told_as_people_do(watched: WatchedPlant, seconds: int, age: str) -> None:
+def test_an_age_is_told_as_people_do(watched: LivePlant, seconds: int, age: str) -> None:
     lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
     assert " ".join(lines[3].split()[6:8]) == age
 
 
-def test_a_wide_overview_has_the_delays(watched: WatchedPlant) -> None:
+def test_a_wide_overview_has_the_delays(watched: LivePlant) -> None:
     lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
     assert lines[2].split()[-2:] == ["DELAY", "HISTORY"]
     assert " 8.9 ms " in lines[3]
     assert " ms " not in lines[4]
 
 
-def test_the_page_says_how_the_drive_answers(watched: WatchedPlant) -> None:
+def test_the_page_says_how_the_drive_answers(watched: LivePlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
     assert lines[1] == " forward      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
@@ -216,7 +218,7 @@ def test_the_page_says_how_the_drive_answers(watched: WatchedPlant) -> None:
     assert silent[2] == " 0.0 exchanges/s"
 
 
-def test_the_page_scrolls_as_far_as_there_is_something(watched: WatchedPlant) -> None:
+def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> None:
     at = Position(0, page=True, scrolled=1000)
     lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
     assert lines[9].strip()
@@ -275,9 +277,9 @@ def a_monitor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Pol
     for polled in plant.lines[0].drives:
         polled.drive.perform = lambda script, name=polled.drive.name: poller.perform(name, script)
     anyone: Any = poller
-    monitor: Any = _Monitor(plant, anyone, [], Console())
+    monitor: Any = Monitor(LivePlant(plant), PollingSession(anyone, Interruption(), lambda: None), Console())
     monitor._in_background = monitor._carry_out  # at once
-    monitor._side.read = lambda chosen: {}
+    monitor._side_reader.read = lambda chosen: {}
     return monitor, poller
 
 
@@ -300,7 +302,7 @@ def test_a_stop_needs_a_yes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def seen(monitor: Any) -> str:
     """All that stands on the screen."""
-    return "\n".join(line.rstrip() for line in monitor._drawn().plain.split("\n"))
+    return "\n".join(line.rstrip() for line in monitor._picture().plain.split("\n"))
 
 
 def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,14 +329,14 @@ def test_all_lines_stand_in_what_a_stop_of_all_came_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monitor, _ = a_monitor(tmp_path, monkeypatch)
-    monitor._stood = {}
+    monitor._stop_results = {}
     message = ""
     for line in ("hall-1", "hall-2"):
         message, _ = monitor._stop_all(line)
     assert message == "1 of 2 drives on hall-1 have stopped; 1 of 2 drives on hall-2 have stopped"
 
 
-def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: WatchedPlant) -> None:
+def test_what_had_no_room_is_shown_once_the_first_are_acknowledged(watched: LivePlant) -> None:
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):
@@ -519,7 +521,7 @@ def test_without_a_terminal_it_says_what_works(run: Run, tmp_path: Path) -> None
 
 
 def test_without_the_extra_it_is_named(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multidrop.cli.support.extra.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(multidrop.cli.support.extras.importlib.util, "find_spec", lambda name: None)
     status, _, err = run("monitor", plant_file(tmp_path))
     assert status == 2
     assert "pip install 'multidrop[monitor]'" in err

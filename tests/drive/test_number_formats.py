@@ -11,8 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
 
-from multidrop.cli.monitor.watched import told
-from multidrop.cli.support.values import as_json, taken
+from multidrop.cli.support.values import as_json, nearest_value, value_text
 from multidrop.control.outcome import Effect
 from multidrop.core import Message
 from multidrop.drive import Drive
@@ -180,9 +179,9 @@ def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
 
 def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str]) -> None:
     (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
-    assert taken(Meter.f32, Meter.f32.parse("12.1")) == single
+    assert nearest_value(Meter.f32, Meter.f32.parse("12.1")) == single
     assert capsys.readouterr().err == ""  # shown as it was typed
-    assert taken(Meter.f32, 16_777_217.0) == 16_777_216
+    assert nearest_value(Meter.f32, 16_777_217.0) == 16_777_216
     assert capsys.readouterr().err == (
         "multidrop: f32 holds single-precision numbers: 16777217.0 is taken as 16777216 V\n"
     )
@@ -194,7 +193,7 @@ def test_what_the_command_line_takes_and_tells(capsys: pytest.CaptureFixture[str
 
 @pytest.mark.parametrize(("value", "text"), [(12.345678, "12.345678 raw"), (1_234_567, "1234567 raw")])
 def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, text: str) -> None:
-    assert told(Meter.unscaled, value) == text
+    assert value_text(Meter.unscaled, value) == text
 
 
 # ---- what is common in devices ----

@@ -15,11 +15,10 @@ from batches import METADATA, SECOND, UTC_0, example
 from commands import Run
 from recordings import ABOUT, record, row
 
-import multidrop.cli.support.extra
+import multidrop.cli.support.extras
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
-from multidrop.recording.rows import from_rows
 from multidrop.report import Recording, load, plot, plot_page, png, report_page
 from multidrop.report.health import MOST_REASONS, delays, draw_rates, miss_shares, reasons_of
 from multidrop.report.html import _about, _drives
@@ -651,7 +650,7 @@ def test_what_is_no_recording_or_has_no_rows_is_one_sentence(run: Run, tmp_path:
 def test_without_the_extra_it_is_named(
     run: Run, ramp: Path, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(multidrop.cli.support.extra.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(multidrop.cli.support.extras.importlib.util, "find_spec", lambda name: None)
     status, _, err = run(command, ramp)
     assert status == 2
     assert "pip install 'multidrop[plot]'" in err

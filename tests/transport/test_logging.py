@@ -10,7 +10,7 @@ from typing import Any
 
 import checksums
 import pytest
-from halls import one
+from simulated_bus import one
 from toy import PatientToy
 
 from multidrop import Bus, LineError, Refused

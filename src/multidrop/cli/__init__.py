@@ -1,6 +1,6 @@
-"""The command line: finds the command, runs it, and turns what goes wrong into a sentence and a status.
+"""The command line: run one command, and turn a failure into a sentence and an exit status.
 
-A command's module is imported when it is run: `multidrop --help` loads none of them.
+A command's module is imported when it runs: `multidrop --help` imports none.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ import difflib
 import importlib
 import logging
 import os
-import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Refused, Unsupported
-from multidrop.printable import printable
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
-COMMANDS = {  # name: its module here, and what it does
+COMMANDS = {  # name: module in this package, and help
     "demo": ("demo", "poll simulated drives of every family on one line"),
     "models": ("models", "list the families, or one family's registers"),
     "read": ("read", "read values from a drive"),
@@ -38,11 +36,11 @@ COMMANDS = {  # name: its module here, and what it does
     "scan": ("scan", "find the drives on a line, by reading only"),
     "plan": ("plan", "predict what a plant file's lines will reach; opens no port"),
     "wear": ("wear", "list what was written to EEPROMs, and what is left"),
-    "poll": ("poll", "poll the drives of a plant file, and record them"),
-    "doctor": ("doctor", "say what is amiss with a port and its adapter"),
-    "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
+    "poll": ("poll.command", "poll the drives of a plant file, and record them"),
+    "doctor": ("doctor.command", "say what is amiss with a port and its adapter"),
+    "monitor": ("monitor.command", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
-    "sniff": ("sniff", "listen to a line that someone else masters"),
+    "sniff": ("sniff.command", "listen to a line that someone else masters"),
     "decode": ("decode", "turn a capture into a recording or into text"),
     "plot": ("plot", "draw a recording's values into a picture"),
     "report": ("report", "write one page of all that a recording tells"),
@@ -62,7 +60,7 @@ Exit status: 0 done, 1 the line or a drive failed or a rule forbade it, 2 mistak
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; its exit status."""
+    """Run one command and return its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):
         print(HELP, end="")
@@ -72,33 +70,36 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"multidrop {version('multidrop')}")
         return DONE
-    with _sigterm_as_interrupt(), _telling_what_is_run():
+    from multidrop.cli.support.output import logging_to, warn
+    from multidrop.cli.support.signals import sigterm_interrupts
+
+    with sigterm_interrupts(), logging_to(warn, "multidrop.drives.registry", logging.INFO):
         return _guarded(words[0], words[1:])
 
 
 def _guarded(command: str, words: list[str]) -> int:
-    """Run it; every foreseeable failure becomes a sentence on stderr."""
+    """Run the command; print every foreseeable failure as a sentence on stderr."""
     try:
         status = _run(command, words)
-        if sys.stdout is not None:  # as it is where the caller has closed it
+        if sys.stdout is not None:  # None: the caller has closed it
             sys.stdout.flush()
     except KeyboardInterrupt as interruption:  # its notes say what was sent
-        return _say("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
-    except BrokenPipeError:  # whoever reads our output has seen enough
+        return _fail("\n".join(["interrupted", *getattr(interruption, "__notes__", ())]), INTERRUPTED)
+    except BrokenPipeError:  # such as of `multidrop models | head`
         _abandon_output()
         return DONE
     except Refused as refusal:
-        return _say(refusal.for_command_line(), FAILED)
+        return _fail(refusal.for_command_line(), FAILED)
     except (ValueError, TypeError, Unsupported) as mistake:
-        return _say(str(mistake), MISTAKE)
+        return _fail(str(mistake), MISTAKE)
     except OSError as failure:
-        if failure.strerror is None:  # one of ours
-            return _say(str(failure), FAILED)
+        if failure.strerror is None:  # one of multidrop's own
+            return _fail(str(failure), FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
-        return _say(f"{where}{failure.strerror}", MISTAKE if isinstance(failure, _MISNAMED) else FAILED)
+        return _fail(f"{where}{failure.strerror}", MISTAKE if isinstance(failure, _MISNAMED) else FAILED)
     except BusError as failure:
-        return _say(str(failure), FAILED)
+        return _fail(str(failure), FAILED)
     return status
 
 
@@ -120,54 +121,20 @@ def _run(command: str, words: list[str]) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Mistakes in the arguments are a ValueError, as all mistakes are."""
+    """Raise ValueError for mistaken arguments, as for every other mistake of the caller."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see `{self.prog} --help`")
 
 
-def _say(sentences: str, status: int) -> int:
-    for sentence in sentences.splitlines():
-        print(f"multidrop: {printable(sentence)}", file=sys.stderr)
+def _fail(sentences: str, status: int) -> int:
+    from multidrop.cli.support.output import warn
+
+    warn(sentences)
     return status
 
 
 def _abandon_output() -> None:
-    """Nothing more can be written to stdout: keep the interpreter from trying when it ends."""
+    """Point stdout at /dev/null: else the interpreter fails to flush it at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-class _OnStderr(logging.Handler):
-    """Says what is logged as all else is said."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        _say(record.getMessage(), DONE)
-
-
-@contextmanager
-def _telling_what_is_run() -> Iterator[None]:
-    """Say which files with models of the user's own are run, which they are for every command."""
-    logger, handler = logging.getLogger("multidrop.drives.registry"), _OnStderr()
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
-
-
-@contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
-    """SIGTERM ends a command as Ctrl-C does."""
-    try:
-        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    except ValueError:  # not the main thread, whose business signals are
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

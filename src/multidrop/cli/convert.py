@@ -1,13 +1,12 @@
-"""`multidrop convert`: a recording anew, in the format of another suffix."""
+"""`multidrop convert`: copies a recording into the format of another suffix."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.truncated import tell_torn
+from multidrop.cli.support.files import refuse_overwriting, warn_truncated
+from multidrop.cli.support.output import print_text
 from multidrop.recording import FORMATS, convert, open_reader
 
 
@@ -19,6 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     refuse_overwriting(arguments.target)
     rows = convert(arguments.source, arguments.target)
-    tell_torn(arguments.source, rows, open_reader(arguments.source).truncated)
-    say(f"{rows} rows in {arguments.target}")
+    warn_truncated(arguments.source, rows, open_reader(arguments.source).truncated)
+    print_text(f"{rows} rows in {arguments.target}")
     return 0

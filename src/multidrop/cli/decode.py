@@ -1,19 +1,18 @@
-"""`multidrop decode`: captures as columns, or as text."""
+"""`multidrop decode`: turns a capture into a recording, or into text."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.sniff.sniffed import replay, summary
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.traffic import replay, summary
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.recording import open_writer
@@ -36,13 +35,12 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             counts = dict(replay(capture, plant, as_json=arguments.json))
         if capture.truncated:
-            say(
-                f"multidrop: {capture.path} is cut: its last {capture.truncated} bytes are no whole packet, "
-                "and were left out",
-                file=sys.stderr,
+            warn(
+                f"{capture.path} is cut: its last {capture.truncated} bytes are no whole packet, "
+                "and were left out"
             )
     into = f"{counts['rows']} rows in {arguments.out}: " if arguments.out else ""
-    say(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
+    print_text(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`multidrop demo`: a simulated line with every family on it, polled and recorded."""
+"""`multidrop demo`: polls and records a simulated line with every family on it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from multidrop.bus import Bus
-from multidrop.cli.monitor import is_possible, watch
-from multidrop.cli.poll import add_polling_arguments, conclude, follow
+from multidrop.cli.monitor.command import is_possible, watch
+from multidrop.cli.poll.command import add_polling_arguments, conclude, follow
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.drives import MODELS
 from multidrop.errors import BadReply, NoReply, NotDone, Unconfirmed
@@ -53,15 +53,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _make_room(out: Path) -> None:
-    """Only what an earlier demo recorded gives way to the next one."""
-    with suppress(ValueError, TypeError, OSError):  # there is none, or what is there is not ours
+    """Remove an earlier demo's recording, and nothing else. Raises ValueError for any other file."""
+    with suppress(ValueError, TypeError, OSError):  # no file, or no recording
         if set(open_reader(out).metadata.get("drives", ())) == {name for name, *_ in DRIVES}:
             out.unlink()
     refuse_overwriting(out)
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """The monitor shows more than a table does, where there is a terminal and its library."""
+    """Tell whether the monitor can show the demo: it writes no captures, and needs a terminal and rich."""
     if arguments.capture or arguments.flight_recorder:
         return False
     return not arguments.json and is_possible() and find_spec("rich") is not None
@@ -72,19 +72,20 @@ def _plant_file(port: Path) -> str:
     for address, (name, model, framing) in enumerate(DRIVES, 1):
         family = MODELS[model]
         options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+        polled = [register for register in POLLED if register in family.registers]
         tables.append(
             f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
-            f"address = {address}\n{options}poll = {[it for it in POLLED if it in family.registers]}\n"
+            f"address = {address}\n{options}poll = {polled}\n"
         )
     return "\n".join(tables)
 
 
 def _start_motors(line: PlantLine) -> None:
-    """Every simulated motor at another frequency, so that there is something to be seen."""
+    """Start every simulated motor, each at another frequency."""
     with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
-            # On a busy machine the simulated drive is too late: the demo shows whether its motor turns.
+            # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
             with suppress(BadReply, NoReply, NotDone, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
@@ -92,9 +93,9 @@ def _start_motors(line: PlantLine) -> None:
 
 @contextmanager
 def _simulator(plant: Path, ports: Path) -> Iterator[None]:
-    """A process of its own, so that the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
-    # In a session of its own, Ctrl-C reaches it only when polling has ended.
+    """Simulate in another process: the two sides do not share an interpreter."""
+    words = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", str(ports)]
+    # A session of its own keeps Ctrl-C from it: it must outlive the polling.
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         assert process.stdout is not None
         try:

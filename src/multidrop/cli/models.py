@@ -1,17 +1,16 @@
-"""`multidrop models`: the families, or all that one family's document says of its registers."""
+"""`multidrop models`: lists the families, or everything that one family declares."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
 import json
-import textwrap
 from collections.abc import Iterator
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.values import aligned
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import aligned, wrapped
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register, Table
@@ -19,7 +18,6 @@ from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 
-WIDTH = 80
 INDENT = 16  # of a family's facts
 
 
@@ -31,18 +29,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
         families = list(MODELS.values())
-        say(json.dumps([_summary(it) for it in families], indent=2) if arguments.json else _list(families))
+        summaries = [_summary(family) for family in families]
+        print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:
         family = find_model(arguments.model)
-        say(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
+        print_text(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
     return 0
 
 
 def _list(families: list[type[Drive]]) -> str:
     rows = [("MODEL", "FAMILY", "FRAMINGS", "ADDRESSES", "REGISTERS")]
     rows += [
-        (it.model, it.title, " ".join(map(str, it.framings)), _range(it.addresses), str(len(it.registers)))
-        for it in families
+        (
+            family.model,
+            family.title,
+            " ".join(map(str, family.framings)),
+            _range(family.addresses),
+            str(len(family.registers)),
+        )
+        for family in families
     ]
     return "\n".join([*aligned(rows, "<<<<>"), "", "`multidrop models MODEL` says all of one family."])
 
@@ -51,35 +56,27 @@ def _range(numbers: range) -> str:
     return f"{numbers[0]}-{numbers[-1]}"
 
 
-# ---- one family, for people ----
+# ---- one family as text ----
 
 
 def _sheet(family: type[Drive]) -> str:
-    lines = [family.title or family.__name__, *_paragraph(family.manual), ""]
+    lines = [family.title or family.__name__, *wrapped(family.manual), ""]
     for name, text in _lines_of(family):
-        lines += textwrap.wrap(
-            text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT
-        )
+        lines += wrapped(text, f"{name:<{INDENT}}", " " * INDENT)
     exceptions = {f"{code:02X}H": meaning for code, meaning in family.exceptions.items()}
     options = {name: _option(option) for name, option in family.options.items()}
     for heading, entries in (("exceptions", exceptions), ("options", options)):
         if entries:
-            lines += ["", heading, *_entries(entries)]
+            lines += ["", heading]
+            for name, meaning in entries.items():
+                lines += wrapped(meaning, f"  {name}  ", " " * 8)
     for table in dict.fromkeys(register.table for register in family.registers.values()):
         lines += ["", _table_heading(table, family), *_registers(family, table)]
     if family.__doc__:
-        lines += ["", *_notes(family.__doc__)]
+        lines.append("")
+        for line in inspect.cleandoc(family.__doc__).splitlines():
+            lines += wrapped(line) or [""]
     return "\n".join(lines)
-
-
-def _paragraph(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent)
-
-
-def _notes(docstring: str) -> Iterator[str]:
-    """The docstring as it stands, but no line wider than the rest."""
-    for line in inspect.cleandoc(docstring).splitlines():
-        yield from _paragraph(line) or [""]
 
 
 def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
@@ -119,7 +116,7 @@ def _silence(family: type[Drive], framing: Framing) -> str:
 
 
 def _needed_silence(family: type[Drive], framing: Framing) -> float:
-    """In s, at the family's default baud rate."""
+    """Return the silence in s at the family's default baud rate."""
     return family(family.addresses[0], framing=framing).needed_silence()
 
 
@@ -133,11 +130,6 @@ def _response_delay(family: type[Drive]) -> str:
 
 def _verbs(family: type[Drive]) -> list[str]:
     return [name.replace("_", "-") for name in VERBS if getattr(family, name) is not getattr(Drive, name)]
-
-
-def _entries(entries: dict[str, str]) -> Iterator[str]:
-    for name, meaning in entries.items():
-        yield from textwrap.wrap(meaning, WIDTH, initial_indent=f"  {name}  ", subsequent_indent=" " * 8)
 
 
 def _option(option: Option) -> str:
@@ -155,22 +147,21 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
 
 
 def _registers(family: type[Drive], table: Table) -> Iterator[str]:
-    """A row a register, and under it what else is known."""
+    """Return a row per register, with remarks under it."""
     registers = [register for register in family.registers.values() if register.table is table]
     rows = aligned([_row(register) for register in registers], "<<<<<")
     for register, row in zip(registers, rows, strict=True):
         yield f"  {row}"
-        yield from _paragraph("; ".join(_remarks(register)), " " * 8)
+        yield from wrapped("; ".join(_remarks(register)), " " * 8, " " * 8)
 
 
 def _row(register: Register[Any]) -> tuple[str, ...]:
-    what = (
-        f"{register.step:g} {register.unit}"
-        if register.step is not None
-        else f"{register.unit} scale not stated"
-    )
     if register.values is not None:
         what = "names"
+    elif register.step is None:
+        what = f"{register.unit} scale not stated"
+    else:
+        what = f"{register.step:g} {register.unit}"
     span = f"{register.span[0]:g} to {register.span[1]:g}" if register.span else ""
     return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
 
@@ -210,7 +201,7 @@ def _bits(register: Register[Any], mask: int) -> str:
     return register.format(register.decode(mask)).replace("|", " and ")
 
 
-# ---- for programs ----
+# ---- as JSON ----
 
 
 def _summary(family: type[Drive]) -> dict[str, Any]:
@@ -240,8 +231,8 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
         "most_registers": {table.name: most for table, most in family.most_registers.items()},
         "exceptions": family.exceptions,
         "options": {
-            name: {"unit": it.unit, "span": it.span, "meaning": it.meaning}
-            for name, it in family.options.items()
+            name: {"unit": option.unit, "span": option.span, "meaning": option.meaning}
+            for name, option in family.options.items()
         },
         "verbs": _verbs(family),
         "line_parameters": family.line_parameters,
@@ -254,28 +245,20 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
 
 def _register(register: Register[Any]) -> dict[str, Any]:
     names = register.values
-    return {
-        "name": register.name,
+    facts = {name: getattr(register, name, None) for name in _REGISTER_KEYS}
+    return facts | {
         "table": register.table.name,
-        "address": register.address,
         "access": register.access.value,
-        "unit": register.unit,
-        "step": register.step,
-        "span": register.span,
         "at_least": register.at_least or None,
         "at_most": register.at_most or None,
         "values": None if names is None else {member.name: member.value for member in names},
         "wire": register.number_format.name,
         "kept": register.kept.value,
-        "ram_address": register.ram_address,
-        "default": register.default,
-        "while_running": register.while_running,
-        "broadcast": register.broadcast,
-        "moves": register.moves,
-        "harmless": register.harmless,
-        "never_together": register.never_together,
-        "never": register.never,
-        "place": register.place,
-        "outside": register.outside,
-        "note": register.note,
     }
+
+
+_REGISTER_KEYS = (  # in this order
+    *("name", "table", "address", "access", "unit", "step", "span", "at_least", "at_most", "values", "wire"),
+    *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),
+    *("never", "place", "outside", "note"),
+)

@@ -1,4 +1,4 @@
-"""`multidrop plan`: what a plant file's lines will reach, what does not fit and what would make it fit.
+"""`multidrop plan`: predicts what a plant file's lines reach, and suggests what would make misfits fit.
 
 No port is opened.
 """
@@ -7,37 +7,34 @@ from __future__ import annotations
 
 import argparse
 import json
-import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.values import Row, aligned
+from multidrop.cli.support.arguments import add_json_argument, add_plant_argument
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import Row, aligned, shortened, wrapped
 from multidrop.planning.prediction import Prediction, Rate, predict
 from multidrop.planning.suggestions import Suggestions, duration_text, suggest
 from multidrop.plant.loader import load_plant
 from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
 
-WIDTH = 80
-LONGEST_NAME = 24
-LONG_CYCLE = 1.0  # s; who polls all readings may not have meant to wait for so long
-_NAMES = 3  # of registers that a sentence tells
+LONG_CYCLE = 1.0  # s; polling all readings for longer than this may not have been meant
+_NAMES = 3  # registers named in a sentence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+    add_plant_argument(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     plans = [_plan(line) for line in load_plant(arguments.plant).lines]
     if arguments.json:
-        say(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
+        print_text(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
     else:
-        say("\n\n".join("\n".join(_text(plan)) for plan in plans))
+        print_text("\n\n".join("\n".join(_text(plan)) for plan in plans))
     return 0 if all(plan.prediction.fits for plan in plans) else 1
 
 
@@ -45,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 class _Plan:
     line: PlantLine
     prediction: Prediction
-    suggestions: Suggestions | None  # None: it fits
+    suggestions: Suggestions | None  # None: the plan fits
 
 
 def _plan(line: PlantLine) -> _Plan:
@@ -55,24 +52,24 @@ def _plan(line: PlantLine) -> _Plan:
 
 
 def _misfits(plan: _Plan) -> list[str]:
-    """A sentence for each rate that is not kept."""
+    """Return a sentence for each rate that is not kept."""
     return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
 
 
 def _misfit(rate: Rate, every: float) -> str:
-    names = [it.name for it in rate.registers]
-    told = ", ".join(names[:_NAMES]) + (f" and {len(names) - _NAMES} more" if len(names) > _NAMES else "")
+    names = [register.name for register in rate.registers]
+    shown = ", ".join(names[:_NAMES]) + (f" and {len(names) - _NAMES} more" if len(names) > _NAMES else "")
     verb = "does" if len(names) == 1 else "do"
     reached = f"{_number(rate.reached)} of {_number(1 / every)} times per second"
-    return f"{rate.drive.name}: {told} {verb} not fit: {reached}"
+    return f"{rate.drive.name}: {shown} {verb} not fit: {reached}"
 
 
 def _warnings(plan: _Plan) -> list[str]:
-    """Polling all readings, which is what happens when nothing is said, may take long."""
+    """Warn where all readings are polled, which is the default, and a cycle takes long."""
     whole = [
         polled.drive
         for polled in plan.line.drives
-        if tuple(it.register for it in polled.polls) == polled.drive.readings()
+        if tuple(poll.register for poll in polled.polls) == polled.drive.readings()
     ]
     if plan.prediction.cycle <= LONG_CYCLE or not whole:
         return []
@@ -86,27 +83,26 @@ def _warnings(plan: _Plan) -> list[str]:
     ]
 
 
-# ---- for a person ----
+# ---- as text ----
 
 
 def _text(plan: _Plan) -> Iterator[str]:
     prediction = plan.prediction
-    yield from textwrap.wrap(
+    yield from wrapped(
         f"{plan.line.name}: utilisation {prediction.utilisation:.1%}, "
-        f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest",
-        WIDTH,
+        f"bus cycle {prediction.cycle * 1e3:.1f} ms at the fastest"
     )
     if prediction.switches:
-        yield from _wrapped(_switching(plan))
+        yield from _indented(_switching(plan))
     rows: list[Row] = [("DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED")]
     rows += [_row(rate) for rate in prediction.rates]
     yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
     for sentence in _misfits(plan):
-        yield from _wrapped(f"! {sentence}")
+        yield from _indented(f"! {sentence}")
     if plan.suggestions:
-        yield from _wrapped(f"! {plan.suggestions}")
+        yield from _indented(f"! {plan.suggestions}")
     for sentence in _warnings(plan):
-        yield from _wrapped(f"? {sentence}")
+        yield from _indented(f"? {sentence}")
 
 
 def _switching(plan: _Plan) -> str:
@@ -128,16 +124,11 @@ def _number(rate: float) -> str:
     return f"{rate:.0f}" if rate >= 100 else f"{rate:.3g}"
 
 
-def shortened(name: str) -> str:
-    """So that a table stays within the terminal."""
-    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 3]}..."
+def _indented(sentence: str) -> list[str]:
+    return wrapped(sentence, "  ", "    ")
 
 
-def _wrapped(sentence: str) -> list[str]:
-    return textwrap.wrap(sentence, WIDTH, initial_indent="  ", subsequent_indent="    ")
-
-
-# ---- for a program ----
+# ---- as JSON ----
 
 
 def _as_json(plan: _Plan) -> dict[str, Any]:
@@ -158,7 +149,7 @@ def _as_json(plan: _Plan) -> dict[str, Any]:
 def _drive_as_json(plan: _Plan, name: str) -> list[dict[str, Any]]:
     return [
         {
-            "registers": [it.name for it in rate.registers],
+            "registers": [register.name for register in rate.registers],
             "requests": rate.requests,
             "every_ms": None if rate.every is None else rate.every * 1e3,
             "asked_per_second": None if rate.every is None else round(1 / rate.every, 3),
@@ -174,6 +165,6 @@ def _suggestions_as_json(found: Suggestions) -> dict[str, Any]:
     return {
         "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every],
         "baudrate": found.baudrate and found.baudrate[0],
-        "baudrate_for": [it.name for it in found.baudrate[1]] if found.baudrate else [],
+        "baudrate_for": [drive.name for drive in found.baudrate[1]] if found.baudrate else [],
         "registers": found.registers,
     }

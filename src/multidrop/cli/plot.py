@@ -1,14 +1,12 @@
-"""`multidrop plot`: a recording's values as a picture, or as a page with the picture in it."""
+"""`multidrop plot`: draws a recording's values as a picture, or as a page with the picture in it."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.extra import need
-from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.truncated import tell_torn
+from multidrop.cli.support.files import load_recording
+from multidrop.cli.support.output import print_text
 
 SUFFIXES = (".png", ".html")
 
@@ -26,18 +24,15 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or arguments.recording.with_suffix(".png")
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{out}: a plot's name ends in {' or '.join(SUFFIXES)}")
-    need("matplotlib", "plot", "plot")
-    refuse_overwriting(out)
-    from multidrop.report import load, plot, plot_page, png
+    recording = load_recording(arguments.recording, out, "plot")
+    from multidrop.report import plot, plot_page, png
 
-    look = load(arguments.recording)
-    tell_torn(look.path, look.rows, look.truncated)
-    figure, left = plot(look, arguments.drive, arguments.register)
+    figure, left_out = plot(recording, arguments.drive, arguments.register)
     if out.suffix.lower() == ".png":
         out.write_bytes(png(figure))
     else:
-        out.write_text(plot_page(look, figure), "utf-8")
-    say(out)
-    if left:
-        say(f"not shown: {'; '.join(left)} (choose with --register)")
+        out.write_text(plot_page(recording, figure), "utf-8")
+    print_text(out)
+    if left_out:
+        print_text(f"not shown: {'; '.join(left_out)} (choose with --register)")
     return 0

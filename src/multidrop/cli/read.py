@@ -1,4 +1,4 @@
-"""`multidrop read`: values of one drive, with their units."""
+"""`multidrop read`: reads values of one drive and prints them with their units."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.values import aligned, as_json, as_row
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import Row, aligned, as_json, as_row
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import DriveRefused
@@ -33,16 +33,20 @@ def run(arguments: argparse.Namespace) -> int:
     with Bus(arguments.port) as bus:
         bus.attach(drive)
         values = _read(bus, drive, wanted)
-    refused = [answer for answer in values.values() if isinstance(answer, DriveRefused)]
-    say(_json(drive, values) if arguments.json else _text(drive, values))
-    return 1 if refused else 0
+    if arguments.json:
+        record = {"drive": drive.name, "model": drive.model, "address": drive.address}
+        shown = {register.name: _as_json(register, value) for register, value in values.items()}
+        print_text(json.dumps(record | {"values": shown}, indent=2))
+    else:
+        print_text("\n".join(aligned([_row(*answer) for answer in values.items()], "<><")))
+    return 1 if any(isinstance(value, DriveRefused) for value in values.values()) else 0
 
 
 def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Every register's value, or the drive's refusal to tell it."""
+    """Return each register's value, or the drive's refusal."""
     try:
         found = bus.read_many(drive, wanted)
-    except DriveRefused:  # one of them; which one, only asking singly tells
+    except DriveRefused:  # which register, only single reads show
         return {register: _read_one(bus, drive, register) for register in wanted}
     return {register: found[register.name] for register in wanted}
 
@@ -54,23 +58,13 @@ def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
         return refusal
 
 
-def _text(drive: Drive, values: dict[Register[Any], Any]) -> str:
-    rows = [
-        (register.name, "", f"refused: {value.meaning}")
-        if isinstance(value, DriveRefused)
-        else as_row(register, value)
-        for register, value in values.items()
-    ]
-    return "\n".join(aligned(rows, "<><"))
+def _row(register: Register[Any], value: Any) -> Row:
+    if isinstance(value, DriveRefused):
+        return register.name, "", f"refused: {value.meaning}"
+    return as_row(register, value)
 
 
-def _json(drive: Drive, values: dict[Register[Any], Any]) -> str:
-    told = {
-        register.name: {"value": None, "refused": value.meaning, "code": value.code}
-        if isinstance(value, DriveRefused)
-        else as_json(register, value)
-        for register, value in values.items()
-    }
-    return json.dumps(
-        {"drive": drive.name, "model": drive.model, "address": drive.address, "values": told}, indent=2
-    )
+def _as_json(register: Register[Any], value: Any) -> dict[str, Any]:
+    if isinstance(value, DriveRefused):
+        return {"value": None, "refused": value.meaning, "code": value.code}
+    return as_json(register, value)

@@ -1,14 +1,12 @@
-"""`multidrop report`: all that a recording tells of itself, as one HTML page."""
+"""`multidrop report`: writes one HTML page with everything that a recording says."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.extra import need
-from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.truncated import tell_torn
+from multidrop.cli.support.files import load_recording
+from multidrop.cli.support.output import print_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,12 +20,9 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or arguments.recording.with_suffix(".html")
     if out.suffix.lower() != ".html":
         raise ValueError(f"{out}: a report's name ends in .html")
-    need("matplotlib", "plot", "report")
-    refuse_overwriting(out)
-    from multidrop.report import load, report_page
+    recording = load_recording(arguments.recording, out, "report")
+    from multidrop.report import report_page
 
-    look = load(arguments.recording)
-    tell_torn(look.path, look.rows, look.truncated)
-    out.write_text(report_page(look), "utf-8")
-    say(out)
+    out.write_text(report_page(recording), "utf-8")
+    print_text(out)
     return 0

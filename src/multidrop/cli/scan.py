@@ -1,4 +1,4 @@
-"""`multidrop scan`: which drives are on a line, at which address and settings; writes a plant file."""
+"""`multidrop scan`: finds the drives on a line, their addresses and settings; writes a plant file."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, add_port_argument
 from multidrop.cli.support.files import check_writable
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.drive.family import Drive
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -36,7 +36,7 @@ _CLEAR_LINE = "\r\x1b[K"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("port", metavar="PORT", help="device such as /dev/ttyUSB0, or pyserial URL")
+    add_port_argument(parser)
     parser.add_argument("--model", action="append", default=[], help="only these; all families without it")
     parser.add_argument(
         "--addresses",
@@ -45,12 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=list(ADDRESSES),
         help=f"such as 1-247 or 1,5,9; {ADDRESSES[0]}-{ADDRESSES[-1]} without it",
     )
-    parser.add_argument(
-        "--baudrates", metavar="N,N", type=_baudrates, default=[], help="only these; all without it"
-    )
-    parser.add_argument(
-        "--formats", metavar="8N1,8E1", type=_formats, default=[], help="only these; all without it"
-    )
+    for name, metavar, parse in (("--baudrates", "N,N", _baudrates), ("--formats", "8N1,8E1", _formats)):
+        parser.add_argument(name, metavar=metavar, type=parse, default=[], help="only these; all without it")
     parser.add_argument(
         "--quick", action="store_true", help="do not ask again for drives that answer later than usual"
     )
@@ -74,21 +70,26 @@ def run(arguments: argparse.Namespace) -> int:
         pass
     finally:
         line.close()
-    plant = _write(arguments.out, arguments.port, found, families)
-    told = {"port": arguments.port, "seconds": round(time.monotonic() - begun, 3), "finished": finished}
+    seconds = round(time.monotonic() - begun, 3)
+    drives = [finding for finding in found if isinstance(finding, Found)]
+    plant = None
+    if arguments.out and any(drive.models for drive in drives):
+        arguments.out.write_text(plant_text(arguments.port, drives, families), "utf-8")
+        plant = str(arguments.out)
     if arguments.json:
-        say(json.dumps(told | _as_json(found) | {"plant": plant}, indent=2))
+        record = {"port": arguments.port, "seconds": seconds, "finished": finished}
+        print_text(json.dumps(record | _as_json(found) | {"plant": plant}, indent=2))
     else:
-        say(_summary(found, told["seconds"], arguments.addresses))
+        print_text(_summary(len(drives), seconds, arguments.addresses))
         if plant:
-            say(f"{plant} is ready: multidrop poll {plant}")
+            print_text(f"{plant} is ready: multidrop poll {plant}")
     if not finished:
         raise KeyboardInterrupt
-    return 0 if any(isinstance(it, Found) for it in found) else 1
+    return 0 if drives else 1
 
 
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
-    """By what a plant file calls them: a file's path is made absolute, because it may lie anywhere."""
+    """Return families by their names in a plant file, with absolute paths of model files."""
     named = {}
     for text in models or MODELS:
         path, colon, name = text.rpartition(":")
@@ -116,30 +117,32 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
 
 
 def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
-    """Findings as they come, told at once; progress on stderr."""
-    said = ""
+    """Print findings as they come, unless silent, and progress on stderr; pass the findings on.
+
+    On a terminal progress is one line, redrawn; into a file it is a line for every setting.
+    """
+    redraws = sys.stderr.isatty()
+    shown = ""  # the setting of the progress line
     for finding in findings:
         if isinstance(finding, Progress):
-            said = _tell(finding, said, sys.stderr)
+            setting, left = f"{finding.settings} {finding.framing}", _duration(finding.left)
+            if redraws:
+                _redraw(f"{setting}, address {finding.address}; {left} left")
+            elif setting != shown:
+                print_text(f"{setting}; {left} left", file=sys.stderr, flush=True)
+            shown = setting
             continue
-        if said and sys.stderr.isatty():
-            print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
+        if shown and redraws:
+            _redraw("")
         if not silent:
-            say(sentence(finding), flush=True)
+            print_text(sentence(finding), flush=True)
         yield finding
-    if said and sys.stderr.isatty():
-        print(_CLEAR_LINE, end="", file=sys.stderr, flush=True)
+    if shown and redraws:
+        _redraw("")
 
 
-def _tell(progress: Progress, said: str, stream: TextIO) -> str:
-    """On a terminal one line, always the same; into a file a line for every setting."""
-    setting = f"{progress.settings} {progress.framing}"
-    if stream.isatty():
-        text = f"{setting}, address {progress.address}; {_duration(progress.left)} left"
-        print(f"{_CLEAR_LINE}{text}", end="", file=stream, flush=True)
-    elif setting != said:
-        say(f"{setting}; {_duration(progress.left)} left", file=stream, flush=True)
-    return setting
+def _redraw(text: str) -> None:
+    print(f"{_CLEAR_LINE}{text}", end="", file=sys.stderr, flush=True)
 
 
 def _duration(seconds: float) -> str:
@@ -148,7 +151,7 @@ def _duration(seconds: float) -> str:
 
 
 def sentence(finding: Finding) -> str:
-    """What a person is told of it."""
+    """Return the finding in words."""
     at = f"{finding.settings} {finding.framing}"
     match finding:
         case Found():
@@ -176,19 +179,7 @@ def sentence(finding: Finding) -> str:
 # ---- afterwards ----
 
 
-def _write(
-    out: Path | None, port: str, found: Sequence[Finding], families: Mapping[str, type[Drive]]
-) -> str | None:
-    """The plant file's path, where one was wanted and there is something to write."""
-    drives = [it for it in found if isinstance(it, Found)]
-    if out is None or not any(it.models for it in drives):
-        return None
-    out.write_text(plant_text(port, drives, families), "utf-8")
-    return str(out)
-
-
-def _summary(found: Sequence[Finding], seconds: float, addresses: Sequence[int]) -> str:
-    drives = sum(isinstance(it, Found) for it in found)
+def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:
     text = f"{drives or 'no'} drive{'s' * (drives != 1)} found in {_duration(seconds)}"
     if addresses == list(ADDRESSES):
         text += f"; addresses above {ADDRESSES[-1]} were not asked (--addresses 1-247 does)"
@@ -196,35 +187,37 @@ def _summary(found: Sequence[Finding], seconds: float, addresses: Sequence[int])
 
 
 def _as_json(found: Sequence[Finding]) -> dict[str, Any]:
+    kinds = {"drives": Found, "crowds": Crowd, "noise": Noise, "untried": Untried}
     return {
-        "drives": [
-            _place(it)
-            | {
-                "models": list(it.models),
-                "response_delay_ms": round(it.response_delay * 1e3, 3),
-                "doubt": it.doubt or None,
+        name: [_record(finding) for finding in found if isinstance(finding, kind)]
+        for name, kind in kinds.items()
+    }
+
+
+def _record(finding: Finding) -> dict[str, Any]:
+    settings = finding.settings
+    record = {
+        "baudrate": settings.baudrate,
+        "format": settings.format,
+        "framing": str(finding.framing),
+    }
+    match finding:
+        case Found():
+            return {
+                "address": finding.address,
+                **record,
+                "models": list(finding.models),
+                "response_delay_ms": round(finding.response_delay * 1e3, 3),
+                "doubt": finding.doubt or None,
             }
-            for it in found
-            if isinstance(it, Found)
-        ],
-        "crowds": [_place(it) for it in found if isinstance(it, Crowd)],
-        "noise": [
-            _setting(it) | {"garbled": it.garbled, "asked": it.asked} for it in found if isinstance(it, Noise)
-        ],
-        "untried": [_setting(it) | {"reason": it.reason} for it in found if isinstance(it, Untried)],
-    }
-
-
-def _place(it: Found | Crowd) -> dict[str, Any]:
-    return {"address": it.address} | _setting(it)
-
-
-def _setting(it: Finding) -> dict[str, Any]:
-    return {
-        "baudrate": it.settings.baudrate,
-        "format": it.settings.format,
-        "framing": str(it.framing),
-    }
+        case Crowd():
+            return {"address": finding.address, **record}
+        case Noise():
+            return {**record, "garbled": finding.garbled, "asked": finding.asked}
+        case Untried():
+            return {**record, "reason": finding.reason}
+        case Progress():
+            return record
 
 
 # ---- arguments ----

@@ -1,11 +1,11 @@
-"""`multidrop simulate`: the drives of a plant file, on pseudo-terminals."""
+"""`multidrop simulate`: simulates the drives of a plant file on pseudo-terminals."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, Simulator, Wire, load_faults, serve, simulated
@@ -47,4 +47,4 @@ def _wire(line: PlantLine, directory: Path, faults: Faults, unpaced: bool) -> Wi
 
 def _announce(simulator: Simulator) -> None:
     for wire in simulator.wires:
-        say(f"ready {wire.name} {wire.path}", flush=True)
+        print_text(f"ready {wire.name} {wire.path}", flush=True)

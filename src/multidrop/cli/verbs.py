@@ -1,4 +1,4 @@
-"""`multidrop start`, `stop` and the other verbs: each is a method of the drive of the same name."""
+"""`multidrop start`, `stop` and the other verbs: each calls the drive's method of the same name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.cli.support.arguments import (
@@ -17,19 +17,18 @@ from multidrop.cli.support.arguments import (
     drive_of,
     duration,
 )
-from multidrop.cli.support.confirm import ask
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.values import as_json, taken
+from multidrop.cli.support.confirm import confirm
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register
 from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
 from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
 _STOPS = ("stop", "coast", "emergency-stop")
-_WATCHED = ("state", *_DIRECTED)  # it is told what becomes of the motor when the client dies
-_ASKED = {  # before they are sent; a stop is never asked for
+_SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
+_QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
     "reset-fault": "Reset the fault of",
@@ -42,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command = parser.get_default("command")
     if command in _DIRECTED:
         parser.add_argument(
-            "--direction", choices=[it.value for it in Direction], help="the one in force if not given"
+            "--direction",
+            choices=[direction.value for direction in Direction],
+            help="the one in force if not given",
         )
     if command == "set-frequency":
         parser.add_argument("frequency", metavar="HZ", type=float, help="the setpoint in Hz")
@@ -63,44 +64,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     drive = drive_of(arguments)
     verb = getattr(drive, arguments.command.replace("-", "_"))
-    given = _given(arguments)
-    _rehearse(verb.script(*given))
+    parameters = _parameters(arguments)
+    _rehearse(verb.script(*parameters))
     hz = getattr(arguments, "frequency", None)
     setpoint = None if hz is None else _setpoint(drive, hz)
-    if arguments.command in _ASKED:
+    if arguments.command in _QUESTIONS:
         drive.check_confirmed(arguments.command)
-        ask(f"{_ASKED[arguments.command]} {drive.name} on {arguments.port}?", arguments)
+        confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {arguments.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
-    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus, _told(arguments) as known:
+    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus, _annotating(arguments) as known:
         bus.attach(drive)
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
-        state = verb(*given, **limit)
+        state = verb(*parameters, **limit)
         known.append(f"{drive.name}: {arguments.command} is done")
-        watchdog = bus.watchdog(drive) if arguments.command in _WATCHED else ""
+        watchdog = bus.watchdog(drive) if arguments.command in _SHOWING_WATCHDOG else ""
         if not isinstance(state, State):
             try:
                 state = drive.state()
             except Unsupported:
                 state = None
     if arguments.json:
-        record = {"drive": drive.name, "done": arguments.command, "state": _json(state)}
+        record = {"drive": drive.name, "done": arguments.command, "state": _as_json(state)}
         if setpoint:
-            record["setpoint"] = {"register": setpoint.register.name} | as_json(*setpoint)
-        say(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
+            register, value = setpoint.register, setpoint.value
+            record["setpoint"] = {"register": register.name} | as_json(register, value)
+        print_text(json.dumps(record | ({"watchdog": watchdog} if watchdog else {}), indent=2))
     elif arguments.command == "state":
-        say(state)
-        say(f"watchdog: {watchdog}")
+        print_text(state)
+        print_text(f"watchdog: {watchdog}")
     else:
-        at = f" at {setpoint}" if setpoint else ""
-        told = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
-        say(told + (f"; watchdog: {watchdog}" if watchdog else ""))
+        at = f" at {setpoint.register.name} = {setpoint.register.format(setpoint.value)}" if setpoint else ""
+        done = f"{drive.name}: {arguments.command} done{at}; state: {state or 'the family cannot say'}"
+        print_text(done + (f"; watchdog: {watchdog}" if watchdog else ""))
     return 0
 
 
 @contextmanager
-def _told(arguments: argparse.Namespace) -> Iterator[list[str]]:
-    """Add to an interruption what is known, and what stops the motor, for whoever is to type it."""
+def _annotating(arguments: argparse.Namespace) -> Iterator[list[str]]:
+    """Add to an interruption what is known of the verb, and the command that stops the motor."""
     known: list[str] = []
     try:
         yield known
@@ -121,39 +123,28 @@ def _stop_line(arguments: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-class _Setpoint(NamedTuple):
-    """What set_frequency writes."""
-
-    register: Register[float]
-    value: float
-
-    def __str__(self) -> str:
-        return f"{self.register.name} = {self.register.format(self.value)}"
-
-
-def _setpoint(drive: Drive, hz: float) -> _Setpoint | None:
-    """What the drive can take of this frequency; None where its family looks at the drive before it says."""
+def _setpoint(drive: Drive, hz: float) -> Write | None:
+    """Return what set_frequency writes; None where its script begins with a read."""
     step = next(drive.set_frequency.script(hz))
     if not isinstance(step, Write):
         return None
-    return _Setpoint(step.register, taken(step.register, step.value))
+    return Write(step.register, nearest_value(step.register, step.value))
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Work out the first step, so that what the family lacks or forbids is refused with no port opened."""
+    """Make the first step: raise for what the family lacks or forbids, before a port is opened."""
     step = next(script)
     if isinstance(step, Write):
         step.register.encode(step.value)
 
 
-def _given(arguments: argparse.Namespace) -> list[Any]:
-    """What the verb takes."""
+def _parameters(arguments: argparse.Namespace) -> list[Any]:
     if arguments.command in _DIRECTED:
         return [Direction(arguments.direction) if arguments.direction else None]
     return [arguments.frequency] if arguments.command == "set-frequency" else []
 
 
-def _json(state: State | None) -> dict[str, Any] | None:
+def _as_json(state: State | None) -> dict[str, Any] | None:
     if state is None:
         return None
     return {

@@ -1,4 +1,4 @@
-"""`multidrop wear`: how often registers that a drive may keep in EEPROM were written, and what is left."""
+"""`multidrop wear`: lists the writes to registers that a drive may keep in EEPROM, and how many are left."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from multidrop.cli.support.arguments import add_json_argument
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned
 from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_path
 from multidrop.core import utc_minus_monotonic_ns
@@ -28,29 +28,23 @@ def run(arguments: argparse.Namespace) -> int:
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:
-        say(json.dumps([_facts(it) for it in found], indent=2))
+        print_text(json.dumps([_as_json(wear) for wear in found], indent=2))
     elif not found:
-        say(f"{ledger.path}: no register that may be in EEPROM was written yet")
+        print_text(f"{ledger.path}: no register that may be in EEPROM was written yet")
     else:
-        say("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
-        say(f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears.")
+        print_text("\n".join(aligned([HEAD, *map(_row, found)], "<><<>>><")))
+        print_text(
+            f"\n{ledger.path}: {BUDGET} writes of a register in a year, of {CYCLES} that an EEPROM bears."
+        )
     return 0
 
 
 def _row(wear: Wear) -> tuple[str, ...]:
-    cell = wear.cell
-    numbers = (str(wear.writes), str(wear.this_year), str(BUDGET - wear.this_year))
-    return (
-        cell.port,
-        str(cell.address),
-        cell.model,
-        cell.register,
-        *numbers,
-        _time(wear)[:16].replace("T", " "),
-    )
+    *columns, last = map(str, _as_json(wear).values())
+    return *columns, last[:16].replace("T", " ")
 
 
-def _facts(wear: Wear) -> dict[str, object]:
+def _as_json(wear: Wear) -> dict[str, object]:
     cell = wear.cell
     return {
         "port": cell.port,
@@ -60,9 +54,5 @@ def _facts(wear: Wear) -> dict[str, object]:
         "writes": wear.writes,
         "this_year": wear.this_year,
         "left": BUDGET - wear.this_year,
-        "last": _time(wear),
+        "last": datetime.fromtimestamp(wear.last, UTC).isoformat(timespec="seconds"),
     }
-
-
-def _time(wear: Wear) -> str:
-    return datetime.fromtimestamp(wear.last, UTC).isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""`multidrop write`: one register of one drive, and what became of it."""
+"""`multidrop write`: writes one register of one drive and says what became of it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from multidrop.cli.support.arguments import (
     add_writing_arguments,
     drive_of,
 )
-from multidrop.cli.support.confirm import ask
-from multidrop.cli.support.saying import say
-from multidrop.cli.support.values import as_json, taken
+from multidrop.cli.support.confirm import confirm
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.outcome import Effect
 from multidrop.control.rules import check_plain, raw_count, refused
 
@@ -33,15 +33,17 @@ def run(arguments: argparse.Namespace) -> int:
     register = drive.register(arguments.register)
     if register.never:
         raise refused(drive, register, register.never)
-    value = taken(register, register.parse(arguments.value))
+    value = nearest_value(register, register.parse(arguments.value))
     check_plain(drive, register, raw_count(drive, register, value))  # before a port is opened
-    ask(f"Write {register.name} = {register.format(value)} to {drive.name} on {arguments.port}?", arguments)
+    confirm(
+        f"Write {register.name} = {register.format(value)} to {drive.name} on {arguments.port}?", arguments
+    )
     with Bus(arguments.port, audit=arguments.audit) as bus:
         outcome = bus.try_write(bus.attach(drive), register, value)
     if arguments.json:
         held = outcome.asked if outcome.held is None else outcome.held
-        told = {"drive": drive.name, "register": register.name} | as_json(register, held)
-        say(json.dumps(told | {"outcome": outcome.effect.value}, indent=2))
+        record = {"drive": drive.name, "register": register.name} | as_json(register, held)
+        print_text(json.dumps(record | {"outcome": outcome.effect.value}, indent=2))
     else:
-        say(outcome, file=sys.stdout if outcome.effect is Effect.DONE else sys.stderr)
+        print_text(outcome, file=sys.stdout if outcome.effect is Effect.DONE else sys.stderr)
     return 0 if outcome.effect is Effect.DONE else 1

@@ -49,8 +49,8 @@ def make_read(
     """Return the exchange that reads a block, with the probe for an adapter's echo where it needs one."""
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
-        probe = make_exchange(drive, alone(register).request(drive.address), peer, NO_ROWS)
-    return make_exchange(drive, block.request(drive.address), peer, rows, echo_probe=probe, **details)
+        probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
+    return make_exchange(drive, block.request, peer, rows, echo_probe=probe, **details)
 
 
 class PreparedRead:

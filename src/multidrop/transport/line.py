@@ -11,7 +11,18 @@ from contextlib import suppress
 
 import serial
 
-from multidrop.core import REFUSALS, STATUSES, Completion, Echo, Exchange, Failure, Peer, Port, Tap, build_request
+from multidrop.core import (
+    REFUSALS,
+    STATUSES,
+    Completion,
+    Echo,
+    Exchange,
+    Failure,
+    Peer,
+    Port,
+    Tap,
+    build_request,
+)
 from multidrop.core.fork import register_at_fork
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock

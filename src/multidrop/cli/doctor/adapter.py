@@ -1,4 +1,4 @@
-"""What the system says of a serial port's adapter: sysfs, and what the driver answers."""
+"""A serial port's adapter, as sysfs describes it and its driver answers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ SYSFS = Path("/sys")
 
 # linux/serial.h, asm-generic/ioctls.h
 TIOCGSERIAL, TIOCGRS485 = 0x541E, 0x542E
-SERIAL_STRUCT = 72  # bytes that struct serial_struct takes at most
-FLAGS_AT = 4  # of its ints
+SERIAL_STRUCT = 72  # bytes of struct serial_struct, at most
+FLAGS_AT = 4  # index among its ints
 LOW_LATENCY = 1 << 13
 RS485_STRUCT = struct.Struct("=III5I")
 RS485_ENABLED, RS485_RX_DURING_TX = 1 << 0, 1 << 4
@@ -25,7 +25,7 @@ _LACKING = {errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, errno.EI
 
 @dataclass(frozen=True)
 class Adapter:
-    """What is known without opening the port; what is not known is empty or None."""
+    """Facts from sysfs; those that are not known are empty or None."""
 
     name: str  # of the tty, such as ttyUSB0
     driver: str = ""
@@ -37,14 +37,12 @@ class Adapter:
 
 @dataclass(frozen=True)
 class RS485Mode:
-    """How the driver switches the direction, where it does."""
-
     enabled: bool
     hears_itself: bool
 
 
 def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
-    """The adapter behind a device such as /dev/ttyUSB0, or a link to it."""
+    """Find the adapter behind a device such as /dev/ttyUSB0, or a link to it."""
     name = Path(device).resolve().name
     tty = sysfs / "class/tty" / name / "device"
     driver = tty / "driver"
@@ -61,11 +59,11 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 
 def _usb_device(tty: Path) -> Path | None:
-    """The nearest one above that says which product it is."""
+    """Return the nearest directory above that names a USB product."""
     if not tty.exists():
         return None
     above = tty.resolve()
-    return next((it for it in (above, *above.parents) if (it / "idVendor").exists()), None)
+    return next((path for path in (above, *above.parents) if (path / "idVendor").exists()), None)
 
 
 def _text(path: Path) -> str:
@@ -76,34 +74,32 @@ def _text(path: Path) -> str:
 
 
 def rs485_mode(fd: int) -> RS485Mode | None:
-    """None where the driver has none."""
-    if sys.platform != "linux":
-        return None
-    answer = bytearray(RS485_STRUCT.size)
-    try:
-        fcntl.ioctl(fd, TIOCGRS485, answer)
-    except OSError as failure:
-        if failure.errno in _LACKING:
-            return None
-        raise
-    return decoded_rs485(bytes(answer))
+    """Ask the driver for its RS-485 mode; None where it has none."""
+    answer = _ask(fd, TIOCGRS485, RS485_STRUCT.size)
+    return None if answer is None else decoded_rs485(answer)
 
 
 def decoded_rs485(answer: bytes) -> RS485Mode:
-    """What a struct serial_rs485 says."""
+    """Decode a struct serial_rs485."""
     flags = RS485_STRUCT.unpack(answer)[0]
     return RS485Mode(bool(flags & RS485_ENABLED), bool(flags & RS485_RX_DURING_TX))
 
 
 def low_latency(fd: int) -> bool | None:
-    """Whether the driver hands over at once what comes; None where it has no such flag."""
+    """Ask the driver for its low-latency flag; None where it has none."""
+    answer = _ask(fd, TIOCGSERIAL, SERIAL_STRUCT)
+    return None if answer is None else bool(array.array("i", answer)[FLAGS_AT] & LOW_LATENCY)
+
+
+def _ask(fd: int, request: int, size: int) -> bytes | None:
+    """Return the driver's answer to an ioctl; None where it does not know the request."""
     if sys.platform != "linux":
         return None
-    known = array.array("i", [0] * (SERIAL_STRUCT // 4))
+    answer = bytearray(size)
     try:
-        fcntl.ioctl(fd, TIOCGSERIAL, known)
+        fcntl.ioctl(fd, request, answer)
     except OSError as failure:
         if failure.errno in _LACKING:
             return None
         raise
-    return bool(known[FLAGS_AT] & LOW_LATENCY)
+    return bytes(answer)

@@ -1,4 +1,4 @@
-"""What is said of a port, its adapter and its line: a sentence each, and advice where there is any."""
+"""Findings about a port, its adapter and its line: a sentence each, with advice where it helps."""
 
 from __future__ import annotations
 
@@ -11,17 +11,15 @@ from multidrop.drive.timing import Settings
 
 LATENCY_MS = 1  # a larger latency timer is worth changing
 ROUNDS = 20
-SLOW_S = 0.005  # more than this on top of a drive's usual response delay is worth a word
+SLOW_S = 0.005  # a larger excess over a drive's usual response delay is reported
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found, and what the user should do about it, if anything."""
-
     topic: str
     what: str
     advice: str = ""
-    is_failure: bool = False  # a drive that was named does not answer
+    is_failure: bool = False  # the named drive does not answer
 
 
 def adapter_finding(adapter: Adapter) -> Finding:
@@ -73,23 +71,23 @@ def rs485_finding(mode: RS485Mode | None) -> Finding:
 
 
 def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """`found` is what became of a request that nobody should answer; `sent` its bytes."""
+    """Judge what became of a request, `sent`, that nobody should answer."""
     if found.result > 0:
         return _answered_finding(found, sent, settings)
-    heard = found.raw
-    if not heard:
+    received = found.raw
+    if not received:
         return Finding("echo", f"none at {settings}: nothing came back of what was sent")
-    if heard == sent:
+    if received == sent:
         return Finding("echo", f"the adapter hears what it sends at {settings}; multidrop takes it out")
     return Finding(
         "echo",
-        f"{len(heard)} bytes came unasked at {settings}: {heard[:16].hex(' ').upper()}",
+        f"{len(received)} bytes came unasked at {settings}: {received[:16].hex(' ').upper()}",
         "see whether another program or master talks on this line, and whether its ends are terminated",
     )
 
 
 def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """A reply to the request itself is no foreign traffic."""
+    """Report a good reply, which is no foreign traffic."""
     reply = found.reply
     how = f"with exception {reply.exception:02X}" if reply.exception else "with a value"
     echo = "the adapter hears what it sends" if found.skipped == len(sent) else "none"
@@ -102,11 +100,11 @@ def _answered_finding(found: Completion, sent: bytes, settings: Settings) -> Fin
 
 
 def round_trip_finding(drive: Drive, delays: list[float], asked: int, wire: float = 0.0) -> Finding:
-    """What so many requests that were sent came to.
+    """Judge the delays of the replies to `asked` requests.
 
-    `delays` are sorted, in s, from the request's last bit to the reply's first, as seen from here. Where
-    the port tells nothing of bits, as a network's, they begin when the request was handed over; `wire` is
-    then how long, in s, request and first character would be on a wire.
+    `delays` are sorted, in s, from the request's last bit to the reply's first. Where the port does not
+    show bits, as a network, they begin when the request was handed over; `wire` is then the time, in s, of
+    the request and the first character on a wire.
     """
     if not delays:
         return Finding(

@@ -1,4 +1,4 @@
-"""Keys of a terminal, one at a time, as they are pressed."""
+"""Keys pressed on a terminal, one at a time."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ KEYS = {  # as terminals send them
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str]]:
-    """A function that waits so many seconds for a key; its name or letter, or nothing."""
+    """Give a function that waits so many seconds for a key, and returns its name or letter, or ""."""
     fd = sys.stdin.fileno()
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
-    pressed = b""  # and not told yet
+    pressed = b""  # and not returned yet
 
     def wait_for_key(seconds: float) -> str:
         nonlocal pressed
@@ -49,7 +49,7 @@ def keys() -> Iterator[Callable[[float], str]]:
 
 
 def next_key(pressed: bytes) -> tuple[str, bytes]:
-    """The first key of what a terminal sent, by its name or letter, and the rest."""
+    """Split off the first key of what a terminal sent: its name or letter, and the rest."""
     for code in sorted(KEYS, key=len, reverse=True):
         if pressed.startswith(code):
             return KEYS[code], pressed[len(code) :]

@@ -1,6 +1,6 @@
-"""How a watched plant looks on a terminal: lines of text for a width and a height, and nothing else.
+"""The pictures of the monitor, as lines of text for a width and a height.
 
-What matters is in words and marks as well as in colours.
+Everything that matters is in words and marks as well as in colours.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.text import Text
 
-from multidrop.cli.monitor.watched import CURRENT, FREQUENCY, Watched, WatchedPlant
+from multidrop.cli.support.live_plant import CURRENT, FREQUENCY, LiveDrive, LivePlant
 from multidrop.drive.register import Register
 from multidrop.printable import printable
 
@@ -28,21 +28,19 @@ PAGE_HELP = "up/down choose   PgUp/PgDn scroll   Enter back   s stop   S stop al
 
 @dataclass
 class Position:
-    """Where the user is."""
+    """The user's place in the monitor, and what waits for an answer."""
 
     chosen: int = 0  # of the drives
-    page: bool = False  # its registers, and not all drives
+    page: bool = False  # one drive's registers are shown, not all drives
     scrolled: int = 0  # lines of the page
-    question: str = ""  # that waits for an answer
+    question: str = ""
     message: str = ""
     failures: list[str] = field(default_factory=list)  # of stops, until they are acknowledged
-    failures_shown: int = 0  # of them, as many as had room
+    failures_shown: int = 0  # as many as had room
 
 
-def overview(
-    plant: WatchedPlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str
-) -> list[Text]:
-    """All drives, a line each, those around the chosen one where there are more than fit."""
+def overview(plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str) -> list[Text]:
+    """Draw all drives, a line each; where not all fit, those around the chosen one."""
     width, height = size
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
@@ -51,8 +49,8 @@ def overview(
     room = height - len(top) - len(alarms) - 2
     first = _first_seen(at.chosen, len(plant.drives), room)
     rows = [
-        _drive(it, number == at.chosen, columns, width, now_ns, blocks)
-        for number, it in enumerate(plant.drives[first : first + room], first)
+        _drive(drive, number == at.chosen, columns, width, now_ns, blocks)
+        for number, drive in enumerate(plant.drives[first : first + room], first)
     ]
     hidden = len(plant.drives) - len(rows)
     note = f"{hidden} more drives: scroll" if hidden else ""
@@ -60,81 +58,79 @@ def overview(
 
 
 def page(
-    it: Watched, others: Mapping[str, str], at: Position, size: tuple[int, int], now_ns: int
+    shown: LiveDrive, others: Mapping[str, str], at: Position, size: tuple[int, int], now_ns: int
 ) -> list[Text]:
-    """Every register of one drive; `others` are those that are not polled, read on the side."""
+    """Draw every register of one drive; `others` has the side reads of those that are not polled."""
     width, height = size
-    drive = it.polled.drive
-    head = (
-        f" {it.name}  {drive.title or drive.model}  address {drive.address}  {drive.settings} {drive.framing}"
-    )
+    drive = shown.polled.drive
+    head = f" {shown.name}  {drive.title or drive.model}  address {drive.address}  "
+    head += f"{drive.settings} {drive.framing}"
+    state = f" {shown.state or 'state not polled'}   {shown.fault}   {_misses(shown.so_far.misses)}"
     top = [
         Text(head[:width].ljust(width), style="reverse"),
-        Text(_cut(f" {it.state or 'state not polled'}   {it.fault}   {_misses(it.so_far.misses)}", width)),
-        Text(_cut(f" {_pace(it)}", width)),
+        Text(_cut(state, width)),
+        Text(_cut(f" {_pace(shown)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
-    polled = [poll.register.name for poll in it.polled.polls]
+    polled = [poll.register.name for poll in shown.polled.polls]
     names = [*polled, *(name for name in names if name not in polled)]
     longest = max(map(len, names), default=0)
-    rows = [_register(it, drive.register(name), others, longest, width, now_ns) for name in names]
+    rows = [_register(shown, drive.register(name), others, longest, width, now_ns) for name in names]
     alarms = _alarms(at, size)
     room = height - len(top) - len(alarms) - 2
     at.scrolled = max(0, min(at.scrolled, len(rows) - room))
-    seen = rows[at.scrolled : at.scrolled + room]
-    note = f"registers {at.scrolled + 1} to {at.scrolled + len(seen)} of {len(rows)}"
-    return [*top, *seen, *[Text()] * (room - len(seen)), *alarms, *_foot(at, width, PAGE_HELP, note)]
+    visible = rows[at.scrolled : at.scrolled + room]
+    note = f"registers {at.scrolled + 1} to {at.scrolled + len(visible)} of {len(rows)}"
+    return [*top, *visible, *[Text()] * (room - len(visible)), *alarms, *_foot(at, width, PAGE_HELP, note)]
 
 
-# ---- its parts ----
+# ---- parts of both ----
 
 
-def _title(plant: WatchedPlant, width: int, now_ns: int) -> Text:
+def _title(plant: LivePlant, width: int, now_ns: int) -> Text:
     clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
     text = f" multidrop monitor  {printable(plant.plant.path.name)}"[: width - len(clock)]
     return Text(text.ljust(width - len(clock)) + clock, style="reverse")
 
 
-def _line_states(plant: WatchedPlant, width: int) -> list[Text]:
-    found = []
+def _line_states(plant: LivePlant, width: int) -> list[Text]:
+    lines = []
     for line in plant.plant.lines:
         lately = plant.lately[line.name]
-        text = (
-            f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
-            f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
-        )
-        found.append(Text(_cut(text, width)))
-    return found
+        text = f" {line.name}  {lately.utilisation:4.0%} of the wire used  "
+        text += f"{lately.exchanges_per_second:.1f} exchanges/s  {_misses(plant.so_far[line.name].misses)}"
+        lines.append(Text(_cut(text, width)))
+    return lines
 
 
 def _misses(reasons: Mapping[str, int]) -> str:
     if not reasons:
         return "no misses"
-    ordered = sorted(reasons.items(), key=lambda it: -it[1])
+    ordered = sorted(reasons.items(), key=lambda reason: -reason[1])
     total = sum(reasons.values())
     return f"{total} missed: " + ", ".join(f"{reason} {count}" for reason, count in ordered)
 
 
-def _pace(it: Watched) -> str:
-    """How often it is asked as of late, and how it has answered so far."""
-    so_far, delays = it.so_far, it.so_far.delays
-    told = [f"{it.lately.exchanges_per_second:.1f} exchanges/s"]
+def _pace(drive: LiveDrive) -> str:
+    """Describe the exchanges of late, and the delays and losses so far."""
+    so_far, delays = drive.so_far, drive.so_far.delays
+    parts = [f"{drive.lately.exchanges_per_second:.1f} exchanges/s"]
     if delays.replies:
-        told.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
+        parts.append(f"delay {_ms(delays.p50)} ms, p99 {_ms(delays.p99)}, max {_ms(delays.longest)}")
     if so_far.late_replies:
-        told.append(f"{so_far.late_replies} late")
+        parts.append(f"{so_far.late_replies} late")
     if so_far.skipped_bytes:
-        told.append(f"{so_far.skipped_bytes} bytes skipped")
-    return "  ".join(told)
+        parts.append(f"{so_far.skipped_bytes} bytes skipped")
+    return "  ".join(parts)
 
 
 def _ms(seconds: float) -> str:
     return f"{seconds * 1e3:.{0 if seconds >= 0.1 else 1}f}"
 
 
-def _columns(plant: WatchedPlant, width: int) -> dict[str, int]:
-    """Widths by head; what is left over goes to the fault's name and the history."""
-    longest = max(len(it.name) for it in plant.drives)
+def _columns(plant: LivePlant, width: int) -> dict[str, int]:
+    """Return widths by heading; the rest of the line goes to the fault and the history."""
+    longest = max(len(drive.name) for drive in plant.drives)
     columns = {"DRIVE": max(5, min(longest, 16)), "STATE": 10, "FREQUENCY": 9, "CURRENT": 9, "FAULT": 10}
     columns |= {"AGE": 7, "MISSED": 6}
     if width >= WIDE:
@@ -158,33 +154,38 @@ def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str
 
 
 def _drive(
-    it: Watched, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
+    drive: LiveDrive, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
 ) -> Text:
-    age = it.age(now_ns)
+    age = drive.age(now_ns)
     cells = {
-        "DRIVE": it.name,
-        "STATE": it.state,
-        "FREQUENCY": it.shown(FREQUENCY),
-        "CURRENT": it.shown(CURRENT),
-        "FAULT": it.fault or it.why_silent,
+        "DRIVE": drive.name,
+        "STATE": drive.state,
+        "FREQUENCY": drive.shown(FREQUENCY),
+        "CURRENT": drive.shown(CURRENT),
+        "FAULT": drive.fault or drive.why_silent,
         "AGE": _age(age),
-        "DELAY": f"{_ms(it.so_far.delays.p50)} ms" if it.so_far.delays.replies else "",
-        "MISSED": str(it.so_far.misses.total() or ""),
-        "HISTORY": sparkline(list(it.history), columns["HISTORY"], blocks),
+        "DELAY": f"{_ms(drive.so_far.delays.p50)} ms" if drive.so_far.delays.replies else "",
+        "MISSED": str(drive.so_far.misses.total() or ""),
+        "HISTORY": sparkline(list(drive.history), columns["HISTORY"], blocks),
     }
-    style = "red" if it.fault else "yellow" if it.why_silent or (age is not None and age > OLD) else ""
-    text = _row(columns, cells, ">" if chosen else "!" if it.fault else "")
+    style = "red" if drive.fault else "yellow" if drive.why_silent or (age is not None and age > OLD) else ""
+    text = _row(columns, cells, ">" if chosen else "!" if drive.fault else "")
     return Text(text[:width].ljust(width if chosen else 0), style=f"{style} reverse" if chosen else style)
 
 
 def _register(
-    it: Watched, register: Register[Any], others: Mapping[str, str], longest: int, width: int, now_ns: int
+    drive: LiveDrive,
+    register: Register[Any],
+    others: Mapping[str, str],
+    longest: int,
+    width: int,
+    now_ns: int,
 ) -> Text:
     name = register.name
-    miss = it.missed.get(name)
-    row = it.newest.get(name)
-    if any(poll.register.name == name for poll in it.polled.polls):
-        value = it.shown(name) or (miss.status if miss else "not yet")
+    miss = drive.missed.get(name)
+    row = drive.newest.get(name)
+    if any(poll.register.name == name for poll in drive.polled.polls):
+        value = drive.shown(name) or (miss.status if miss else "not yet")
         age = _age(None if row is None else (now_ns - row.time) / 1e9)
         note = miss.status if miss and row else ""
     else:
@@ -195,12 +196,12 @@ def _register(
 
 
 def _alarms(at: Position, size: tuple[int, int]) -> list[Text]:
-    """The failures that nobody has acknowledged, the oldest first, as far as there is room for them whole."""
+    """Draw the failures to be acknowledged, the oldest first: as many as fit whole."""
     width, height = size
     most = max(2, (height - 8) // 2)
     lines: list[str] = []
     at.failures_shown = 0
-    failures = list(at.failures)  # a stop that ends meanwhile may bring more
+    failures = list(at.failures)  # a stop that ends meanwhile may add one
     for failure in failures:
         wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
         if lines and len(lines) + len(wrapped) > most - 1:
@@ -240,10 +241,10 @@ def _age(seconds: float | None) -> str:
 
 
 def sparkline(values: Sequence[float | None], width: int, blocks: str = BLOCKS) -> str:
-    """The last `width` values from their smallest to their largest; a gap where one was missed."""
+    """Draw the last `width` values, scaled from their smallest to their largest; None is a gap."""
     values = values[-width:] if width > 0 else []
     there = [value for value in values if value is not None]
     low, high = min(there, default=0.0), max(there, default=0.0)
-    low = min(low, 0.0)  # so that a steady value does not look like rest, nor noise like a swing
+    low = min(low, 0.0)  # else a steady value looks like rest, and noise like a swing
     scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
     return "".join(" " if value is None else blocks[round((value - low) * scale)] for value in values)

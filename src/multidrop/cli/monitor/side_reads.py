@@ -1,11 +1,12 @@
-"""Reads what is not polled of one drive, one register after another, beside the polling."""
+"""Side reads: registers of one drive that are not polled, read between the polls."""
 
 from __future__ import annotations
 
 import threading
 import time
 
-from multidrop.cli.monitor.watched import Watched, told
+from multidrop.cli.support.live_plant import LiveDrive
+from multidrop.cli.support.values import value_text
 from multidrop.errors import BusError
 from multidrop.poller import Poller
 
@@ -13,36 +14,38 @@ SIDE_S = 0.1  # between two reads: the polling keeps nearly all of the line
 
 
 class SideReader:
-    """For as long as the drive is looked at."""
+    """Reads one drive's other registers, one after another, in a thread of its own."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
-        self._drive: Watched | None = None
+        self._drive: LiveDrive | None = None
         self._found: dict[str, str] = {}
         self._thread: threading.Thread | None = None
 
-    def read(self, it: Watched) -> dict[str, str]:
-        """What was found so far; goes on reading."""
-        if self._drive is not it:
-            self._drive, self._found = it, {}
+    def read(self, drive: LiveDrive) -> dict[str, str]:
+        """Return the values found so far, as text by register; go on reading."""
+        if self._drive is not drive:
+            self._drive, self._found = drive, {}
         if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._go_on, args=(it, self._found), daemon=True)
+            self._thread = threading.Thread(target=self._read_all, args=(drive, self._found), daemon=True)
             self._thread.start()
         return self._found
 
     def rest(self) -> None:
+        """Read no further."""
         self._drive = None
 
-    def _go_on(self, it: Watched, found: dict[str, str]) -> None:
-        drive = it.polled.drive
-        polled = {poll.register.name for poll in it.polled.polls}
-        others = [reg for name, reg in drive.registers.items() if reg.readable and name not in polled]
-        bus = self._poller.bus(it.line.name)
-        for register in others:
-            if self._drive is not it:
+    def _read_all(self, chosen: LiveDrive, found: dict[str, str]) -> None:
+        drive = chosen.polled.drive
+        polled = {poll.register.name for poll in chosen.polled.polls}
+        bus = self._poller.bus(chosen.line.name)
+        for name, register in drive.registers.items():
+            if not register.readable or name in polled:
+                continue
+            if self._drive is not chosen:
                 return
             try:
-                found[register.name] = told(register, bus.read(drive, register))
+                found[name] = value_text(register, bus.read(drive, register))
             except BusError as failure:
-                found[register.name] = type(failure).__name__
+                found[name] = type(failure).__name__
             time.sleep(SIDE_S)

@@ -1,12 +1,11 @@
-"""What was predicted of a polled line, beside what became of it."""
+"""The prediction for a polled line beside what was measured."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-from multidrop.cli.plan import shortened
-from multidrop.cli.support.values import aligned
+from multidrop.cli.support.values import aligned, shortened
 from multidrop.planning.prediction import Prediction, predict
 from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
@@ -14,28 +13,26 @@ from multidrop.plant.model import PlantLine
 Figures = dict[str, Any]
 
 
-def compared(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Predictions, with the documents' response delays and with what was measured, and the summary."""
-    told = summary["drives"]
-    known = {
-        polled.drive: told[polled.drive.name]["response_delay_ms"] / 1e3
+def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
+    """Predict a line with the documents' delays and with the measured ones, beside its summary."""
+    drives = summary["drives"]
+    delays = {
+        polled.drive: drives[polled.drive.name]["response_delay_ms"] / 1e3
         for polled in line.drives
-        if told[polled.drive.name]["exchanges_per_second"]  # only those that answer have one
+        if drives[polled.drive.name]["exchanges_per_second"]  # a silent drive has no delay
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    asked_for = any(poll.every is not None for poll in polls)  # then no cycle follows the other
+    is_timed = any(poll.every is not None for poll in polls)  # cycles then do not follow each other
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
-    by_delays = predict(planned_on(line, known), known, summary["switching_ms"] / 1e3)
+    by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {
         "predicted": _figures(predict(planned_on(line), switching=line.switching)),
         "predicted_with_measured_delays": _figures(by_delays),
         "measured": {
-            "cycle_ms": None if asked_for or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
+            "cycle_ms": None if is_timed or not cycles else round(summary["seconds"] / cycles * 1e3, 3),
             "utilisation": summary["utilisation"],
             "switching_ms": summary["switching_ms"],
-            "exchanges_per_second": {
-                name: told["exchanges_per_second"] for name, told in summary["drives"].items()
-            },
+            "exchanges_per_second": {name: drive["exchanges_per_second"] for name, drive in drives.items()},
         },
     }
 
@@ -53,16 +50,16 @@ def _figures(prediction: Prediction) -> Figures:
 
 
 def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
-    """The same as a table."""
+    """Format the comparison as a table."""
     columns = list(found.values())
-    cycles = ("-" if it["cycle_ms"] is None else f"{it['cycle_ms']:.1f} ms" for it in columns)
+    cycles = ("-" if column["cycle_ms"] is None else f"{column['cycle_ms']:.1f} ms" for column in columns)
     rows = [
         ("", "PREDICTED", "BY DELAYS", "MEASURED"),
         ("bus cycle", *cycles),
-        ("utilisation", *(f"{it['utilisation']:.1%}" for it in columns)),
+        ("utilisation", *(f"{column['utilisation']:.1%}" for column in columns)),
     ]
     for name in found["measured"]["exchanges_per_second"]:
-        rates = (f"{it['exchanges_per_second'][name]:.1f}" for it in columns)
+        rates = (f"{column['exchanges_per_second'][name]:.1f}" for column in columns)
         rows.append((f"{shortened(name)}, exchanges/s", *rates))
     yield from (f"  {row}" for row in aligned(rows, "<>>>"))
     yield "  by delays: predicted with the response delays that were measured"

@@ -1,4 +1,4 @@
-"""The arguments that name one drive on a port."""
+"""Arguments that several commands take."""
 
 from __future__ import annotations
 
@@ -8,9 +8,19 @@ from multidrop.drive.family import Drive
 from multidrop.drives.registry import find_model
 
 
+def add_port_argument(parser: argparse.ArgumentParser, nargs: str | None = None) -> None:
+    parser.add_argument(
+        "port", metavar="PORT", nargs=nargs, help="device such as /dev/ttyUSB0, or pyserial URL"
+    )
+
+
+def add_plant_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", help="lines, drives, and what is polled")
+
+
 def add_target_arguments(parser: argparse.ArgumentParser) -> None:
-    """PORT MODEL ADDRESS, and what may differ from the family's defaults."""
-    parser.add_argument("port", metavar="PORT", help="device such as /dev/ttyUSB0, or pyserial URL")
+    """Add PORT MODEL ADDRESS, and options for a drive that differs from the family's defaults."""
+    add_port_argument(parser)
     parser.add_argument("model", metavar="MODEL", help="see `multidrop models`; or file.py:Class")
     parser.add_argument("address", metavar="ADDRESS", type=_address, help="the drive's address on the line")
     parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
@@ -34,7 +44,7 @@ def add_target_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_writing_arguments(parser: argparse.ArgumentParser) -> None:
-    """What every command takes that may write: whether it asks first, and where it is noted."""
+    """Add --yes and --audit, for commands that may write."""
     parser.add_argument("--yes", action="store_true", help="do not ask; needed where no terminal is")
     parser.add_argument("--audit", metavar="FILE", help="append every write and its outcome to this file")
 
@@ -44,7 +54,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def duration(text: str) -> float:
-    """How long, in s."""
+    """Parse a number of seconds above 0."""
     try:
         seconds = float(text)
     except ValueError:
@@ -55,7 +65,7 @@ def duration(text: str) -> float:
 
 
 def drive_of(arguments: argparse.Namespace) -> Drive:
-    """The drive that the arguments name, not yet on a bus; ValueError for what its family does not allow."""
+    """Make the drive that the arguments name. Raises ValueError for what its family does not allow."""
     family = find_model(arguments.model)
     return family(
         arguments.address,

@@ -1,4 +1,4 @@
-"""Asking before a motor may move or a register be written."""
+"""Confirmation before a motor may move or a register is written."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from multidrop.errors import Refused
 from multidrop.printable import printable
 
 
-def ask(question: str, arguments: argparse.Namespace) -> None:
-    """Go on if --yes was given or the person at the terminal says yes; Refused otherwise."""
+def confirm(question: str, arguments: argparse.Namespace) -> None:
+    """Return if --yes was given or the user answers yes on the terminal; raise Refused otherwise."""
     if arguments.yes:
         return
     if not sys.stdin.isatty():

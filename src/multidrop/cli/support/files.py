@@ -1,10 +1,16 @@
-"""A recording is never put in the place of another file, which may hold months of data."""
+"""Files that a command reads or creates. No command replaces a file: it may hold months of data."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.output import warn
 from multidrop.recording.append_file import already_there, new_file
+
+if TYPE_CHECKING:
+    from multidrop.report.load import Recording
 
 
 def refuse_overwriting(path: Path) -> None:
@@ -14,7 +20,7 @@ def refuse_overwriting(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ValueError or OSError when no new file can be written there, which only trying tells."""
+    """Raise ValueError or OSError when no new file can be written there, by creating and removing one."""
     refuse_overwriting(path)
     if path.exists() and not path.is_dir():  # a device or a pipe
         return
@@ -27,3 +33,23 @@ def check_capture(path: Path) -> None:
     if path.suffix != ".pcapng":
         raise ValueError(f"{path}: a capture's name ends in .pcapng")
     refuse_overwriting(path)
+
+
+def warn_truncated(path: Path, rows: int, left_out: int) -> None:
+    """Warn of a recording whose last `left_out` bytes are no whole rows."""
+    if left_out:
+        warn(
+            f"the end of {path} is missing: {rows} rows were read, and its last {left_out} bytes, "
+            "which are no whole rows, were left out"
+        )
+
+
+def load_recording(path: Path, out: Path, command: str) -> Recording:
+    """Load a recording for a command that draws it into the new file `out`."""
+    require_extra("matplotlib", "plot", command)
+    refuse_overwriting(out)
+    from multidrop.report import load
+
+    recording = load(path)
+    warn_truncated(recording.path, recording.rows, recording.truncated)
+    return recording

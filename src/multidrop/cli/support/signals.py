@@ -1,35 +1,51 @@
-"""Ctrl-C and SIGTERM as the way in which polling ends: noted, so that what is under way is finished."""
+"""SIGINT (Ctrl-C) and SIGTERM while a command runs.
+
+Both interrupt a command at once, but for polling and sniffing: there the first one is noted, so that what
+is under way is finished and recorded, and the second one interrupts.
+"""
 
 from __future__ import annotations
 
 import signal
-from types import FrameType, TracebackType
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+@contextmanager
+def handling(handler: Callable[[int, FrameType | None], object], *numbers: signal.Signals) -> Iterator[None]:
+    """Call `handler` for these signals. Only the main thread can: in another one nothing changes."""
+    try:
+        before = {number: signal.signal(number, handler) for number in numbers}
+    except ValueError:
+        before = {}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def sigterm_interrupts() -> AbstractContextManager[None]:
+    """Raise KeyboardInterrupt on SIGTERM too."""
+    return handling(signal.default_int_handler, signal.SIGTERM)
 
 
 class Interruption:
-    """Whether it came while the context lasted; a second one breaks off at once."""
+    """The first signal sets `came`; the second one raises KeyboardInterrupt."""
 
     def __init__(self) -> None:
         self.came = False
-        self._before: dict[signal.Signals, Any] = {}
 
-    def __enter__(self) -> Interruption:
-        self._before = {number: signal.signal(number, self._note) for number in _SIGNALS}
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def note(self, number: int, frame: FrameType | None) -> None:
         if self.came:
             raise KeyboardInterrupt
         self.came = True
+
+
+@contextmanager
+def noting_signals() -> Iterator[Interruption]:
+    """Note the first SIGINT or SIGTERM instead of being interrupted by it."""
+    interruption = Interruption()
+    with handling(interruption.note, signal.SIGINT, signal.SIGTERM):
+        yield interruption

@@ -1,22 +1,24 @@
-"""Registers' values as people read them, in aligned columns, and as JSON."""
+"""Register values as text and as JSON, and text in aligned columns and wrapped lines."""
 
 from __future__ import annotations
 
 import math
-import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from enum import Flag, IntEnum
 from typing import Any, TypeVar
 
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import warn
 from multidrop.drive.register import Register
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
+WIDTH = 80  # characters of a line
+LONGEST_NAME = 24  # keeps tables within a terminal
 
 
 def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
-    """One line a row, its columns as wide as their widest text; `alignment` has < or > for each column."""
+    """Return one line per row with aligned columns; `alignment` has < or > for each column."""
     rows = list(rows)
     widths = [max((len(text) for text in column), default=0) for column in zip(*rows, strict=True)]
     return [
@@ -27,10 +29,26 @@ def aligned(rows: Iterable[Row], alignment: str) -> list[str]:
     ]
 
 
-def taken(register: Register[T], value: T) -> T:
-    """What the register can take of a value, said on stderr where that is another one.
+def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = True) -> list[str]:
+    """Wrap to WIDTH; `first` begins the first line, `rest` the others."""
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=rest,
+        break_long_words=breaks_words,
+        break_on_hyphens=breaks_words,
+    )
 
-    Raises ValueError for what it cannot take at all.
+
+def shortened(name: str) -> str:
+    return name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 3]}..."
+
+
+def nearest_value(register: Register[T], value: T) -> T:
+    """Return the nearest value that the register can hold; warn when it is another one.
+
+    Raises ValueError for a value outside the register's span.
     """
     nearest = register.decode(register.encode(value))
     if nearest != value and not (register.is_float and register.parse(_number(register, nearest)) == value):
@@ -38,17 +56,26 @@ def taken(register: Register[T], value: T) -> T:
         if register.is_float:
             why = "holds single-precision numbers"
         shown = register.format(nearest)
-        say(f"multidrop: {register.name} {why}: {value!r} is taken as {shown}", file=sys.stderr)
+        warn(f"{register.name} {why}: {value!r} is taken as {shown}")
     return nearest
 
 
+def value_text(register: Register[Any], value: float) -> str:
+    """Return a recorded value as text: a name, a raw count, or a number with its unit."""
+    if register.values is not None:
+        return register.format(register.decode(value))
+    if register.step is None:
+        return f"{_number(register, value)} raw"
+    return register.format(value)
+
+
 def _number(register: Register[Any], value: float) -> str:
-    """The shown value without its unit."""
+    """Return the value as text without its unit."""
     return register.format(value).partition(" ")[0]
 
 
 def as_row(register: Register[Any], value: Any) -> Row:
-    """Name, value, and unit or what is to be known about the value."""
+    """Return name, value, and unit or a remark on the value."""
     if isinstance(value, Flag | IntEnum):
         return register.name, register.format(value), ""
     number, _, unit = register.format(value).partition(" ")
@@ -58,7 +85,7 @@ def as_row(register: Register[Any], value: Any) -> Row:
 
 
 def as_json(register: Register[Any], value: Any) -> dict[str, Any]:
-    """`value` is null, and the count is in `raw`, where the scale is not stated."""
+    """Return value and unit, or a name and its raw count. Without a scale, `value` is None."""
     if isinstance(value, Flag):
         return {"value": [member.name for member in value], "raw": value.value}
     if isinstance(value, IntEnum):

@@ -1,4 +1,4 @@
-"""What was sniffed on lines, printed as it comes, counted, and written into a capture."""
+"""Traffic of sniffed lines: printed as it comes, counted, and written into a capture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from multidrop.capture import Capture, CaptureWriter, Pairing, Side, Sniffed
 from multidrop.capture.lookup import RegisterLookup, line_of
 from multidrop.capture.text import ExchangeFormatter
-from multidrop.cli.support.saying import say
+from multidrop.cli.support.output import print_text
 from multidrop.core import FrameSpan, Kind, Splitter, Stream
 from multidrop.plant.model import Plant, PlantLine
 
@@ -23,8 +23,8 @@ _SIDES = {
 }
 
 
-class Ear:
-    """One line that is listened to."""
+class TrafficPrinter:
+    """Prints the exchanges of one line."""
 
     def __init__(
         self, name: str, line: PlantLine | None, *, as_json: bool, out: CaptureWriter | None
@@ -36,44 +36,45 @@ class Ear:
         self._as_json = as_json
         self._out = out
 
-    def hear(self, stream: Stream) -> None:
-        """Print what came of it so far."""
+    def show(self, stream: Stream) -> None:
+        """Print what is complete in the stream so far."""
         spans = list(self._splitter.spans(stream))
         if self._out:
             self._write(spans, self._out)
         self._print(self.pairing.pair(spans))
 
-    def rest(self) -> None:
-        """Nothing more is to be waited for."""
+    def finish(self) -> None:
+        """Print what still waits for a reply: none will come."""
         self._print(self.pairing.flush())
 
     def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
         for span in spans:
             out.write(span.raw, _SIDES[span.kind], span.time_ns, self.name)
 
-    def _print(self, told: Iterable[Sniffed]) -> None:
-        for it in told:
+    def _print(self, traffic: Iterable[Sniffed]) -> None:
+        for sniffed in traffic:
             if self._as_json:
-                say(json.dumps({"line": self.name} | self._formatter.json(it)))
+                print_text(json.dumps({"line": self.name} | self._formatter.json(sniffed)))
             else:
-                say(self._formatter.text(it))
+                print_text(self._formatter.text(sniffed))
         sys.stdout.flush()
 
 
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print all that a capture holds, as if it came now; how much of what that was."""
-    ears: list[Ear] = []
+    """Print all that a capture holds; return how many exchanges and other things it held."""
+    printers: list[TrafficPrinter] = []
     for _ in capture:
-        ears += [
-            Ear(name, line_of(plant, name), as_json=as_json, out=out) for name in capture.lines[len(ears) :]
+        printers += [
+            TrafficPrinter(name, line_of(plant, name), as_json=as_json, out=out)
+            for name in capture.lines[len(printers) :]
         ]
-        for ear, stream in zip(ears, capture.streams, strict=True):
-            ear.hear(stream)
-    for ear in ears:
-        ear.rest()
-    return sum((Counter(ear.pairing.counts()) for ear in ears), Counter())
+        for printer, stream in zip(printers, capture.streams, strict=True):
+            printer.show(stream)
+    for printer in printers:
+        printer.finish()
+    return sum((Counter(printer.pairing.counts()) for printer in printers), Counter())
 
 
 _COUNTED = {  # one, many
@@ -87,7 +88,7 @@ _ALWAYS = ("exchanges", "unknown_bytes")
 
 
 def summary(counts: Mapping[str, int]) -> str:
-    """How much was stream, in words."""
+    """Return the counts in words."""
     return ", ".join(
         f"{counts.get(name, 0)} {words[counts.get(name, 0) != 1]}"
         for name, words in _COUNTED.items()

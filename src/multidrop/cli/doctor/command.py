@@ -1,0 +1,216 @@
+"""The `doctor` command: examines a port, and says what to change."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from multidrop.bus import Bus
+from multidrop.cli.doctor.adapter import find_adapter, low_latency, rs485_mode
+from multidrop.cli.doctor.findings import (
+    ROUNDS,
+    Finding,
+    adapter_finding,
+    echo_finding,
+    latency_finding,
+    low_latency_finding,
+    round_trip_finding,
+    rs485_finding,
+)
+from multidrop.cli.support.arguments import add_json_argument, add_port_argument
+from multidrop.cli.support.output import print_text
+from multidrop.cli.support.values import wrapped
+from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request
+from multidrop.drive.family import Drive
+from multidrop.drive.timing import Settings
+from multidrop.drives.registry import find_model
+from multidrop.errors import LineError
+from multidrop.planning.blocks import blocks
+from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
+from multidrop.transport.line import Line
+from multidrop.transport.port_identity import is_pseudo_terminal
+
+MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
+LOOK_S = 0.05  # between attempts to send a request that was held back
+NOBODY = 247  # the address of the request that looks for an echo
+SETTING_UP = (
+    "while it has the port, multidrop locks it against programs that heed such locks, makes it raw, sets "
+    "each drive's baud rate and format, reads them back, and asks the driver for low latency"
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_port_argument(parser)
+    parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
+    parser.add_argument("--address", type=int, metavar="N", help="its address")
+    parser.add_argument(
+        "--baudrate", type=int, metavar="N", help="of the line; the family's default, or 9600, without it"
+    )
+    parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits; the same, or 8N1")
+    parser.add_argument("--framing", metavar="rtu", help="of the drive, where the family has several")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    drive = _drive(arguments)
+    settings = drive.settings if drive else _line_settings(arguments)
+    findings = list(_findings(arguments.port, drive, settings))
+    if arguments.json:
+        records = [asdict(finding) for finding in findings]
+        print_text(json.dumps({"port": arguments.port, "findings": records}, indent=2))
+    else:
+        print_text("\n".join(_text(findings)))
+    return 1 if any(finding.is_failure for finding in findings) else 0
+
+
+def _drive(arguments: argparse.Namespace) -> Drive | None:
+    if (arguments.model is None) != (arguments.address is None):
+        raise ValueError("--model and --address belong together: both name the drive to measure with")
+    if arguments.model is None:
+        if arguments.framing is not None:
+            raise ValueError("--framing is how a drive is asked: name the drive with --model and --address")
+        return None
+    return find_model(arguments.model)(
+        arguments.address, framing=arguments.framing, baudrate=arguments.baudrate, format=arguments.format
+    )
+
+
+def _line_settings(arguments: argparse.Namespace) -> Settings:
+    """Return the settings to look for an echo with, where no drive is named."""
+    return Settings(
+        9600 if arguments.baudrate is None else arguments.baudrate,
+        "8N1" if arguments.format is None else arguments.format,
+    )
+
+
+def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Finding]:
+    if "://" in port:
+        yield from _remote(port)
+    else:
+        yield from _local(port)
+    yield _echo(port, settings)
+    yield _round_trip(port, drive)
+
+
+# ---- the port ----
+
+
+def _remote(port: str) -> Iterator[Finding]:
+    kind = port.partition("://")[0]
+    if kind == "socket":
+        yield Finding("port", f"{port} is a TCP connection; small packets are sent at once (TCP_NODELAY)")
+    else:
+        yield Finding("port", f"{port} is a pyserial {kind} port, which is copied to by two threads")
+    yield Finding(
+        "adapter",
+        "it is at the far end: its driver, latency timer and RS-485 mode cannot be seen from here",
+        "set baud rate, format and the shortest packing delay in the serial server itself",
+    )
+
+
+def _local(port: str) -> Iterator[Finding]:
+    line = Line(port)  # raises LineError, with the reason, when it cannot be opened
+    try:
+        yield from _opened(port, str(Path(port).resolve()))
+    finally:
+        line.close()
+
+
+def _opened(port: str, device: str) -> Iterator[Finding]:
+    """Examine a port that multidrop has open."""
+    link = f", which is {device}" if device != port else ""
+    if is_pseudo_terminal(device):
+        yield Finding("port", f"{port} is a pseudo-terminal{link}: a program is at its other end")
+        yield Finding("set here", SETTING_UP)
+        yield Finding(
+            "adapter", "there is none, and so no driver, latency timer, RS-485 mode or low-latency flag"
+        )
+        return
+    yield Finding("port", f"{port} is a serial port{link}")
+    yield Finding("set here", SETTING_UP)
+    adapter = find_adapter(device)
+    yield adapter_finding(adapter)
+    fd = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        yield low_latency_finding(low_latency(fd))
+        yield latency_finding(adapter)
+        yield rs485_finding(rs485_mode(fd))
+    finally:
+        os.close(fd)
+
+
+# ---- the line ----
+
+
+def _echo(port: str, settings: Settings) -> Finding:
+    """Read from an address that nobody should have: only the request itself may come back."""
+    request = Message(NOBODY, 0x03, 0, 1)
+    peer = Peer(least_timeout=4 * LEAST_TIMEOUT, most_timeout=4 * LEAST_TIMEOUT)
+    probe = Exchange(
+        Framing.RTU,
+        request,
+        peer,
+        baudrate=settings.baudrate,
+        format=settings.format,
+        character=settings.character,
+        silence=max(settings.t3_5, LEAST_TIMEOUT),
+    )
+    line = Line(port)
+    try:
+        found = line.carry_out(probe)
+    except LineError as failure:
+        return Finding("echo", f"not tried: {failure.reason}")
+    finally:
+        line.close()
+    return echo_finding(found, build_request(Framing.RTU, request), settings)
+
+
+def _round_trip(port: str, drive: Drive | None) -> Finding:
+    if drive is None:
+        return Finding(
+            "round trip",
+            "not measured: a drive must answer",
+            "name one with --model and --address; `multidrop scan` finds those that are there",
+        )
+    register = next(iter(drive.readings()))
+    (block,) = blocks(drive, [register])
+    with Bus(port) as bus:
+        bus.attach(drive)
+        poll = make_exchange(drive, block.request, bus.peer(drive))
+        completions = list(_repeat(bus.line, poll))
+    # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
+    wire = (len(build_request(drive.framing, poll.request)) + 1) * drive.settings.character
+    shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
+    seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
+    delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
+    return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
+
+
+def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
+    """Send ROUNDS requests, or those that fit into MOST_S, and return what became of each.
+
+    A request that is held back, because an earlier answer may still come, does not count.
+    """
+    end = time.monotonic() + MOST_S
+    count = 0
+    while count < ROUNDS and (time.monotonic() < end or not count):
+        found = line.carry_out(poll)
+        if found.sent_ns:
+            count += 1
+            yield found
+        else:
+            time.sleep(LOOK_S)
+
+
+def _text(findings: list[Finding]) -> Iterator[str]:
+    width = max(len(finding.topic) for finding in findings) + 2
+    for finding in findings:
+        yield from wrapped(finding.what, f"{finding.topic:<{width}}", " " * width)
+        if finding.advice:  # may hold a command to be copied
+            indent = " " * width
+            yield from wrapped(finding.advice, f"{indent}-> ", f"{indent}   ", breaks_words=False)

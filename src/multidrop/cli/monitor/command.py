@@ -1,0 +1,282 @@
+"""The `monitor` command: polls, draws and obeys keys. Its keys stop motors, and none starts one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import partial
+from logging import WARNING
+from os import get_terminal_size
+from pathlib import Path
+from typing import Any
+
+from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
+from multidrop.cli.monitor.side_reads import SideReader
+from multidrop.cli.support.arguments import add_plant_argument
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.live_plant import LiveDrive, LivePlant
+from multidrop.cli.support.output import logging_to, warn
+from multidrop.cli.support.polling import PollingSession, polling_session
+from multidrop.control.outcome import Seen
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
+
+DRAW_S = 0.25
+SCROLL_S = 2.0  # between two pictures that scroll
+PAGE = 10  # lines
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_plant_argument(parser)
+    parser.add_argument("--out", metavar="FILE", type=Path, help="record what is polled as well")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    require_extra("rich", "monitor", "monitor")
+    if not is_possible():
+        raise ValueError("`multidrop monitor` needs a terminal; `multidrop poll` works without one")
+    if arguments.out:
+        refuse_overwriting(arguments.out)
+    summary = watch(load_plant(arguments.plant), out=arguments.out)
+    return 0 if summary["samples"] else 1
+
+
+def is_possible() -> bool:
+    """Tell whether there is a terminal to draw on and to read keys from."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def watch(plant: Plant, *, out: Path | None = None, seconds: float | None = None) -> dict[str, Any]:
+    """Poll the plant and show it until the user leaves or `seconds` are over; return the poller's summary."""
+    console = _console()
+    live = LivePlant(plant)
+    with polling_session(plant, out, live.add) as session:
+        with session.poller:
+            monitor = Monitor(live, session, console)
+            monitor.show(seconds)
+            for sentence in monitor.left_open():
+                warn(sentence)
+        session.hand_out()  # what came while the poller closed
+    return session.poller.summary()
+
+
+def _console() -> Any:
+    """Return the terminal. Raises ValueError when it is too small."""
+    from rich.console import Console
+
+    from multidrop.cli.monitor.screen import LEAST_HEIGHT, LEAST_WIDTH
+
+    console = Console()
+    if console.is_dumb_terminal:
+        width, height = get_terminal_size()
+        console = Console(width=width, height=height - 1)  # it scrolls, and its last line stays empty
+    if console.width < LEAST_WIDTH or console.height < LEAST_HEIGHT:
+        raise ValueError(
+            f"the terminal is too small: it has {console.width} x {console.height} characters, "
+            f"and the monitor needs {LEAST_WIDTH} x {LEAST_HEIGHT}"
+        )
+    return console
+
+
+class Monitor:
+    """The screen of a polled plant: draws what has come, and carries out what keys ask for."""
+
+    def __init__(self, plant: LivePlant, session: PollingSession, console: Any) -> None:
+        from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position
+
+        self._console = console
+        self._session = session
+        self._plant = plant
+        self._at = Position()
+        self._on_yes: Callable[[], None] | None = None  # done when the question is answered with y
+        self._stops: list[threading.Thread] = []  # under way, or done
+        self._stop_results: dict[str, str] = {}  # of the last stop of all drives, by line
+        self._has_left = False
+        self._side_reader = SideReader(session.poller)
+        self._blocks = BLOCKS if "utf" in console.encoding else PLAIN_BLOCKS
+
+    def show(self, seconds: float | None) -> None:
+        """Draw and obey keys until the user leaves, a signal comes, or `seconds` are over."""
+        begun = next_draw = next_tick = time.monotonic()
+        # Warnings on standard error would spoil the screen.
+        with (
+            self._drawing() as (draw, every),
+            keys() as wait_for_key,
+            logging_to(self._show_message, "multidrop", WARNING),
+        ):
+            while not self._session.interruption.came and not self._has_left:
+                now = time.monotonic()
+                if seconds is not None and now - begun >= seconds:
+                    return
+                if now >= next_tick:
+                    next_tick += 1.0
+                    self._session.hand_out()
+                    self._plant.tick(now, self._session.poller.statistics())
+                if now >= next_draw:
+                    next_draw = max(next_draw + every, now)
+                    self._session.hand_out()
+                    draw(self._picture())
+                key = wait_for_key(max(0.0, min(next_draw, next_tick) - time.monotonic()))
+                if key:
+                    self._obey(key)
+                    next_draw = 0.0
+
+    def _show_message(self, text: str) -> None:
+        self._at.message = text
+
+    def left_open(self) -> Iterator[str]:
+        """Return the failures that were not acknowledged, and a warning if a stop is under way."""
+        yield from self._at.failures
+        if self._is_stopping:
+            yield "a stop was under way and is not waited for: look at the motors"
+
+    @property
+    def _is_stopping(self) -> bool:
+        return any(thread.is_alive() for thread in self._stops)
+
+    @contextmanager
+    def _drawing(self) -> Iterator[tuple[Callable[[Any], None], float]]:
+        """Give a function that draws a picture, and the seconds between two pictures.
+
+        On a terminal without cursor control each picture is printed below the last one.
+        """
+        if self._console.is_dumb_terminal:
+            yield self._console.print, SCROLL_S
+            return
+        from rich.control import Control
+
+        with self._console.screen(hide_cursor=True) as screen:
+
+            def draw(picture: Any) -> None:
+                self._console.control(Control.home())  # else rich draws below the last picture
+                screen.update(picture)
+
+            yield draw, DRAW_S
+
+    def _picture(self) -> Any:
+        from rich.text import Text
+
+        from multidrop.cli.monitor.screen import overview, page
+
+        size = self._console.width, self._console.height
+        now_ns = time.time_ns()
+        if self._at.page:
+            others = self._side_reader.read(self._chosen)
+            lines = page(self._chosen, others, self._at, size, now_ns)
+        else:
+            lines = overview(self._plant, self._at, size, now_ns, self._blocks)
+        return Text("\n", no_wrap=True, end="").join(lines)
+
+    @property
+    def _chosen(self) -> LiveDrive:
+        return self._plant.drives[self._at.chosen]
+
+    # ---- keys ----
+
+    def _obey(self, key: str) -> None:
+        if self._on_yes:
+            on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
+            if key == "y":
+                on_yes()
+            else:
+                self._at.message = "nothing was sent"
+            return
+        self._at.message = ""
+        actions: dict[str, Callable[[], None]] = {
+            UP: lambda: self._move(-1),
+            DOWN: lambda: self._move(1),
+            PAGE_UP: lambda: self._scroll(-PAGE),
+            PAGE_DOWN: lambda: self._scroll(PAGE),
+            ENTER: self._turn_page,
+            ESCAPE: self._leave_page,
+            "s": self._ask_to_stop,
+            "S": self._ask_to_stop_all,
+            "a": self._acknowledge,
+            "q": self._leave,
+        }
+        if key in actions:
+            actions[key]()
+
+    def _move(self, by: int) -> None:
+        self._at.chosen = max(0, min(self._at.chosen + by, len(self._plant.drives) - 1))
+        self._at.scrolled = 0
+
+    def _scroll(self, by: int) -> None:
+        if self._at.page:
+            self._at.scrolled = max(0, self._at.scrolled + by)
+        else:
+            self._move(by)
+
+    def _turn_page(self) -> None:
+        self._at.page = not self._at.page
+        self._at.scrolled = 0
+        if not self._at.page:
+            self._side_reader.rest()
+
+    def _leave_page(self) -> None:
+        if self._at.page:
+            self._turn_page()
+
+    def _acknowledge(self) -> None:
+        """Drop the failures that were shown; those that had no room are shown next."""
+        del self._at.failures[: self._at.failures_shown]
+
+    def _leave(self) -> None:
+        if not self._is_stopping:
+            self._has_left = True
+            return
+        self._at.question = "A stop is under way. Leave all the same? y leaves, any other key does not"
+        self._on_yes = self._leave_now
+
+    def _leave_now(self) -> None:
+        self._has_left = True
+
+    def _ask_to_stop(self) -> None:
+        chosen = self._chosen
+        self._at.question = f"Stop {chosen.name}? y stops it, any other key does not"
+        self._on_yes = lambda: self._in_background(f"stopping {chosen.name}", lambda: self._stop(chosen))
+
+    def _ask_to_stop_all(self) -> None:
+        count = len(self._plant.drives)
+        self._at.question = f"Stop ALL {count} drives? y stops them, any other key does not"
+        self._on_yes = self._stop_lines
+
+    def _stop_lines(self) -> None:
+        """Stop all lines at the same time: none waits for another's ramps."""
+        self._stop_results = {}
+        for line in self._plant.plant.lines:
+            self._in_background(f"stopping all drives on {line.name}", partial(self._stop_all, line.name))
+
+    def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
+        """Carry out a stop in a thread: it waits until the motor stands."""
+        self._at.message = what
+        thread = threading.Thread(target=self._carry_out, args=(what, work), daemon=True)
+        self._stops = [*filter(threading.Thread.is_alive, self._stops), thread]
+        thread.start()
+
+    def _carry_out(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
+        """Carry out a stop; its failures stay on the screen until they are acknowledged."""
+        try:
+            self._at.message, failures = work()
+        except Exception as failure:  # any failure of a stop must be seen
+            failures = [f"{what} failed: {str(failure) or type(failure).__name__}"]
+        clock = datetime.now(UTC)
+        self._at.failures += [f"{clock:%H:%M:%S} {failure}" for failure in failures]
+
+    def _stop(self, chosen: LiveDrive) -> tuple[str, list[str]]:
+        chosen.polled.drive.stop()
+        return f"{chosen.name} has stopped", []
+
+    def _stop_all(self, line: str) -> tuple[str, list[str]]:
+        stopped = self._session.poller.bus(line).stop_all().values()
+        doubtful = [str(stop) for stop in stopped if stop.seen is not Seen.STOPPED]
+        self._stop_results[line] = (
+            f"{len(stopped) - len(doubtful)} of {len(stopped)} drives on {line} have stopped"
+        )
+        return "; ".join(self._stop_results.values()), doubtful

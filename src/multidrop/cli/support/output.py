@@ -1,0 +1,45 @@
+"""Output on stdout and stderr, with control characters in names, ports and paths spelt out."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from multidrop.printable import printable
+
+
+def print_text(text: object, *, file: TextIO | None = None, flush: bool = False) -> None:
+    """Print the text. Only \\n ends a line."""
+    print("\n".join(map(printable, str(text).split("\n"))), file=file, flush=flush)
+
+
+def warn(sentences: str) -> None:
+    """Print each line on stderr, after the program's name."""
+    for sentence in sentences.splitlines():
+        print(f"multidrop: {printable(sentence)}", file=sys.stderr)
+
+
+class _Handler(logging.Handler):
+    def __init__(self, show: Callable[[str], object], level: int) -> None:
+        super().__init__(level)
+        self._show = show
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._show(record.getMessage())
+
+
+@contextmanager
+def logging_to(show: Callable[[str], object], logger_name: str, level: int) -> Iterator[None]:
+    """Hand the messages of this logger, from this level on, to `show`."""
+    logger, handler = logging.getLogger(logger_name), _Handler(show, level)
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
