@@ -2,6 +2,8 @@
 
 import os
 import signal
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -41,10 +43,18 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exchanges, "Peer", peer)
 
 
+@pytest.fixture(scope="session")
+def _states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return directories, each a new one; pytest's own numbering takes as long as a small test."""
+    whole = tmp_path_factory.mktemp("states")
+    return (whole / str(number) for number in count())
+
+
 @pytest.fixture(autouse=True)
-def _own_state(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    state: Path = tmp_path_factory.mktemp("state")
-    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+def _own_state(_states: Iterator[Path]) -> None:
+    state = next(_states)
+    state.mkdir()
+    os.environ["XDG_STATE_HOME"] = str(state)
 
 
 @pytest.fixture

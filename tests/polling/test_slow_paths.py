@@ -11,6 +11,7 @@ from random import Random
 from typing import Any, cast
 
 import pytest
+from examples import usually
 from lines import proof
 from motors import MAKE, Heard
 from stories import Story
@@ -99,11 +100,6 @@ class Path(Story):
             tail = self.run(tail_s)
         self.judge_values()
         return {row.drive for row in tail if row.value is not None}
-
-
-def usually(tried: object, *others: object) -> list[Any]:
-    """The one that is always tried, and those that take long."""
-    return [tried, *(pytest.param(other, marks=pytest.mark.long) for other in others)]
 
 
 PATHS = [
