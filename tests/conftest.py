@@ -2,8 +2,9 @@
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,36 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def pytest_xdist_auto_num_workers() -> int:
     """Twice as many as there are processors, because half of the tests wait for a line; 2 to 8."""
     return min(2 * len(os.sched_getaffinity(0)), 8)
+
+
+@pytest.hookimpl(trylast=True)  # when what is not wanted has been left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Deal the slow tests out, so that every worker begins with its share of them."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    others = iter([item for item in items if not item.get_closest_marker("slow")])
+    dealt: list[pytest.Item] = []
+    for worker in range(workers):
+        share = (len(items) - len(dealt)) // (workers - worker)  # as --dist worksteal gives them out
+        begins = slow[worker::workers]
+        dealt += [*begins, *islice(others, max(0, share - len(begins)))]
+    items[:] = [*dealt, *others]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Count no lines in stories, to note which takes minutes more, nor where a full disk is tried."""
+    coverage = sys.modules.get("coverage")
+    counting = coverage.Coverage.current() if coverage else None
+    if counting is None or not (item.get_closest_marker("story") or item.get_closest_marker("uncounted")):
+        return (yield)
+    kept = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("COVERAGE_PROCESS_")}
+    counting.stop()
+    try:
+        return (yield)
+    finally:
+        counting.start()
+        os.environ.update(kept)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

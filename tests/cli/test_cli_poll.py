@@ -178,6 +178,7 @@ def test_a_place_that_takes_no_recording_is_a_sentence(
     assert (done.returncode, done.stderr) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
 
 
+@pytest.mark.uncounted
 def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
     plant: Path, tmp_path: Path
 ) -> None:

@@ -104,9 +104,13 @@ def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_
     assert is_harmless(out + err)
 
 
+# a label that is hidden, mathematics, a format and a terminal's command
+ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
+
+
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize(
-    "name", usually(f"$x^{{${TRAP}", "_hidden", "$", "a$b$c", "\\frac", "%s{0}", "$x^{$", TRAP)
+    "name", usually(ALL_AT_ONCE, "_hidden", "$", "$x^{$", "a$b$c", "\\frac", "%s{0}", TRAP)
 )
 def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
     rows = [
