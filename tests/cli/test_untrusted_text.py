@@ -84,6 +84,7 @@ def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object
     assert is_harmless(out + err)
 
 
+@pytest.mark.slow
 def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_path: Path) -> None:
     rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(10)]
     rows.append(row(3, TRAP, TRAP, None, TRAP))
@@ -108,6 +109,7 @@ def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_
 ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize(
     "name", usually(ALL_AT_ONCE, "_hidden", "$", "$x^{$", "a$b$c", "\\frac", "%s{0}", TRAP)

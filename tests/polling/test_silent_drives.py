@@ -60,6 +60,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
             back |= {row.drive for row in world.run(0.5) if row.value is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead"), usually((16, 5), (16, 1), (31, 10)))
 @pytest.mark.parametrize("every", [None, 0.5], ids=["in turn", "at a rate"])

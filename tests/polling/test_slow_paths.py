@@ -127,6 +127,7 @@ def test_a_slow_path_costs_time_and_no_truth(
     assert answering == {drive.name for drive in story.drives}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("longest", STALLS)
 @pytest.mark.parametrize("name", FEW)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:

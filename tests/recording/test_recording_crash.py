@@ -140,6 +140,7 @@ for at in count():
 """
 
 
+@pytest.mark.slow
 @growing
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
@@ -422,6 +423,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
             open_reader(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None:
     """Some bytes are overwritten: it is read with other values, cut short, or refused; never a crash."""

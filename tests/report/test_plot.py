@@ -98,6 +98,7 @@ def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
     with open_writer(tmp_path / "it.arrows", METADATA) as writer:
         writer.write(example())
@@ -445,6 +446,7 @@ def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
     assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
 
 
+@pytest.mark.slow
 def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))
@@ -538,6 +540,7 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
             yield whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
 def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
     """All parts of it are read before a picture is drawn."""

@@ -16,7 +16,7 @@ from multidrop.cli.monitor import is_possible, watch
 from multidrop.cli.poll import add_polling_arguments, conclude, follow
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.drives import MODELS
-from multidrop.errors import BadReply, NoReply, NotDone, Unconfirmed
+from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.recording import open_reader
@@ -85,7 +85,7 @@ def _start_motors(line: PlantLine) -> None:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
             # On a busy machine the simulated drive is too late: the demo shows whether its motor turns.
-            with suppress(BadReply, NoReply, NotDone, Unconfirmed):
+            with suppress(BadReply, Expired, NoReply, NotDone, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
 
