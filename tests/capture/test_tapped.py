@@ -150,6 +150,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
     return Mixed(drives, capture, *captured(capture, real_wires, drives, Counter(ok=100)))
 
 
+@pytest.mark.slow
 def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
     check(mixed.rows, mixed.decoded)
     samples = {row.drive for row in mixed.decoded if row.value is not None}
@@ -196,6 +197,7 @@ def epoch(time_ns: int) -> str:
     return f"{time_ns // 10**9}.{time_ns % 10**9:09}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from commands import TOY, Run
-from lines import Faulty, until
+from lines import Faulty, patient, until
 from motors import Heard
 from toy import Status, Toy
 
@@ -364,6 +364,7 @@ def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
     return loses
 
 
+@patient
 def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
     run: Run, che: tuple[Heard, list[object]]
 ) -> None:
@@ -376,6 +377,7 @@ def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
     assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
 
 
+@patient
 def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard, list[object]]) -> None:
     heard, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
 from peers import require_module
 from raw_client import opened, receive
 from sniffing import sniffing
@@ -57,7 +58,7 @@ def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Call
     def master(port: str, chance: random.Random) -> Iterator[Said]:
         client = require_module("pymodbus.client")
         kind = require_module("pymodbus").FramerType(framer)
-        with client.ModbusSerialClient(port, framer=kind, baudrate=BAUDRATE, timeout=5) as it:
+        with client.ModbusSerialClient(port, framer=kind, baudrate=BAUDRATE, timeout=60) as it:
             for _ in range(TURN):
                 if chance.random() < 0.6:
                     start = chance.choice(starts)
@@ -111,6 +112,7 @@ def told_as_said(told: dict[str, Any]) -> Said:
     return told["address"], told["function"], values
 
 
+@pytest.mark.slow
 def test_every_exchange_of_a_mixed_line_is_heard() -> None:
     said, told = mastered()
     assert [told_as_said(it) for it in told[:-1]] == said
@@ -167,6 +169,7 @@ def frames(pair: tuple[FrameSpan, ...]) -> tuple[str, ...]:
     return tuple(span.raw.hex(" ").upper() for span in pair)
 
 
+@pytest.mark.slow
 def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
     damage = Damage()
     said, told = mastered(damage)

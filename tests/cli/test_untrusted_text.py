@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from captures import write
 from commands import Run
+from examples import usually
 from frames import PRINTED
 from recordings import record, row
 from terminals import MULTIDROP
@@ -83,6 +84,7 @@ def test_arguments_are_told_without_their_commands(run: Run, words: tuple[object
     assert is_harmless(out + err)
 
 
+@pytest.mark.slow
 def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_path: Path) -> None:
     rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(10)]
     rows.append(row(3, TRAP, TRAP, None, TRAP))
@@ -103,8 +105,15 @@ def test_the_names_in_a_recording_are_told_without_their_commands(run: Run, tmp_
     assert is_harmless(out + err)
 
 
+# a label that is hidden, mathematics, a format and a terminal's command
+ALL_AT_ONCE = rf"_$x^{{$\frac%s{{0}}{TRAP}"
+
+
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")
-@pytest.mark.parametrize("name", ["$x^{$", "_hidden", "$", "a$b$c", "\\frac", "%s{0}", TRAP])
+@pytest.mark.parametrize(
+    "name", usually(ALL_AT_ONCE, "_hidden", "$", "$x^{$", "a$b$c", "\\frac", "%s{0}", TRAP)
+)
 def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path, name: str) -> None:
     rows = [
         row(at, name, register, at) for at in range(3) for register in (name, "output_frequency", "fault")

@@ -97,6 +97,7 @@ def value(address: int, at: int) -> int:
     return 1000 * address + 100 * at + 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
     drives: dict[str, Drive] = {

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motors import MAKE, STARTS
@@ -160,7 +161,7 @@ def values(register: Register[Any]) -> st.SearchStrategy[Any]:
 
 @pytest.mark.parametrize("model", MAKE)
 @settings(
-    max_examples=100,
+    max_examples=examples(100),
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

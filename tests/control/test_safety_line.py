@@ -53,6 +53,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
         assert sim.motor.energised  # it did happen, and the caller was told that it may have
 
 
+@pytest.mark.slow
 @every_family
 @pytest.mark.parametrize("lost", [2, 3, 7])
 def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
@@ -126,6 +127,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not sim.motor.energised
 
 
+@pytest.mark.slow
 def test_a_power_cycle_in_mid_ramp() -> None:
     """The drive has forgotten its setpoint: it stays off, and the next start says so."""
     with line(YD1000(1)) as (drive, sim, heard):

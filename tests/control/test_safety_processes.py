@@ -24,8 +24,11 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 CLIENT = """
 import sys, time
 from multidrop import Bus, InvtCHE
-with Bus(sys.argv[1]) as bus:
-    pump = bus.attach(InvtCHE(1, maximum_frequency=50))
+class Pump(InvtCHE):  # is waited for however busy the machine is
+    response_timeout = 60.0
+    response_delay = 15.0
+with Bus(sys.argv[1], expiry=60) as bus:
+    pump = bus.attach(Pump(1, maximum_frequency=50))
     pump.set_frequency(20)
     pump.start()
     if sys.argv[2] == "stop":

@@ -346,6 +346,7 @@ class Stops(RuleBasedStateMachine):
         self._stack.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_moves_after_a_stop(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})

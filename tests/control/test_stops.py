@@ -102,7 +102,7 @@ class Meanwhile:
             self.has_come = True
             thread = threading.Thread(target=self._run)
             thread.start()
-            thread.join(30)
+            thread.join(120)
             assert not thread.is_alive()
         return completion
 
@@ -795,7 +795,7 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes: list[str] = []
 
     def attach(address: int) -> None:
-        together.wait(30)
+        together.wait(120)
         try:
             hall.attach(InvtCHE(address))
             outcomes.append("attached")
@@ -808,7 +808,7 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(30)
+            thread.join(120)
         assert sorted(outcomes) == ["attached"] * 4 + ["taken"] * 4
         assert sorted(drive.address for drive in hall.bus.drives) == [1, 2, 3, 4]
         for drive in hall.bus.drives:

@@ -46,6 +46,7 @@ def line(model: str) -> Iterator[tuple[Bus, Any, Heard, Delayed]]:
         yield bus, bus.attach(drive), heard, wire
 
 
+@pytest.mark.slow
 @every_family
 def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
     """Each answer comes after the next question: the look before the stop has another's."""

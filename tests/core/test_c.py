@@ -7,11 +7,13 @@ import pytest
 from c_programs import build_and_run
 
 
+@pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
     core = ("checksum", "frame", "reason", "tap", "line", "late", "delay", "counters", "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
 
+@pytest.mark.slow
 def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
     build_and_run(tmp_path / "test_row_queue", "row_queue", "columns", "frame", "checksum", "reason")
 

@@ -463,7 +463,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
     def answer(request: Message) -> bytes:
         heard.append(request.start)
         if len(heard) == 1:
-            go_on.wait(30)
+            go_on.wait(120)
         return build_reply(Framing.RTU, request) if request.function == 6 else echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
@@ -485,7 +485,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
             time.sleep(0.05)
         go_on.set()
         for thread in threads:
-            thread.join(30)
+            thread.join(120)
     assert heard == [0, 98, 99, 1, 51, 52]
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
@@ -522,12 +522,12 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
 
     threads = [threading.Thread(target=carry_out, args=[it]) for it in exchanges]
     threads[0].start()
-    assert came.wait(30)
+    assert came.wait(120)
     threads[1].start()
     time.sleep(0.05)  # it waits behind the other
     port.stop()
     for thread in threads:
-        thread.join(30)
+        thread.join(120)
     port.close()
     assert [it.result for it in found] == [Failure.LINE_LOST] * 2
     assert sorted(it.sent_ns > 0 for it in found) == [False, True]

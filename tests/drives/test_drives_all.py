@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -187,7 +188,7 @@ def test_an_unknown_scale_is_not_written(family: type[Drive], register: Register
 
 
 @registers(lambda it: not it.values)
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(data=st.data())
 def test_a_raw_count_survives_its_value(
     family: type[Drive], register: Register[Any], data: st.DataObject
@@ -206,7 +207,7 @@ def test_a_raw_count_survives_its_value(
 
 
 @registers(lambda it: it.writable)
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(data=st.data())
 def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
     """Written in any framing, taken by the drive as it stands in the frame, and read back."""
@@ -251,7 +252,7 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
 
 
 @registers(lambda it: it.values is None and it.writable)
-@settings(max_examples=10)
+@settings(max_examples=examples(10))
 @given(data=st.data())
 def test_what_is_shown_can_be_typed(
     family: type[Drive], register: Register[Any], data: st.DataObject

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from itertools import permutations
 
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -148,7 +149,7 @@ def span(register: Register[float]) -> range:
     return range(register.address, register.address + register.words)
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     st.dictionaries(st.integers(0, 17).map(lambda half: 2 * half), st.booleans(), min_size=1, max_size=7),
     st.sampled_from([1200, 9600, 38400, 115200]),
@@ -192,7 +193,7 @@ class Scattered(Drive):
     r0, r1, r2, r3, r4, r5, r6, r7, r8, r9 = (reading(address) for address in addresses_of)
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(
     st.sets(st.sampled_from(list(Scattered.registers.values())), min_size=1, max_size=8),
     st.sampled_from([1200, 9600, 38400, 115200]),
@@ -253,7 +254,7 @@ FORBIDDEN = {  # addresses of which the documents do not say that they can be re
 }
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(st.data())
 def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
     model = data.draw(st.sampled_from(sorted(MODELS)))
@@ -304,7 +305,7 @@ def companies(draw: st.DrawFn) -> list[Drive]:
     ]
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(companies())
 def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
     order = in_order(drives)

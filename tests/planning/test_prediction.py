@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_driver import LineDriver
@@ -159,7 +160,7 @@ def carried_out(exchanges: Sequence[Planned]) -> float:
     return (begun[2] - begun[1]) / 1e9
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     st.lists(
         st.tuples(st.sampled_from(sorted(MODELS)), st.integers(0, 2), st.integers(1, 6)),
@@ -179,8 +180,9 @@ def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, i
 PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 
 
+@pytest.mark.slow
 @pytest.mark.story
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
 def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | None]]) -> None:
     """What is reached, each exchange with its own characters and delay alone, fits into a second."""

@@ -6,6 +6,7 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
+from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
@@ -224,7 +225,7 @@ def test_all_silent_drives_together_cost_their_share() -> None:
 
 
 @pytest.mark.story
-@pytest.mark.parametrize("dead", [1, 5, 10])
+@pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
 def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int | None) -> None:
     """Of 31, once it is known: the others keep 97 % of the rate that they have without them."""
@@ -603,7 +604,7 @@ class Operation(RuleBasedStateMachine):
 
 
 TestOperation = Operation.TestCase
-TestOperation.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
+TestOperation.settings = settings(max_examples=examples(100), stateful_step_count=30, deadline=None)
 
 
 # ---- jobs that leave ----

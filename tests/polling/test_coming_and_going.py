@@ -50,6 +50,7 @@ class Seen:
         return self.values.get(name, [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [None, 0.02])
 def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, every: float | None) -> None:
     second = pump(2, every=every)
@@ -151,24 +152,25 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
 
         def slow(*arguments: object) -> object:
             begun.set()
-            assert go_on.wait(30)
+            assert go_on.wait(120)
             return step(*arguments)
 
         monkeypatch.setattr(bus._stopper, "_do", slow)
         stopping = threading.Thread(target=bus.stop_all)
         stopping.start()
-        assert begun.wait(30)
+        assert begun.wait(120)
         leaving = threading.Thread(target=bus.detach, args=(ours,))
         leaving.start()
         leaving.join(0.05)
         assert leaving.is_alive()
         assert bus.drives == [ours]
         go_on.set()
-        stopping.join(30)
-        leaving.join(30)
+        stopping.join(120)
+        leaving.join(120)
         assert bus.drives == []
 
 
+@pytest.mark.slow
 def test_many_threads_do_all_of_it_at_once() -> None:
     """The program that does so with 64 lines for ten minutes, for a short while."""
     program = [

@@ -6,6 +6,7 @@ import random
 from collections import Counter
 from typing import Any
 
+import pytest
 from lines import LateWire, line, plant, polled, proofs, rows_of, served
 from variants import LATEST, REASONS, fast_drives, real_drives, real_wires
 
@@ -69,6 +70,7 @@ def test_values_tell_all_registers_apart() -> None:
         assert max(raws.values()) == 1
 
 
+@pytest.mark.slow
 def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
     drives = []
     for drive in real_drives():
@@ -85,6 +87,7 @@ def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
     assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
 
 
+@pytest.mark.slow
 def test_late_lost_and_doubled_replies_are_never_taken_for_others() -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
     with served(fast_wires) as (path,):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from examples import usually
 from lines import polled, rows_of
 from toy import Toy
 from worlds import S, World, WorldWire
@@ -59,8 +60,9 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
             back |= {row.drive for row in world.run(0.5) if row.value is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.story
-@pytest.mark.parametrize(("count", "dead"), [(16, 1), (16, 5), (31, 10)])
+@pytest.mark.parametrize(("count", "dead"), usually((16, 5), (16, 1), (31, 10)))
 @pytest.mark.parametrize("every", [None, 0.5], ids=["in turn", "at a rate"])
 def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
     count: int, dead: int, every: float | None

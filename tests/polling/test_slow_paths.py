@@ -11,6 +11,7 @@ from random import Random
 from typing import Any, cast
 
 import pytest
+from examples import usually
 from lines import proof
 from motors import MAKE, Heard
 from stories import Story
@@ -98,11 +99,6 @@ class Path(Story):
         return {row.drive for row in tail if row.value is not None}
 
 
-def usually(tried: object, *others: object) -> list[Any]:
-    """The one that is always tried, and those that take long."""
-    return [tried, *(pytest.param(other, marks=pytest.mark.long) for other in others)]
-
-
 PATHS = [
     pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
     for path, delays in (
@@ -128,6 +124,7 @@ def test_a_slow_path_costs_time_and_no_truth(
     assert answering == {drive.name for drive in story.drives}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("longest", STALLS)
 @pytest.mark.parametrize("name", FEW)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from batches import EXAMPLE, METADATA, counting, example
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import SCHEMA, rows_of
@@ -221,7 +222,7 @@ MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
 
 
 @every_format
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
 def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: list[Row]) -> None:
     assert rows_of(pa.record_batch(from_rows(some))) == some
@@ -233,7 +234,7 @@ def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: l
 
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
 def test_any_batches_converted(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
@@ -253,7 +254,7 @@ def as_text(name: str) -> str:
     return f"'{name}" if name.lstrip("'")[:1] in tuple("=+-@\t\r\n") else name
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
 def test_any_csv_means_the_same_to_another_reader(
     tmp_path_factory: pytest.TempPathFactory, some: list[Row]
@@ -299,6 +300,7 @@ def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -
     assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
 
 
+@pytest.mark.slow
 def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
     """Peak memory of a conversion of 40 MB stays far below them."""
     tracemalloc = pytest.importorskip("tracemalloc")

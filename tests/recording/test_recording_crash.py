@@ -19,6 +19,7 @@ import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
 from completions import add_rows
 from disks import full_at, read_only_directory
+from examples import examples
 from recordings import rows_of
 from toy import Toy
 
@@ -140,6 +141,7 @@ for at in count():
 """
 
 
+@pytest.mark.slow
 @growing
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
@@ -195,6 +197,7 @@ except RecordingError as failure:
 """
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_disk_that_becomes_full(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
@@ -421,6 +424,7 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
             open_reader(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None:
     """Some bytes are overwritten: it is read with other values, cut short, or refused; never a crash."""
@@ -428,7 +432,7 @@ def test_damage_anywhere_ends_in_a_sentence(tmp_path: Path, suffix: str) -> None
     record(path, 2)
     whole = path.read_bytes()
     chance = random.Random(4)
-    for _ in range(1500):
+    for _ in range(examples(1500)):
         damaged = bytearray(whole)
         for _ in range(chance.choice((1, 1, 4))):
             damaged[chance.randrange(len(damaged))] = chance.choice((0, 1, 0x7F, 0xFF, chance.randrange(256)))

@@ -123,6 +123,7 @@ def declared(*drives: object) -> set[tuple[int, str, str, str]]:
     return {(it.address, it.model, f"{it.settings}", f"{it.framing}") for it in drives}
 
 
+@pytest.mark.slow
 @pytest.mark.story
 def test_all_eight_are_found_at_their_settings_and_nothing_else() -> None:
     line = Line(Pair([simulated(it) for it in ALL_EIGHT]))

@@ -25,7 +25,7 @@ def mbpoll(sim: SimulatedDrive, options: str, *values: int) -> subprocess.Comple
     with Simulator([Wire([sim])]) as simulator:
         line = [program, "-q", "-m", "rtu", "-b", baudrate, "-P", "none", "-o", "1", "-a", address, "-0"]
         line += [*options.split(), simulator.wires[0].path, *map(str, values)]
-        return subprocess.run(line, capture_output=True, text=True, timeout=30)
+        return subprocess.run(line, capture_output=True, text=True, timeout=120)
 
 
 def values(done: subprocess.CompletedProcess[str]) -> list[str]:
@@ -85,7 +85,7 @@ def test_pymodbus_reads_and_writes_over_ascii() -> None:
     framer = require_module("pymodbus").FramerType.ASCII
     sim = simulated(InnovertIBD(240, framing="ascii"))
     with Simulator([Wire([sim])]) as simulator:
-        master = client.ModbusSerialClient(simulator.wires[0].path, framer=framer, baudrate=9600, timeout=5)
+        master = client.ModbusSerialClient(simulator.wires[0].path, framer=framer, baudrate=9600, timeout=60)
         assert master.connect()
         try:
             assert master.read_holding_registers(22, count=1, device_id=240).registers == [0x1800]

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from multidrop.core import set_settings
 
-PATIENCE = 5.0  # s until a reply that should come is given up; never waited for when all is well
+PATIENCE = 60.0  # s until a reply that should come is given up; never waited for when all is well
 
 
 @contextmanager

@@ -45,5 +45,5 @@ def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
             yield sniffer
         finally:
             process.send_signal(signal.SIGINT)
-            reader.join(timeout=20)
+            reader.join(timeout=60)
             process.kill()

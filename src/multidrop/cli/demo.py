@@ -16,7 +16,7 @@ from multidrop.cli.monitor.command import is_possible, watch
 from multidrop.cli.poll.command import add_polling_arguments, conclude, follow
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.drives import MODELS
-from multidrop.errors import BadReply, NoReply, NotDone, Unconfirmed
+from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.recording import open_reader
@@ -94,7 +94,7 @@ def _start_motors(line: PlantLine) -> None:
 @contextmanager
 def _simulator(plant: Path, ports: Path) -> Iterator[None]:
     """Simulate in another process: the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", str(ports)]
+    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
     # A session of its own keeps Ctrl-C from it: it must outlive the polling.
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         assert process.stdout is not None

@@ -1,0 +1,24 @@
+"""The number of random examples of a test: a quarter by default, all of them where THOROUGH is set."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import pytest
+
+PART = 1 if os.environ.get("THOROUGH") else 4
+
+
+def examples(number: int) -> int:
+    return max(1, number // PART)
+
+
+def usually(tried: object, *others: object) -> list[Any]:
+    """Return the parameters of a test: the first is always tried, the others are marked `long`."""
+    return [tried, *(_long(other) for other in others)]
+
+
+def _long(other: object) -> Any:
+    values = other if isinstance(other, tuple) else (other,)
+    return pytest.param(*values, marks=pytest.mark.long)
