@@ -27,7 +27,8 @@ static int is_start(int framing, uint8_t first)
 /* A good reply to such a request is its copy, or looks like one. */
 static int is_echoed(int framing, uint8_t function)
 {
-    return framing == MD_DELIXI || function == MD_WRITE_COIL || function == MD_WRITE_ONE || function == MD_LOOPBACK;
+    int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE;
+    return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
 /* Delixi's requests look like replies, but the value that a query asks for is 0 in it. */
@@ -89,10 +90,10 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     return used;
 }
 
-/* Find the frame that begins here: return its length, and set its kind, framing and message in `span`. `least` is
- * MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
-static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len, int least,
-                      struct md_span *span)
+/* Find the frame that begins here: return its length, and set its kind, framing and message in `span`.
+ * `least` is MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
+static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len,
+                      int least, struct md_span *span)
 {
     static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
     struct md_message *message = &span->message;
@@ -108,8 +109,9 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
         if (side == (is_request ? MD_ANSWERING : MD_ASKING) || !is_start(framing, bytes[0]))
             continue;
         int used = (is_request ? find_request : find_reply)(framing, bytes, len, message);
-        int may_be_copy = used > 0 && !splitter->is_in_step && side != MD_ASKING && is_echoed(framing, message->function);
-        span->kind = !is_request ? MD_STRAY : may_be_copy ? MD_EITHER : MD_REQUEST;
+        int may_be_copy = !splitter->is_in_step && side != MD_ASKING;
+        int is_either = used > 0 && may_be_copy && is_echoed(framing, message->function);
+        span->kind = !is_request ? MD_STRAY : is_either ? MD_EITHER : MD_REQUEST;
         span->framing = framing;
         if (used >= least)
             return used;
@@ -191,7 +193,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
 
 /* ---- the stream ---- */
 
-int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece)
+int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece)
 {
     if (stream->room - stream->len < len || stream->most == stream->count)
         return 0;
@@ -202,7 +204,7 @@ int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct m
     return 1;
 }
 
-void md_forget(struct md_stream *stream, struct md_splitter *splitter)
+void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
 {
     size_t gone = splitter->at, first = splitter->piece;
     while (first + 1 < stream->count && stream->pieces[first + 1].at <= gone)
