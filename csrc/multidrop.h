@@ -1,7 +1,7 @@
 /* What Python calls of the C core. internal.h has what only C calls.
  *
  * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
- * The pure parts (all but ports, engine, row queue and clock) do no I/O, call nobody back and have no globals. */
+ * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
@@ -79,7 +79,12 @@ struct md_settings {
     uint8_t stopbits; /* 1, 2 */
 };
 
-enum md_refusal { MD_REFUSED_BAUDRATE = 1, MD_REFUSED_DATABITS = 2, MD_REFUSED_PARITY = 4, MD_REFUSED_STOPBITS = 8 };
+enum md_refusal {
+    MD_REFUSED_BAUDRATE = 1,
+    MD_REFUSED_DATABITS = 2,
+    MD_REFUSED_PARITY = 4,
+    MD_REFUSED_STOPBITS = 8
+};
 
 /* Make the port raw with these settings, and read them back to find what it did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
@@ -94,15 +99,18 @@ int64_t md_utc_minus_monotonic_ns(void);
 
 /* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
 
-enum md_wire { MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32, MD_F32_SWAPPED, MD_BIT };
+enum md_number_format {
+    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32,
+    MD_F32_SWAPPED, MD_BIT
+};
 
 /* Read the number at word (MD_BIT: bit) `at` of a reply's data. */
-double md_value(const uint8_t *data, size_t len, size_t at, int wire);
+double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
 struct md_field {
     uint16_t at;
-    uint8_t wire;
+    uint8_t format; /* enum md_number_format */
     uint16_t reg; /* code of its name */
     double multiplier, divisor;
 };
@@ -144,7 +152,7 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
 
 /* ---- delay.c, late.c, counters.c: what is known of a drive; return a time in ns ---- */
 
-/* What became of a drive's exchanges; all but longest_ns only grow. A value is one of the exchange's block. */
+/* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */
 struct md_counters {
     uint64_t exchanges, answered, values; /* counted at every exchange: the first eight share a cache line */
     uint64_t sent;        /* requests that began to leave */
@@ -179,7 +187,7 @@ struct md_drive {
     int64_t answered_ns;            /* requests that left before then are answered, or never will be */
     uint32_t failures;              /* in a row */
     uint32_t owed_count, proof_count;
-    const struct md_exchange *const *proofs; /* reads whose replies differ from each other's and most others' */
+    const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
     struct md_counters counters;
     struct md_owed owed[MD_MOST_OWED];
@@ -214,7 +222,7 @@ struct md_exchange {
      * known to take, but not beyond this. */
     int64_t timeout_ns;
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
-    const uint32_t *stops; /* of its drive (md_count_stop): sent only while they are stops_seen; NULL: always */
+    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
     struct md_message request;
 };
@@ -282,7 +290,8 @@ void md_port_tell_echo(struct md_port *port, int echo);
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
 /* Queue exchanges, none to be sent before its time; return how many there was room for. One client at a
  * time. A slot that is late by a period is not sent (MD_EXPIRED) when the same exchange's next one is due. */
-int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns, int n);
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns, int n);
 /* Repeat these in turn while nothing that is queued is due, until they are replaced, the port is lost, or one
  * of them could not be sent. Return which one of those before would have been next. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
@@ -302,7 +311,8 @@ struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
 /* Free it once no port reports to it. Chunks taken before may be given back afterwards. */
 void md_row_queue_free(struct md_row_queue *row_queue);
 /* Add rows for values that were due at a time and not asked for. */
-void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status, int64_t due_ns);
+void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
+                       int64_t due_ns);
 struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
 void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
 size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* with rows; the newest is still being filled */
@@ -346,7 +356,7 @@ size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t f
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- stream.c, split.c: return 1, or 0 when room (md_hear, md_know) or more bytes (md_split) are needed ---- */
+/* ---- split.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
 
 /* Bytes that came together, from `at` up to the next piece. */
 struct md_piece {
@@ -390,8 +400,10 @@ struct md_splitter {
     struct md_message request; /* the last one */
 };
 
-int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece); /* append */
-void md_forget(struct md_stream *stream, struct md_splitter *splitter); /* what was split */
+/* Append a piece. */
+int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
+/* Forget what was split. */
+void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
 /* Find the next span. Every byte is part of one. Only pauses and sides matter of how the bytes came in; junk
  * comes in any number of spans. */
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
@@ -425,7 +437,8 @@ enum md_decoded {
 };
 
 /* Say what replies to this request hold; NULL: nothing that makes rows. Return 0 when the table is full. */
-int md_know(struct md_decoder *decoder, int framing, const struct md_message *request, const struct md_block *block);
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
+            const struct md_block *block);
 /* Add the rows of every sniffed exchange, also of requests without a reply. */
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 

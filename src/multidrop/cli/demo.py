@@ -86,7 +86,7 @@ def _start_motors(line: PlantLine) -> None:
         for number, polled in enumerate(line.drives):
             drive = bus.attach(polled.drive)
             # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
-            with suppress(BadReply, NoReply, NotDone, Unconfirmed):
+            with suppress(BadReply, Expired, NoReply, NotDone, Unconfirmed):
                 drive.set_frequency(20.0 + 3 * number)
                 drive.start()
 
