@@ -4,14 +4,17 @@
     Bus Poller
     ```
 
-documents these, and with the option `:rest:` and no names all others of the package's `__all__` that no
-earlier directive on the page has documented.
+documents these, and with the option `:rest:` and no names all others of the package that no earlier directive
+on the page has documented.
 """
 
 from __future__ import annotations
 
+import ast
 import inspect
+from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -20,6 +23,23 @@ from docutils.parsers.rst import Directive, directives
 from docutils.statemachine import StringList
 
 import multidrop
+
+
+def public(package: ModuleType) -> list[str]:
+    """Return a package's public names: `__all__`, or what its file defines or imports as itself."""
+    if hasattr(package, "__all__"):
+        return list(package.__all__)
+    tree = ast.parse(Path(str(package.__file__)).read_text("utf-8"))
+    return [name for node in tree.body for name in _defined(node) if not name.startswith("_")]
+
+
+def _defined(node: ast.stmt) -> Iterator[str]:
+    if isinstance(node, ast.ImportFrom):
+        yield from (alias.name for alias in node.names if alias.asname == alias.name)
+    elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+        yield node.name
+    elif isinstance(node, ast.Assign):
+        yield from (target.id for target in node.targets if isinstance(target, ast.Name))
 
 
 class PublicNames(Directive):
@@ -34,10 +54,10 @@ class PublicNames(Directive):
         env = self.state.document.settings.env
         seen: set[str] = env.temp_data.setdefault(f"public-names {package.__name__}", set())
         names = " ".join(self.content).split()
-        if unknown := set(names) - set(package.__all__):
+        if unknown := set(names) - set(public(package)):
             raise self.error(f"{package.__name__} has no public {', '.join(sorted(unknown))}")
         if "rest" in self.options:
-            names += [name for name in package.__all__ if name not in seen]
+            names += [name for name in public(package) if name not in seen]
         seen.update(names)
         again = [name for name in names if package is not multidrop and _is_in_multidrop(package, name)]
         own = [name for name in names if name not in again]
@@ -50,7 +70,7 @@ class PublicNames(Directive):
 
 
 def _is_in_multidrop(package: ModuleType, name: str) -> bool:
-    return name in multidrop.__all__ and getattr(multidrop, name) is getattr(package, name)
+    return name in public(multidrop) and getattr(multidrop, name) is getattr(package, name)
 
 
 def _documented(package: ModuleType, name: str) -> list[str]:
