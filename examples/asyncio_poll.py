@@ -1,0 +1,64 @@
+"""Poll beside other tasks of an asyncio program: `python examples/asyncio_poll.py [SECONDS]`."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator
+
+from simulated_plant import simulated_plant
+
+from multidrop import Batch, Poller
+
+PLANT = """
+[[line]]
+name = "hall"
+port = "{ports}/hall"
+
+[[line.drive]]
+name = "pump"
+model = "innovert-ibd"
+address = 1
+poll = ["output_current", "motor_speed"]
+"""
+
+
+async def batches(poller: Poller) -> AsyncIterator[Batch]:
+    """Yield batches as they come, without blocking the loop."""
+    loop = asyncio.get_running_loop()
+    ready = asyncio.Event()
+    loop.add_reader(poller.fileno(), ready.set)
+    try:
+        while True:
+            await ready.wait()
+            ready.clear()
+            while batch := poller.take():
+                yield batch
+    finally:
+        loop.remove_reader(poller.fileno())
+
+
+async def count(poller: Poller) -> None:
+    """Print a line for each batch."""
+    async for batch in batches(poller):
+        print(f"{len(batch)} rows")
+
+
+async def tick() -> None:
+    """Do something else meanwhile."""
+    while True:
+        await asyncio.sleep(0.2)
+        print("tick")
+
+
+async def main(seconds: float) -> None:
+    with simulated_plant(PLANT) as plant, Poller(plant) as poller:
+        tasks = [asyncio.create_task(count(poller)), asyncio.create_task(tick())]
+        await asyncio.wait(tasks, timeout=seconds)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(float(sys.argv[1]) if sys.argv[1:] else 3.0))

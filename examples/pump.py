@@ -1,0 +1,38 @@
+"""Run a pump for some seconds, and stop it however the program ends: `python examples/pump.py [SECONDS]`.
+
+Try Ctrl-C: the pump is stopped first.
+"""
+
+from __future__ import annotations
+
+import sys
+from time import sleep
+
+from multidrop import Bus, BusError, ErmanERG220
+from multidrop.sim import Simulator, Wire, simulated
+
+
+def run(port: str, seconds: float) -> None:
+    """Start the pump of address 1 at this port, show what it does, and stop it."""
+    with Bus(port, audit="pump.jsonl") as bus:
+        bus.stop_on_exit()  # from here on leaving, Ctrl-C and SIGTERM stop the motor
+        pump = bus.attach(ErmanERG220, address=1, name="pump")
+        pump.set_frequency(30.0)
+        pump.start()
+        for _ in range(round(seconds)):
+            print(pump.state(), pump.output_frequency.format(bus.read(pump, pump.output_frequency)))
+            sleep(1.0)
+
+
+def main(seconds: float) -> None:
+    motor = simulated(ErmanERG220(1))
+    with Simulator([Wire([motor])]) as line:
+        try:
+            run(line.wires[0].path, seconds)
+        except BusError as failure:
+            print("failed:", failure)
+        print("the output frequency is now", motor["output_frequency"], "Hz")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]) if sys.argv[1:] else 5.0)

@@ -1,0 +1,362 @@
+"""README's and the documentation's code runs as it stands, and their pages hold what the library has.
+
+Each page has a directory and a namespace of its own, in which its blocks run in their order. A block that
+begins with `# NAME.toml` or `# NAME.py` is saved under that name. A port /dev/ttyUSBn of a plant file is a
+simulated line with the drives of that file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import ExitStack, redirect_stderr, redirect_stdout
+from importlib.util import find_spec
+from io import StringIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from multidrop import core, load_plant
+from multidrop.cli import COMMANDS, main
+from multidrop.drives import MODELS, InnovertIBD
+from multidrop.sim import Simulator, Wire, simulated
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c are shown, and not run
+PACKAGES = ("multidrop", *(f"multidrop.{name}" for name in ("drive", "sim", "recording", "capture", "scan")))
+
+# Commands that are not run, and why: those that begin so.
+NOT_RUN = {
+    "python3 -m venv": "installs: .ci/run does README's",
+    ".venv/bin/pip": "installs",
+    ". .venv/bin/activate": "belongs to a shell",
+    "mkdir ~/": "makes a directory outside the test's",
+    ".venv/bin/pytest": "runs the tests themselves",
+    ".venv/bin/ruff": "is a step of .ci/run",
+    ".ci/run": "runs the tests themselves",
+    ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
+    ".venv/bin/python -m sphinx": "is a test of its own, below",
+    ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",
+    "tshark": "is another program: tests/capture/test_capture.py runs it",
+    "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
+    "multidrop plot demo.arrows": "needs the demo's recording",
+    "multidrop report demo.arrows": "needs the demo's recording",
+    "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
+    "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",
+}
+STATUS = {"multidrop plan full.toml": 1}  # where that is not 0
+SHORTER = (  # what would take long, and what is enough here
+    (r"--seconds \d+", "--seconds 1"),
+    (r"seconds=\d+", "seconds=0.5"),
+    (r"--addresses 1-4", "--addresses 1-3 --quick"),
+    (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
+    (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
+    (r"\bevery=0\.1\b", "every=0.05"),
+)
+NEEDED = {"polars": "polars", "pandas": "pandas", "duckdb": "duckdb"}  # by a page: named in it
+
+
+class Block(NamedTuple):
+    """A block of a page, with the line it begins in."""
+
+    language: str
+    text: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the fenced blocks, without those that are directives of Sphinx."""
+    text = page.read_text("utf-8")
+    found = re.finditer(r"^( *)```([^\n]*)\n(.*?)^\1```$", text, re.DOTALL | re.MULTILINE)
+    return [
+        Block(match[2], match[3], text.count("\n", 0, match.start()) + 1)
+        for match in found
+        if not match[2].startswith("{")
+    ]
+
+
+def prose(page: Path) -> str:
+    """Return a page without its fenced blocks."""
+    return re.sub(r"^ *```.*?^ *```$", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+RUN = [page for page in PAGES if {block.language for block in blocks(page)} & LANGUAGES - {"text", "c"}]
+
+
+class Session:
+    """Runs a page's blocks in the working directory."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.space: dict[str, Any] = {"__name__": "page"}
+        self._stack = stack
+        self._wires: dict[str, str] = {}  # the link that stands for each port
+
+    def run(self, block: Block) -> None:
+        """Run a block. Raises whatever it raises."""
+        text = block.text
+        for pattern, enough in SHORTER:
+            text = re.sub(pattern, enough, text)
+        saved = re.match(r"# ([\w-]+\.(?:toml|py))\n", text)
+        if block.language == "toml":
+            assert saved, "a plant file's first line says its name"
+            self._save(saved[1], text)
+        elif block.language == "python":
+            if saved:
+                Path(saved[1]).write_text(text)
+            source = "\n" * block.line + self._with_ports(text)
+            exec(compile(source, "page", "exec", dont_inherit=True), self.space)
+        elif block.language in ("sh", "console"):
+            self._run_commands(text, has_prompt=block.language == "console")
+
+    def _with_ports(self, text: str) -> str:
+        """Return the text with simulated lines in place of real ports."""
+        for port in sorted(set(re.findall(r"/dev/ttyUSB\d", text))):
+            if port not in self._wires:
+                self._play(port, [InnovertIBD(1)])
+            text = text.replace(port, self._wires[port])
+        return text
+
+    def _save(self, name: str, text: str) -> None:
+        """Save a TOML file; the drives of a plant file are played."""
+        for line in tomllib.loads(text).get("line", ()):
+            if line["port"].startswith("/dev/ttyUSB"):
+                link = self._wires.setdefault(line["port"], str(Path.cwd() / Path(line["port"]).name))
+                text = text.replace(f'"{line["port"]}"', f'"{link}"')
+        Path(name).write_text(text)
+        if "[[line]]" in text:
+            for line in load_plant(name).lines:
+                if line.port in self._wires.values() and not Path(line.port).is_symlink():
+                    self._serve(line.port, [polled.drive for polled in line.drives])
+
+    def _play(self, port: str, drives: list[Any]) -> None:
+        self._wires[port] = str(Path.cwd() / Path(port).name)
+        self._serve(self._wires[port], drives)
+
+    def _serve(self, link: str, drives: list[Any]) -> None:
+        wire = Wire([simulated(drive) for drive in drives], port=link, unpaced=True)
+        self._stack.enter_context(Simulator([wire]))
+
+    def _run_commands(self, text: str, *, has_prompt: bool) -> None:
+        commands: list[tuple[str, list[str]]] = []
+        for line in text.splitlines():
+            if line.startswith("$ ") or not has_prompt:
+                commands.append((line.removeprefix("$ "), []))
+            elif commands:
+                commands[-1][1].append(line)
+        for command, shown in commands:
+            if command and not any(command.startswith(begin) for begin in NOT_RUN):
+                compare(shown, self._run_command(command))
+
+    def _run_command(self, command: str) -> str:
+        words = shlex.split(self._with_ports(command), comments=True)
+        assert words[0] == "multidrop", f"{command!r} is neither run nor in the table of what is not"
+        if words[1] == "simulate":
+            return self._simulate(words[1:])
+        printed = StringIO()
+        with redirect_stdout(printed), redirect_stderr(printed):
+            status = main(words[1:])
+        assert status == STATUS.get(command, 0), printed.getvalue()
+        return printed.getvalue()
+
+    def _simulate(self, words: list[str]) -> str:
+        """Start the simulator, which runs until the page's end; return its first line."""
+        command = [sys.executable, "-m", "multidrop.cli", *words, "--unpaced"]
+        process = self._stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        self._stack.callback(process.terminate)
+        assert process.stdout is not None
+        return process.stdout.readline()
+
+
+def compare(shown: list[str], printed: str) -> None:
+    """Fail unless each line that a page shows was printed, but for its numbers and spaces.
+
+    `…` on the page stands for lines that it leaves out.
+    """
+    left = [shape(line) for line in printed.splitlines()]
+    for line in filter(None, map(shape, shown)):
+        if line != "…":
+            assert line in left, f"{line!r} was not printed, but\n{printed}"
+
+
+def shape(line: str) -> str:
+    """Return a line without its numbers' digits, its times' units, and its spaces' widths."""
+    return re.sub(r"\s+", " ", re.sub(r"\d+(\.\d+)?( (ms|us))?", "0", line)).strip()
+
+
+@pytest.fixture
+def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    with ExitStack() as stack:
+        yield Session(stack)
+
+
+@pytest.mark.parametrize("page", RUN, ids=named)
+def test_a_page_runs_as_it_stands(page: Path, session: Session) -> None:
+    text = page.read_text("utf-8")
+    for module in NEEDED:
+        if f"import {module}\n" in text and find_spec(module) is None:
+            pytest.skip(f"{module} is not installed")
+    for block in blocks(page):
+        try:
+            session.run(block)
+        except Exception as failure:
+            raise AssertionError(f"{named(page)}, line {block.line}: {failure}") from failure
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_a_page_s_blocks_say_what_they_are(page: Path) -> None:
+    assert {block.language for block in blocks(page)} <= LANGUAGES
+
+
+def test_what_is_not_run_is_there() -> None:
+    text = "\n".join(block.text for page in PAGES for block in blocks(page))
+    assert [begin for begin in NOT_RUN if begin not in text] == []
+
+
+# ---- what pages say in passing ----
+
+PLACEHOLDERS = {
+    "PORT": "port",
+    "MODEL": "yd1000",
+    "ADDRESS": "1",
+    "REGISTER": "control",
+    "COMMAND": "poll",
+    "FILE": "plant.toml",
+    "HZ": "10",
+}
+MENTIONED = sorted(
+    {
+        re.sub(r"\s+", " ", words)
+        for page in PAGES
+        for words in re.findall(r"`multidrop\s([^`]+)`", prose(page))
+        if "..." not in words
+    }
+)
+
+
+@pytest.mark.parametrize("mentioned", MENTIONED)
+def test_a_command_that_is_mentioned_is_a_command(mentioned: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = [PLACEHOLDERS.get(word, word) for word in shlex.split(mentioned)]
+    if words[0].startswith("--"):
+        return
+    assert words[0] in COMMANDS
+    is_typed_so = words[1:] and not words[1].startswith("--")
+    if is_typed_so:
+        module = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
+        monkeypatch.setattr(module, "run", lambda arguments: 0)
+        assert main(words) == 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_a_page_s_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", prose(page)):
+        assert target.startswith("https://") or (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_no_line_is_too_long(page: Path) -> None:
+    assert [line for line in page.read_text("utf-8").splitlines() if len(line) > 110] == []
+
+
+# ---- the pages hold what the library has ----
+
+
+def table(page: str, heading: str = "") -> dict[str, str]:
+    """Return the rows of the first table after a heading: the name in the first column, and the rest."""
+    text = (
+        (DOCS / page).read_text("utf-8").partition(heading)[2]
+        if heading
+        else (DOCS / page).read_text("utf-8")
+    )
+    rows = re.search(r"^\|.*?(?=\n\n|\Z)", text, re.DOTALL | re.MULTILINE)
+    assert rows
+    return {
+        name: rest
+        for line in rows[0].splitlines()[2:]
+        for first, rest in [line.strip("| ").split(" | ", 1)]
+        for name in re.findall(r"`([^`]+)`", first)
+    }
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_is_in_the_reference(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    public = importlib.import_module("public_names").public
+    pages = "\n".join(page.read_text("utf-8") for page in (DOCS / "reference").glob("*.md"))
+    given = re.findall(
+        rf"^```{{public-names}} {re.escape(package)}\n(.*?)^```", pages, re.DOTALL | re.MULTILINE
+    )
+    assert any(":rest:" in names for names in given)
+    names = " ".join(given).replace(":rest:", "").split()
+    assert set(names) <= set(public(importlib.import_module(package)))
+
+
+def test_every_status_is_in_the_reference() -> None:
+    known = {status for status in core.STATUSES if status and not status.startswith("exception")}
+    assert known == set(table("reference/statuses.md")) - {"exception 01", "exception FF"}
+
+
+def test_every_column_is_in_the_reference() -> None:
+    from multidrop.polling.batch import schema
+
+    assert [child.name for child in schema().children] == list(table("reference/recording-format.md"))
+
+
+def test_every_key_of_a_plant_file_is_in_the_reference() -> None:
+    from multidrop.plant import loader
+
+    page = "reference/plant-file.md"
+    assert list(table(page, "## `[[line]]`")) == list(loader._LINE)
+    assert set(table(page, "## `[[line.drive]]`")) == set(loader._DRIVE)
+    assert list(table(page, "## An entry of `poll`")) == list(loader._POLL)
+
+
+def test_every_family_is_in_the_reference() -> None:
+    text = (DOCS / "reference" / "families.md").read_text("utf-8")
+    assert re.findall(r"^- `([\w-]+)` ", text, re.MULTILINE) == list(MODELS)
+
+
+def test_the_speed_table_is_readme_s() -> None:
+    speed = (DOCS / "explanation" / "speed-table.md").read_text("utf-8")
+    assert speed.strip() in (ROOT / "README.md").read_text("utf-8")
+
+
+def test_the_timing_diagrams_are_what_their_tables_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(DOCS / "pictures"))
+    diagrams = importlib.import_module("diagrams")
+    for name in diagrams.DIAGRAMS:
+        assert (DOCS / "pictures" / f"{name}.svg").read_text("utf-8") == diagrams.draw(name)
+
+
+@pytest.mark.long
+def test_the_pages_are_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx")
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "80"})
+    assert (done.returncode, done.stderr) == (0, "")
