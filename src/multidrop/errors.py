@@ -5,6 +5,8 @@ A mistake of the caller is a ValueError or TypeError at the call; everything els
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 
 class BusError(Exception):
     """Any failure between the call and the drive."""
@@ -106,14 +108,44 @@ class NotAttached(ValueError):
     """The drive is not, or no more, on this bus: a mistake of the caller."""
 
 
+class Advice(NamedTuple):
+    """What the sentence of a refusal tells a program to do, and what to type instead on the command line."""
+
+    program: str
+    command: str
+
+    @classmethod
+    def call(cls, verb: str) -> Advice:
+        """Advise to call a verb of the drive."""
+        return cls(f"call {verb}()", f"run `multidrop {verb.replace('_', '-')}`")
+
+    @classmethod
+    def declare(cls, option: str, value: object) -> Advice:
+        """Advise to declare an option of the drive."""
+        return cls(f"declare {option} = {value}", f"add --option {option}={value}")
+
+
 class Refused(BusError, ValueError):
     """The library itself did not send it; with the register, the rule, and its place in the manual."""
 
-    def __init__(self, sentence: str, *, register: str = "", rule: str = "", place: str = "") -> None:
+    def __init__(
+        self,
+        sentence: str,
+        *,
+        register: str = "",
+        rule: str = "",
+        place: str = "",
+        advice: Advice | None = None,
+    ) -> None:
         super().__init__(sentence)
+        self.advice = advice  # its words for a program are part of the sentence
         self.register = register
         self.rule = rule
         self.place = place
+
+    def for_command_line(self) -> str:
+        """Return the sentence with what to type in place of what a program would call or declare."""
+        return str(self).replace(*self.advice) if self.advice else str(self)
 
 
 class CheckAgain(Exception):

@@ -14,9 +14,12 @@ from pathlib import Path
 import pytest
 
 from multidrop.cli import COMMANDS, main
-from multidrop.cli.support.advice import typed
 from multidrop.cli.support.signals import Interruption
+from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS
+from multidrop.drives.erman_er_g_220 import ErmanERG220
+from multidrop.drives.innovert_ibd import InnovertIBD
+from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.registry import find_model
 
 TOY = f"{Path(__file__).parents[1]}/support/toy.py:Toy"
@@ -262,23 +265,26 @@ def test_what_a_rule_forbids_comes_with_what_is_to_be_typed(run: Run, words: lis
     assert advice in err
 
 
-@pytest.mark.parametrize(
-    ("sentence", "command"),
-    [
-        ("see to it, then call reset_fault()", "see to it, then run `multidrop reset-fault`"),
-        (
-            "then call reset_fault(), or declare acknowledged_fault = 64",
-            "then run `multidrop reset-fault` and add --option acknowledged_fault=64",
-        ),
-        ('declare ram = ["frequency"]', "add --ram frequency"),
-        ("and declare confirmed = 1 if it is an IBD", "and add --option confirmed=1 if it is an IBD"),
-        ("its setpoint is 0: call set_frequency before start", "its setpoint is 0: add --frequency HZ"),
-        ("use emergency_stop()", "use `multidrop emergency-stop`"),
-        ("it is a reading", "it is a reading"),
-    ],
-)
-def test_advice_for_a_program_becomes_a_command_s(sentence: str, command: str) -> None:
-    assert typed(sentence) == command
+def test_advice_for_a_program_becomes_a_command_s() -> None:
+    reset = Refused("x has a fault: see to it, then call reset_fault()", advice=Advice.call("reset_fault"))
+    assert reset.for_command_line() == "x has a fault: see to it, then run `multidrop reset-fault`"
+    declare = Refused("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))
+    assert declare.for_command_line() == "and add --option confirmed=1 if it is"
+    assert Refused("use emergency_stop()").for_command_line() == "use emergency_stop()"
+
+
+def test_a_family_s_advice_stands_in_its_sentence() -> None:
+    """Else nothing of it would be replaced on the command line."""
+    erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
+    answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
+    for script, command in (
+        (erman.start.script(), "then run `multidrop reset-fault` and add --option acknowledged_fault=64"),
+        (che.start.script(), "see to it, then run `multidrop reset-fault`"),
+        (ibd.identify.script(), "and add --option confirmed=1 if it is an IBD"),
+    ):
+        with pytest.raises(Refused) as refused:
+            carry_out(script, lambda step: step.register.decode(answers.get(step.register.name, 0)))
+        assert refused.value.for_command_line().endswith(command)
 
 
 @pytest.mark.parametrize(

@@ -88,9 +88,7 @@ def _guarded(command: str, words: list[str]) -> int:
         _abandon_output()
         return DONE
     except Refused as refusal:
-        from multidrop.cli.support.advice import typed
-
-        return _say(typed(str(refusal)), FAILED)
+        return _say(refusal.for_command_line(), FAILED)
     except (ValueError, TypeError, Unsupported) as mistake:
         return _say(str(mistake), MISTAKE)
     except OSError as failure:

@@ -17,6 +17,7 @@ from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
+from multidrop.errors import Advice
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 
@@ -39,10 +40,11 @@ class WriteRecords:
         ledger = self._ledger.at(self._line.identity)
         why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)
         if why:
-            way = "write it less often, or take a setpoint that is kept in RAM"
+            way, advice = "write it less often, or take a setpoint that is kept in RAM", None
             if kept is Kept.UNKNOWN:
-                way = f'if you know that this drive keeps it in RAM, declare ram = ["{register.name}"]'
-            raise refused(drive, register, f"{why}; {way}")
+                advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
+                way = f"if you know that this drive keeps it in RAM, {advice.program}"
+            raise refused(drive, register, f"{why}; {way}", advice)
 
     def count_later(self, drive: Drive, register: Register[Any]) -> None:
         self._uncounted.append(self._cell(drive, register))

@@ -12,20 +12,20 @@ from multidrop.drive.register import Access, Carrier, Kept, Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
 from multidrop.drive.verbs import VERBS
-from multidrop.errors import Refused, Unsupported
+from multidrop.errors import Advice, Refused, Unsupported
 
 T = TypeVar("T", bound=float)
 
 
-def refused(drive: Drive, register: Register[Any], rule: str) -> Refused:
+def refused(drive: Drive, register: Register[Any], rule: str, advice: Advice | None = None) -> Refused:
     """Return the error that says that this rule keeps the register from being written."""
-    return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}")
+    return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}", advice)
 
 
-def _refusal(register: Register[Any], rule: str, sentence: str) -> Refused:
+def _refusal(register: Register[Any], rule: str, sentence: str, advice: Advice | None = None) -> Refused:
     place = "; ".join(filter(None, (register.place, register.outside)))
     where = f" (manual: {place})" if place else ""
-    return Refused(sentence + where, register=register.name, rule=rule, place=place)
+    return Refused(sentence + where, register=register.name, rule=rule, place=place, advice=advice)
 
 
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
@@ -67,14 +67,18 @@ def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
         drive.check_confirmed(register.name)
     if not register.commands:
         return
-    verbs = [f"{name}()" for name in VERBS if name in _MOVING and _has(drive, name)]
+    verbs = [name for name in VERBS if name in _MOVING and _has(drive, name)]
+    advice = Advice(
+        ", ".join(f"{name}()" for name in verbs),
+        ", ".join(f"`multidrop {name.replace('_', '-')}`" for name in verbs),
+    )
     value = register.format(register.decode(raw))
-    way = f"which verbs alone do: use {', '.join(verbs)}"
+    way = f"which verbs alone do: use {advice.program}"
     if not verbs:
         way = (
             "and its class does not say that it is harmless: declare harmless = (…), moves = False, or a verb"
         )
-    raise refused(drive, register, f"{value} commands the motor, {way}")
+    raise refused(drive, register, f"{value} commands the motor, {way}", advice if verbs else None)
 
 
 _MOVING = ("start", "stop", "jog", "reset_fault")

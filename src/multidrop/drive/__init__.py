@@ -19,7 +19,7 @@ from multidrop.drive.script import (
 )
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import MOVING, STOPPING, VERBS, Option, verb
-from multidrop.errors import BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.errors import Advice, BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 
 __all__ = [
     "LONGEST_SILENCE",
@@ -27,6 +27,7 @@ __all__ = [
     "START_TIME",
     "STOPPING",
     "VERBS",
+    "Advice",
     "BusError",
     "Condition",
     "Direction",

@@ -23,10 +23,11 @@ from multidrop.drive.script import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb
-from multidrop.errors import NotDone, Refused, Unconfirmed, Unsupported
+from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
 LONGEST_SILENCE = 1.0  # s, that a line may be given
 START_TIME = 5.0  # s in which a motor that was started is to be seen to run
+_SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
 T = TypeVar("T", bound=float)
 
@@ -126,6 +127,7 @@ class Drive:
                 "from another drive, to which the same may mean a start; look at its name plate, and declare "
                 "confirmed = 1",
                 rule="nobody has confirmed what it is",
+                advice=Advice.declare("confirmed", 1),
             )
 
     def __init__(
@@ -313,13 +315,19 @@ class Drive:
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
-            raise Refused(f"{self.name} cannot say its setpoint: call set_frequency before start")
+            raise Refused(
+                f"{self.name} cannot say its setpoint: call set_frequency before start",
+                advice=_SETPOINT_FIRST,
+            )
         if held == 0:
-            raise Refused(f"the setpoint of {self.name} is 0: call set_frequency before start")
+            raise Refused(
+                f"the setpoint of {self.name} is 0: call set_frequency before start", advice=_SETPOINT_FIRST
+            )
         if self.commanded is not None and held != self.commanded:
             raise Refused(
                 f"{self.name} holds {register.format(held)} and not {register.format(self.commanded)} as it "
-                "was told: it may have lost its power; call set_frequency before start"
+                "was told: it may have lost its power; call set_frequency before start",
+                advice=_SETPOINT_FIRST,
             )
 
     def _started(self) -> Script[None]:

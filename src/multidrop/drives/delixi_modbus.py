@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import Condition, Direction, Framing, Refused, Script, State, insist, read, write
+from multidrop.drive import Advice, Condition, Direction, Framing, Refused, Script, State, insist, read, write
 from multidrop.drive.register import HOLDING, Kept, Register, command, setting
 from multidrop.drive.verbs import verb
 from multidrop.drives.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiParameters, parameter
@@ -106,7 +106,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction forward, and only from rest."""
         if self._jogged and not (yield from self._stands()):
-            raise Refused(f"{self.name} may still jog, which a start may not end: call stop() first")
+            raise Refused(
+                f"{self.name} may still jog, which a start may not end: call stop() first",
+                advice=Advice.call("stop"),
+            )
         forward = yield from self._forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")

@@ -6,6 +6,7 @@ from enum import IntEnum, IntFlag
 from typing import Any
 
 from multidrop.drive import (
+    Advice,
     BusError,
     Condition,
     Direction,
@@ -235,10 +236,10 @@ class ErmanERG220(Drive):
         fault = yield from read(self.last_fault)
         dealt_with = self.option.get("acknowledged_fault", 0)
         if fault and fault not in (self._reset_fault, dealt_with):
-            raise Refused(
-                f"{self.name} may have a fault, {self.last_fault.format(fault)}: see to it, then call "
-                f"reset_fault(), or declare acknowledged_fault = {int(fault)}"
-            )
+            reset, declare = Advice.call("reset_fault"), Advice.declare("acknowledged_fault", int(fault))
+            way = Advice(f"{reset.program}, or {declare.program}", f"{reset.command} and {declare.command}")
+            shown = self.last_fault.format(fault)
+            raise Refused(f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way)
         yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)
         yield from write(self.emergency_stop_coil, Coil.OFF)

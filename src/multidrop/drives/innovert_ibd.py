@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 
 from multidrop.drive import (
+    Advice,
     BusError,
     Condition,
     Direction,
@@ -228,7 +229,8 @@ class InnovertIBD(Drive):
         if not (yield from self._shows_its_line()):
             raise Refused(
                 f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
-                "name plate, and declare confirmed = 1 if it is an IBD"
+                "name plate, and declare confirmed = 1 if it is an IBD",
+                advice=Advice.declare("confirmed", 1),
             )
 
     def _shows_its_line(self) -> Script[bool]:
@@ -264,11 +266,17 @@ class InnovertIBD(Drive):
         sent = word if direction is None else IBDControl(word | self._bit(direction))
         yield from self._commanded_by_line()
         if (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
-            raise Refused(f"{self.name} has a fault: see to it, then call reset_fault()")
+            raise Refused(
+                f"{self.name} has a fault: see to it, then call reset_fault()",
+                advice=Advice.call("reset_fault"),
+            )
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise Refused(f"{self.name} turns, and a jog would go on through this: call stop() first")
+            raise Refused(
+                f"{self.name} turns, and a jog would go on through this: call stop() first",
+                advice=Advice.call("stop"),
+            )
         yield from write(self.control, sent)
         yield from self._started()
 
@@ -278,7 +286,8 @@ class InnovertIBD(Drive):
             raise Refused(
                 f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
                 "start without a direction, or try which of bits 2 and 3 turns it forward, and "
-                "declare forward_bit = N"
+                "declare forward_bit = N",
+                advice=Advice.declare("forward_bit", "N"),
             )
         return 1 << int(forward if direction is Direction.FORWARD else 5 - forward)
 

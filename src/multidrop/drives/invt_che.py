@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Any, TypeVar, Unpack, overload
 
 from multidrop.drive import (
+    Advice,
     Condition,
     Direction,
     Drive,
@@ -265,7 +266,10 @@ class InvtCHE(Drive):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
         if self._jogged and not (yield from self._stands()):
-            raise Refused(f"{self.name} may still jog, which a start may not end: call stop() first")
+            raise Refused(
+                f"{self.name} may still jog, which a start may not end: call stop() first",
+                advice=Advice.call("stop"),
+            )
         forward = yield from self._forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
@@ -284,7 +288,10 @@ class InvtCHE(Drive):
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = self.fault.format((yield from read(self.fault)))
-            raise Refused(f"{self.name} has a fault, {fault}: see to it, then call reset_fault()")
+            raise Refused(
+                f"{self.name} has a fault, {fault}: see to it, then call reset_fault()",
+                advice=Advice.call("reset_fault"),
+            )
         if direction is None:
             return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
@@ -330,7 +337,8 @@ class InvtCHE(Drive):
         most = self.option.get("maximum_frequency")
         if most is None:
             raise Refused(
-                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency = HZ"
+                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency = HZ",
+                advice=Advice.declare("maximum_frequency", "HZ"),
             )
         if not 0 <= hz <= most:
             raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")

@@ -9,6 +9,7 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import (
+    Advice,
     BusError,
     Condition,
     Direction,
@@ -405,7 +406,10 @@ class YD1000(Drive):
         if hz == 0:
             raise Refused(f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first")
         if (yield from self._without_fault()).condition is Condition.RUNNING:
-            raise Refused(f"{self.name} turns: a preset speed is started from rest, so call stop() first")
+            raise Refused(
+                f"{self.name} turns: a preset speed is started from rest, so call stop() first",
+                advice=Advice.call("stop"),
+            )
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise Refused(
@@ -448,7 +452,10 @@ class YD1000(Drive):
     def _without_fault(self) -> Script[State]:
         state = yield from self.state.script()
         if state.condition is Condition.FAULT:
-            raise Refused(f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()")
+            raise Refused(
+                f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()",
+                advice=Advice.call("reset_fault"),
+            )
         return state
 
     def _direction(self) -> Script[Direction]:
