@@ -97,6 +97,23 @@ def test_a_family_imports_drive_alone(path: Path) -> None:
     assert ours(path) <= {"drive", "drives"}
 
 
+@pytest.mark.parametrize(
+    "path", [path for path in FILES if room(path) in ("drive", "planning")], ids=lambda path: path.stem
+)
+def test_drive_and_planning_are_pure(path: Path) -> None:
+    """They know no time but what they are given, and no port."""
+    ports = {"multidrop.core.port", "multidrop.core.row_queue", "multidrop.core.sniffer"}
+    names = {"datetime", "random", "threading", "pathlib", "asyncio"}
+    assert not imports(path) & (OUTSIDE | ports | names)
+    taken = {
+        alias.name
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module == "multidrop.core"
+        for alias in node.names
+    }
+    assert taken <= {"Framing", "Message", "NumberFormat", "build_request", "reply_length"}
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_imports_point_downwards(path: Path) -> None:
     if room(path) in ("__init__", "__main__"):
