@@ -18,14 +18,14 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import check_own, check_plain, is_harmless, raw_count
+from multidrop.control.rules import check_own
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Echo, Message, Peer
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Script, Write
+from multidrop.drive.script import Script
 from multidrop.drive.state import State
 from multidrop.errors import BusError
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
@@ -36,35 +36,6 @@ D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)
 
 _log = logging.getLogger("multidrop.bus")
-
-
-class _Claims:
-    """Keeps each drive on one bus at a time."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        register_at_fork(self)
-
-    def forked(self) -> None:
-        self._lock = threading.Lock()
-
-    def claim(self, drive: Drive, bus: Bus) -> None:
-        """Raise ValueError where another bus that is still open has it."""
-        with self._lock:
-            owner = drive.bus
-            if owner is not None and owner is not bus and owner.is_open:
-                raise ValueError(
-                    f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"
-                )
-            drive.bus = bus
-
-    def free(self, drive: Drive, bus: Bus) -> None:
-        with self._lock:
-            if drive.bus is bus:
-                drive.bus = None
-
-
-_claims = _Claims()
 
 
 class Bus:
@@ -132,6 +103,7 @@ class Bus:
         self._is_closed = True
         self._attaching = threading.RLock()
         self._latches.forked()
+        self._free(self.drives)
 
     def __repr__(self) -> str:
         state = "" if self.is_open else ", closed"
@@ -181,9 +153,11 @@ class Bus:
             self.line.close()
             self._meter.freeze(overruns)
             self._records.close()
+            with self._attaching:
+                self._free(self.drives)
 
     def tended(self, is_tended: bool) -> None:
-        """Note that somebody opens a lost port again: a stop waits for that, or else does it itself."""
+        """Note that a poller opens a lost port again: a stop waits for that, or else does it itself."""
         self._stopper.is_tended = is_tended
 
     # ---- the drives ----
@@ -200,7 +174,12 @@ class Bus:
             for other in self.drives:
                 if other.address == made.address:
                     raise ValueError(f"address {made.address} is taken by {other.name}")
-            _claims.claim(made, self)
+            owner = vars(made).setdefault("bus", self)  # in one step: two buses cannot both have it
+            if owner is not self and owner.is_open:
+                raise ValueError(
+                    f"{made.name} is on the bus at {owner.line.port}: detach it there first, or make another"
+                )
+            made.bus = self
             made.perform = lambda script: self.perform(made, script)
             made.check_identity = lambda: self.check_identity(made)
             made.begin_call = lambda verb: self._performer.call(made, verb)
@@ -237,8 +216,14 @@ class Bus:
             self.drives = [other for other in self.drives if other is not drive]
             self._exchanges.remove(drive)
             self._writer.identity_check.forget(drive)
-            _claims.free(drive, self)
+            self._free([drive])
         _log.debug("%s: detached %s", self.line.port, drive.name)
+
+    def _free(self, drives: Iterable[Drive]) -> None:
+        """Let these drives be attached to another bus."""
+        for drive in drives:
+            if drive.bus is self:
+                del drive.bus
 
     def peer(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; ValueError for a drive that is not on this bus."""
@@ -246,7 +231,7 @@ class Bus:
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """What is learnt of each drive that is on this bus now."""
+        """Learnt answers of each drive that is on this bus now."""
         return self._exchanges.peers
 
     # ---- reading ----
@@ -280,21 +265,7 @@ class Bus:
 
     def try_write(self, drive: Drive, register: Register[T], value: T) -> Outcome:
         """Write as `write`, and return the outcome of a write that was sent, whatever it is."""
-        raw = raw_count(drive, register, value)
-        check_plain(drive, register, raw)
-        step = Write(register, value)
-        if is_harmless(register, raw):  # a stop
-            self._latches.rise([drive])
-            try:
-                return self._writer.verified(drive, self._stopper.insist(drive, step))
-            finally:
-                self._records.catch_up()
-        call = self._performer.call(drive)
-        with call.noted():
-            call.check(f"{register.name} = {register.format(value)}")
-            outcome = self._writer.put(drive, step, call)
-            with call.look():
-                return self._writer.verified(drive, outcome)
+        return self._performer.write(drive, register, value)
 
     def raw(self, drive: Drive, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
         """Send any request once, past every rule, and return the data of the reply.
@@ -302,9 +273,7 @@ class Bus:
         The one deliberate way round: no check of the drive's identity, no span, no budget. It may start a
         motor. Raises Unconfirmed when no answer comes, and DriveRefused; Overtaken and Expired as `write`.
         """
-        call = self._performer.call(drive)
-        with call.noted():
-            return self._writer.raw(drive, Message(drive.address, function, start, count, data), call)
+        return self._performer.raw(drive, Message(drive.address, function, start, count, data))
 
     def perform(self, drive: Drive, script: Script[Any]) -> Any:
         """Carry out a script's steps, none of which is written once a stop was called.
@@ -344,8 +313,8 @@ class Bus:
         By broadcast where all drives are of one family that has it, and known to be; and then each of
         them, in turns, again and again until it is seen to stand: for `seconds` s, or without that for 30 s
         at least, and as long as the motor's ramp may take. Never raises for one drive: the others go on.
-        What was called before and would move a motor ends with Overtaken, and so does what is called
-        meanwhile. An interruption has each that does not stand yet sent its stop once more.
+        A call that would move a motor ends with Overtaken, if it came before or comes while this lasts.
+        After an interruption each drive that does not stand yet is sent its stop once more.
         """
         peers = self.peers
         is_known = self._writer.identity_check.is_known

@@ -77,7 +77,7 @@ class Poller:
     def __repr__(self) -> str:
         state = "closed" if self._closing else "polling" if self._thread.is_alive() else "not started"
         lines = ", ".join(f"{line.name}: {len(line.bus.drives)} drives" for line in self._lines)
-        return f"<Poller {state}; {lines}>"
+        return f"<Poller {state}; {lines or 'no lines'}>"
 
     def __enter__(self) -> Poller:
         for line in self._lines:

@@ -1,4 +1,4 @@
-"""EchoCheck: tells a drive's confirmation of a write from its adapter's echo.
+"""EchoCheck: distinguishes a drive's confirmation of a write from its adapter's echo.
 
 Many confirmations are copies of their requests, and so is an echo.
 """
@@ -39,7 +39,7 @@ class EchoCheck:
         """Return why a reply that is a copy of its request may be the adapter's echo; "" where it is not.
 
         An echo may begin at any time, and the drive may be dead: so something must be read after the write.
-        Where the adapter is known to echo, the core has told the one from the other.
+        Where the adapter is known to echo, the core has distinguished the two.
         """
         line = self._exchanges.line
         if line.has_echo:

@@ -73,8 +73,7 @@ class IdentityCheck:
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
             raise Refused(f"{drive.name}: a look at its identity must not write")
-        name = step.register.name
-        return self._exchanges.values(drive, [step.register], attempts, insists=insists)[name]
+        return self._exchanges.value(drive, step.register, attempts, insists=insists)
 
     # ---- before a stop ----
 
@@ -157,7 +156,7 @@ class IdentityCheck:
         def do(step: Step) -> object:
             if not isinstance(step, Read):
                 return None
-            return self._exchanges.values_as(other, drive, step.register)[step.register.name]
+            return self._exchanges.value_as(other, drive, step.register)
 
         try:
             carry_out(other.identify.script(), do)

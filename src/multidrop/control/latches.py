@@ -71,7 +71,7 @@ class Latches:
 
     @contextmanager
     def stopping(self, drives: Sequence[Drive]) -> Iterator[None]:
-        """Let nothing that moves these drives begin or go on meanwhile, and none of them leave."""
+        """Within this context nothing that moves these drives begins or goes on, and none of them leaves."""
         with self._over:
             self._stops += 1
         try:

@@ -1,4 +1,4 @@
-"""Performer: carries out the verbs of a line's drives, until a stop comes."""
+"""Performer: carries out plain writes and the verbs of a line's drives, until a stop comes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from typing import Any
 
 from multidrop.control.call import Call
 from multidrop.control.latches import Latches
+from multidrop.control.outcome import Outcome
+from multidrop.control.rules import check_plain, is_harmless, raw_count
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
+from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carry_out
 from multidrop.errors import BadReply, DriveRefused, LineError, NoReply, NotAttached, Overtaken, Unconfirmed
 from multidrop.transport import clock
-from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
+from multidrop.transport.exchange import Exchanges
 
 _log = logging.getLogger("multidrop.control")
 
@@ -57,6 +60,30 @@ class Performer:
                     raise outcome.failure
             return result
 
+    def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
+        """Carry out a plain write, or at once and by all means one that stops the motor."""
+        raw = raw_count(drive, register, value)
+        check_plain(drive, register, raw)
+        step = Write(register, value)
+        if is_harmless(register, raw):  # a stop
+            self._latches.rise([drive])
+            try:
+                return self._writer.verified(drive, self._stopper.insist(drive, step))
+            finally:
+                self._writer.records.catch_up()
+        call = self.call(drive)
+        with call.noted():
+            call.check(f"{register.name} = {register.format(value)}")
+            outcome = self._writer.put(drive, step, call)
+            with call.look():
+                return self._writer.verified(drive, outcome)
+
+    def raw(self, drive: Drive, request: Message) -> bytes:
+        """Send any request once, and return the data of the reply."""
+        call = self.call(drive)
+        with call.noted():
+            return self._writer.raw(drive, request, call)
+
     def check_identity(self, drive: Drive, call: Call | None = None) -> None:
         """Check once that it is of its family; the first check also logs what its watchdog does."""
         identity_check = self._writer.identity_check
@@ -73,7 +100,7 @@ class Performer:
         if register is None or not register.readable:
             return drive.watchdog
         try:
-            held = self._read(drive, register)
+            held = self._exchanges.value(drive, register)
         except DriveRefused:
             return drive.watchdog
         if held == 0:
@@ -115,15 +142,12 @@ class Performer:
                 return clock.sleep(step.seconds)
         if isinstance(step, Read):
             with call.look():
-                value = self._read(drive, step.register)
+                value = self._exchanges.value(drive, step.register)
             call.unverified = None
             return value
         if isinstance(step, Insist):
             return self._stopper.insist(drive, step).value
         return self._writer.put(drive, step, call).value
-
-    def _read(self, drive: Drive, register: Register[Any]) -> Any:
-        return self._exchanges.values(drive, [register], READ_ATTEMPTS)[register.name]
 
 
 def _check(step: Step, call: Call, overtaken: list[Overtaken]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.stop_attempt import Do, Patience, StopAttempt
+from multidrop.control.stop_attempt import Do, StopAttempt
 from multidrop.control.writer import Writer
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Script, Step, Write
@@ -29,7 +29,7 @@ _log = logging.getLogger("multidrop.control")
 class Stopper:
     """Stops the drives of one bus.
 
-    `is_tended` tells that somebody opens a lost port again: a stop waits for that, or else does it itself.
+    `is_tended`: a poller opens a lost port again, and a stop waits for that; else the stop does it itself.
     """
 
     def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
@@ -44,10 +44,10 @@ class Stopper:
 
         Raises Unconfirmed when it is not seen to stand then, and says what is known.
         """
-        patience = _patience(seconds)
+        _check(seconds)
         self._latches.latch(drive)  # raises for one that is not on this bus
         with self._under_way([drive]):
-            stop = StopAttempt(drive, make, _now(), patience)
+            stop = StopAttempt(drive, make, _now(), seconds)
             stop_together([stop], self._do, lambda stop: None)
         _log.info("%s", stop.result(_now()))
         if stop.known is not None:
@@ -60,11 +60,11 @@ class Stopper:
 
         `broadcast` is called before, and returns True where it has sent a stop to all of them.
         """
-        patience = _patience(seconds)
+        _check(seconds)
         found: dict[str, Stopped] = {}
         with self._under_way(drives):
             begun = _now()
-            stops = [StopAttempt(drive, drive.stop.script, begun, patience) for drive in drives]
+            stops = [StopAttempt(drive, drive.stop.script, begun, seconds) for drive in drives]
             try:
                 sent = broadcast()
             except BaseException as interruption:
@@ -93,7 +93,7 @@ class Stopper:
         """Carry out a step; a stop's first write must not hold up others', a later one may wait."""
         self._regain()
         if isinstance(step, Read):  # once: where it is not answered the stop is sent again
-            return self._exchanges.values(stop.drive, [step.register], 1)[step.register.name]
+            return self._exchanges.value(stop.drive, step.register, 1)
         assert isinstance(step, Write)
         return self._writer.insist(stop.drive, step, WRITE_TIMEOUT if stop.is_sent else 0.0).value
 
@@ -116,10 +116,9 @@ def _now() -> float:
     return clock.now_ns() / 1e9
 
 
-def _patience(seconds: float | None) -> Patience:
+def _check(seconds: float | None) -> None:
     if seconds is not None and (isinstance(seconds, bool) or isnan(seconds) or seconds < 0):
         raise ValueError(f"seconds = {seconds!r} is no time that a stop may take: give 0 or more, or none")
-    return Patience(seconds)
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:

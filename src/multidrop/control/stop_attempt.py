@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 from multidrop.control.outcome import Seen, Stopped
@@ -28,47 +27,29 @@ from multidrop.errors import (
 LEAST_S = 30.0  # for which a stop is repeated where its caller gives no time
 PAUSE_S = 0.2  # before it is repeated
 MOST_STEPS = 8  # that are sent once more after an interruption
+WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost)
 
 _log = logging.getLogger("multidrop.control")
 
 Do = Callable[["StopAttempt", Step], Any]
 
 
-@dataclass(frozen=True)
-class Patience:
-    """How long a stop is repeated, and after which failures.
+class StopAttempt:
+    """One drive's stop under way; its `failure`, None while all is well.
 
-    Without `seconds` it is for LEAST_S at least, and an attempt that has begun by then may take its time,
-    which is the ramp's.
+    It is repeated for `seconds`; without that for LEAST_S at least, and an attempt that has begun by then
+    may take its time, which is the ramp's.
     """
 
-    seconds: float | None = None
-    worth_repeating: tuple[type[Exception], ...] = (
-        Unconfirmed,
-        NotDone,
-        NoReply,
-        BadReply,
-        DriveRefused,
-        PortLost,
-    )
-
-
-class StopAttempt:
-    """One drive's stop under way; its `failure`, None while all is well."""
-
     def __init__(
-        self,
-        drive: Drive,
-        script: Callable[[], Script[Any]],
-        begun: float,
-        patience: Patience,
+        self, drive: Drive, script: Callable[[], Script[Any]], begun: float, seconds: float | None
     ) -> None:
         self.drive = drive
         self.due = begun
         self.failure: Exception | None = None
         self.is_sent = False  # a stop has left for it
         self._begun = begun
-        self._patience = patience
+        self._seconds = seconds
         self._make = script
         self._sent = 0
         self._is_confirmed = False
@@ -82,7 +63,7 @@ class StopAttempt:
 
     def advance(self, do: Do, now: Callable[[], float]) -> bool:
         """Carry out one step; True when the stop is over."""
-        limit = self._patience.seconds
+        limit = self._seconds
         if limit is not None and self.is_sent and now() >= self._begun + limit:
             reason = f"after {limit:g} s, all that it was given, it is not seen to have stopped"
             self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
@@ -103,8 +84,8 @@ class StopAttempt:
 
     def _wait(self, seconds: float, now: float) -> None:
         self.due = now + seconds
-        if self._patience.seconds is not None:
-            self.due = min(self.due, max(now, self._begun + self._patience.seconds))
+        if self._seconds is not None:
+            self.due = min(self.due, max(now, self._begun + self._seconds))
         script = self._script
         self._resume = lambda: script.send(None)
 
@@ -138,8 +119,8 @@ class StopAttempt:
         self._is_confirmed |= failure is None
 
     def _goes_on(self, failure: Exception, now: float) -> bool:
-        limit = LEAST_S if self._patience.seconds is None else self._patience.seconds
-        if not isinstance(failure, self._patience.worth_repeating) or now >= self._begun + limit:
+        limit = LEAST_S if self._seconds is None else self._seconds
+        if not isinstance(failure, WORTH_REPEATING) or now >= self._begun + limit:
             return False
         if not self._has_warned:
             self._has_warned = True

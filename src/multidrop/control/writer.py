@@ -30,7 +30,7 @@ from multidrop.errors import (
     Unconfirmed,
 )
 from multidrop.transport import clock
-from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
+from multidrop.transport.exchange import Exchanges
 
 
 class Writer:
@@ -55,7 +55,7 @@ class Writer:
         if kept is not Kept.RAM:
             if register.readable:
                 with call.look():
-                    held = self._read(drive, register)
+                    held = self._exchanges.value(drive, register)
                 if held == asked:
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
             call.check(_in_words(register, asked))  # a write that is not sent is not counted
@@ -190,12 +190,9 @@ class Writer:
             return None, None
         try:
             with call.look() if call else nullcontext():
-                return self._read(drive, register), None
+                return self._exchanges.value(drive, register), None
         except (NoReply, BadReply, DriveRefused, LineError, NotAttached) as failure:
             return None, failure
-
-    def _read(self, drive: Drive, register: Register[Any]) -> Any:
-        return self._exchanges.values(drive, [register], READ_ATTEMPTS)[register.name]
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
         """Carry out a step of a rule's conditions."""
@@ -203,7 +200,7 @@ class Writer:
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)
         with call.look():
-            return self._read(drive, step.register)
+            return self._exchanges.value(drive, step.register)
 
     @contextmanager
     def _logged(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:

@@ -78,6 +78,8 @@ class Drive:
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
 
+    bus: Any = None  # that it is attached to
+
     def __init_subclass__(cls) -> None:
         """Collect the registers. Raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
@@ -152,7 +154,6 @@ class Drive:
         self.option = self._options(options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # setpoint that set_frequency wrote last
-        self.bus: Any = None  # that it is attached to
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.check_identity: Callable[[], None] = lambda: None  # a bus does
         self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
@@ -407,5 +408,5 @@ class Drive:
 # Names that a register cannot have.
 _NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "commanded", "bus", "perform", "check_identity"}
+    | {"option", "ram", "commanded", "perform", "check_identity"}
 )

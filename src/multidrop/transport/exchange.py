@@ -25,19 +25,9 @@ NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the val
 
 
 def make_exchange(
-    drive: Drive,
-    request: Message,
-    peer: Peer,
-    rows: core.RowLayout | None = None,
-    *,
-    period: float = 0.0,
-    insists: bool = False,
-    timeout: float = 0.0,
-    answer: tuple[int, int] | None = None,
-    echo_probe: Exchange | None = None,
-    permit: Permit | None = None,
+    drive: Drive, request: Message, peer: Peer, rows: core.RowLayout | None = None, **details: Any
 ) -> Exchange:
-    """Return the exchange that carries this request to this drive at its settings."""
+    """Return the exchange that carries this request to this drive; `details` are Exchange's own."""
     settings = drive.settings
     return Exchange(
         drive.framing,
@@ -48,34 +38,19 @@ def make_exchange(
         character=settings.character,
         silence=silence(drive),
         turnaround=drive.turnaround_delay,
-        period=period,
-        insists=insists,
-        timeout=timeout,
-        answer=answer,
         block=rows,
-        echo_probe=echo_probe,
-        permit=permit,
+        **details,
     )
 
 
 def make_read(
-    drive: Drive,
-    block: Block,
-    peer: Peer,
-    rows: core.RowLayout = NO_ROWS,
-    *,
-    period: float = 0.0,
-    insists: bool = False,
-    timeout: float = 0.0,
+    drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
 ) -> Exchange:
     """Return the exchange that reads a block, with the probe for an adapter's echo where it needs one."""
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
         probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
-    request = block.request
-    return make_exchange(
-        drive, request, peer, rows, period=period, insists=insists, timeout=timeout, echo_probe=probe
-    )
+    return make_exchange(drive, block.request, peer, rows, echo_probe=probe, **details)
 
 
 class PreparedRead:
@@ -151,7 +126,7 @@ class Exchanges:
 
     @property
     def peers(self) -> dict[Drive, Peer]:
-        """All that are on the line now; drives may come and go meanwhile, on any thread."""
+        """Peers of the drives that are on the line now; a copy, as any thread may add and remove drives."""
         return dict(self._peers)
 
     def peer(self, drive: Drive) -> Peer:
@@ -189,6 +164,12 @@ class Exchanges:
             found.update(read.decode(self._ask(drive, exchange, attempts)))
         return {register.name: found[register.name] for register in registers}
 
+    def value(
+        self, drive: Drive, register: Register[Any], attempts: int = READ_ATTEMPTS, *, insists: bool = False
+    ) -> Any:
+        """Return one register's value."""
+        return self.values(drive, [register], attempts, insists=insists)[register.name]
+
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
         made_for = (
@@ -205,12 +186,12 @@ class Exchanges:
             prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
         return prepared
 
-    def values_as(self, other: Drive, drive: Drive, register: Register[Any]) -> dict[str, Any]:
+    def value_as(self, other: Drive, drive: Drive, register: Register[Any]) -> Any:
         """Return what a drive replies to the request of another family, sent once and without waiting."""
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return dict(read.decode(self._ask(drive, insisting, 1)))
+        return dict(read.decode(self._ask(drive, insisting, 1)))[register.name]
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
         """Return the reply to a read, which is sent again where it is lost."""

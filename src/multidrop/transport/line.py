@@ -11,12 +11,11 @@ from contextlib import suppress
 
 import serial
 
-from multidrop.core import REFUSALS, Completion, Echo, Exchange, Peer, Port, Result, Tap
+from multidrop.core import REFUSALS, Completion, Echo, Exchange, Peer, Port, Result, Tap, build_request
 from multidrop.core.fork import register_at_fork
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
-from multidrop.transport.frame_log import log_exchange
 from multidrop.transport.opening import connection_of, identity_of, is_pseudo_terminal, reason_of, unopened
 
 _ALL_SETTINGS = sum(REFUSALS)
@@ -225,12 +224,21 @@ class Line:
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
-            log_exchange(_log, self.port, exchange, found)
+            self._log_frames(exchange, found)
         if is_lost or found.result in (Result.LINE_LOST, Result.SETTINGS_REFUSED):
             failure = self._failure(found.result, found.error)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
+
+    def _log_frames(self, exchange: Exchange, found: Completion) -> None:
+        """Log both frames: direction, CLOCK_MONOTONIC in s, bytes, meaning."""
+        if found.sent_ns:
+            frame = build_request(exchange.framing, exchange.request).hex(" ").upper()
+            _log.debug("%s > %.6f %s %s", self.port, found.sent_ns / 1e9, frame, exchange.request)
+        meaning = found.reply if found.result > 0 else Result(found.result)
+        at = (found.first_ns or found.begun_ns) / 1e9
+        _log.debug("%s < %.6f %s %s", self.port, at, found.raw.hex(" ").upper() or "nothing", meaning)
 
     def _failure(self, result: int, error: int) -> LineError:
         if result == Result.SETTINGS_REFUSED:
@@ -272,5 +280,5 @@ class Line:
 
     @property
     def queue(self) -> Port | None:
-        """The core's port, for whoever keeps it busy; None while it is closed."""
+        """Port of the core, to queue exchanges on; None while it is closed."""
         return self._core

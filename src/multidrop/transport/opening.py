@@ -74,5 +74,5 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
 
 
 def is_pseudo_terminal(fd: int) -> bool:
-    """Return True for a pty, which stays at 8 bits without parity whatever it is told."""
+    """Return True for a pty, which stays at 8 bits without parity whatever settings it is given."""
     return os.ttyname(fd).startswith(("/dev/pts/", "/dev/ttys"))

@@ -34,7 +34,7 @@ class Diagnostics:
     bus_communication_errors: int
     """Exchanges that ended in damage: a bad checksum or character, a reply cut short, no frame at all.
     Parity and framing errors show as such damage. Noise that begins like a frame of another address
-    cannot be told from one, and is not counted."""
+    cannot be distinguished from one, and is not counted."""
 
     bus_exception_errors: int
     """Exception replies. A drive never says what it finds wrong with a broadcast."""

@@ -1,4 +1,4 @@
-"""WakeUp: tells select, poll or an asyncio loop that something waits."""
+"""WakeUp: a signal for select, poll or an asyncio loop."""
 
 from __future__ import annotations
 

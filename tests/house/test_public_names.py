@@ -1,0 +1,94 @@
+"""Public names: one list, loaded name by name, and what they show in a debugger."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from batches import example
+from toy import Toy
+
+import multidrop
+from multidrop import Bus, Plant, Poller
+
+NAMES = [name for name in multidrop.__all__ if name != "__version__"]
+
+
+def run(*words: str) -> str:
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_name_is_what_its_module_has(name: str) -> None:
+    home = import_module(multidrop._HOMES[name])
+    assert getattr(multidrop, name) is getattr(home, name)
+    assert name in dir(multidrop)
+
+
+def test_no_name_is_listed_twice() -> None:
+    stub = Path(multidrop.__file__).with_suffix(".pyi").read_text()
+    imports = [line for line in stub.splitlines() if line.startswith("from ")]
+    assert len(imports) == len(NAMES)
+    assert len(set(NAMES)) == len(NAMES)
+
+
+def test_a_name_that_is_none() -> None:
+    with pytest.raises(AttributeError, match="module 'multidrop' has no attribute 'Buss'"):
+        _ = multidrop.Buss  # type: ignore[attr-defined]
+
+
+def test_nothing_is_loaded_before_it_is_used() -> None:
+    code = (
+        "import sys, multidrop; print(sorted(name for name in sys.modules if name.startswith('multidrop')))"
+    )
+    assert run("-c", code).strip() == str(["multidrop", "multidrop.interpreter"])
+
+
+def test_the_version_is_the_distributions() -> None:
+    assert multidrop.__version__ == version("multidrop")
+
+
+def test_it_runs_as_a_module() -> None:
+    assert "usage: multidrop" in run("-m", "multidrop", "--help")
+
+
+def test_what_a_declaration_needs() -> None:
+    """A user's own family, by public names alone."""
+
+    class Own(multidrop.Drive):
+        speed = multidrop.reading(
+            1, "Hz", step=0.1, table=multidrop.INPUT, number_format=multidrop.NumberFormat.I16
+        )
+        level = multidrop.setting(2, kept=multidrop.Kept.RAM, table=multidrop.HOLDING)
+        lamp = multidrop.reading(3, number_format=multidrop.NumberFormat.BIT, table=multidrop.DISCRETE)
+
+    assert Own(1, framing=multidrop.Framing.RTU).speed is Own.speed
+
+
+# ---- in a debugger ----
+
+
+def test_a_drive_and_a_bus() -> None:
+    drive = Toy(3, name="pump-3")
+    assert repr(drive) == "<Toy 'pump-3', address 3, rtu, 9600 8N1, not attached>"
+    with Bus("loop://") as bus:
+        assert repr(bus) == "<Bus loop://: no drives>"
+        bus.attach(drive)
+        assert repr(drive) == "<Toy 'pump-3', address 3, rtu, 9600 8N1, on loop://>"
+        assert repr(bus) == "<Bus loop://: pump-3>"
+    assert repr(bus) == "<Bus loop://, closed: pump-3>"
+
+
+def test_a_batch() -> None:
+    assert repr(example()) == "<Batch: 5 rows of 3 drives, 3.000 s from 2026-11-21T09:30:00.123+00:00>"
+
+
+def test_a_poller() -> None:
+    poller = Poller(Plant((), Path()))
+    assert repr(poller) == "<Poller not started; no lines>"
+    poller.close()
+    assert repr(poller) == "<Poller closed; no lines>"

@@ -1,0 +1,99 @@
+"""Loggers under `multidrop.*`: a port's coming and going, frames, writes, refusals and stops."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tty
+from pathlib import Path
+from typing import Any
+
+import checksums
+import pytest
+from halls import one
+from toy import PatientToy
+
+from multidrop import Bus, LineError, Refused
+from multidrop.drives import InvtCHE
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+
+pytestmark = pytest.mark.usefixtures("_patient")
+
+
+def messages(caplog: pytest.LogCaptureFixture, logger: str) -> list[tuple[str, str]]:
+    return [(it.levelname, it.getMessage()) for it in caplog.records if it.name == logger]
+
+
+def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        caplog.at_level(logging.INFO, "multidrop"),
+        Simulator([Wire([SimulatedDrive(PatientToy(1))])]) as sim,
+    ):
+        port = sim.wires[0].path
+        Bus(port).close()
+    told = messages(caplog, "multidrop.line")
+    assert told == [("INFO", f"{port}: opened ({port})"), ("INFO", f"{port}: closed")]
+
+
+def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    """Its loss is told once, however often it is asked."""
+    link = tmp_path / "port"
+
+    def plugged_in() -> tuple[int, int]:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(slave))
+        return master, slave
+
+    ends = plugged_in()
+    with caplog.at_level(logging.INFO, "multidrop"), Bus(str(link)) as bus:
+        drive = bus.attach(PatientToy, 1)
+        for end in ends:
+            os.close(end)
+        for _ in range(3):
+            with pytest.raises(LineError):
+                bus.read(drive, drive.output_current)
+        ends = plugged_in()
+        bus.line.regain()
+        for end in ends:
+            os.close(end)
+    levels = [
+        (level, text.split(": ")[1].split(" (")[0]) for level, text in messages(caplog, "multidrop.line")
+    ]
+    assert levels[:3] == [("INFO", "opened"), ("WARNING", "lost"), ("INFO", "opened again")]
+
+
+def test_frames_are_logged_at_debug_alone(caplog: pytest.LogCaptureFixture) -> None:
+    with (
+        Simulator([Wire([SimulatedDrive(PatientToy(1))], unpaced=True)]) as sim,
+        Bus(sim.wires[0].path) as bus,
+    ):
+        drive = bus.attach(PatientToy, 1)
+        with caplog.at_level(logging.INFO, "multidrop"):
+            bus.read(drive, drive.output_current)
+        assert messages(caplog, "multidrop.line") == []
+        with caplog.at_level(logging.DEBUG, "multidrop"):
+            bus.read(drive, drive.output_current)
+    (_, request), (_, reply) = messages(caplog, "multidrop.line")[:2]
+    assert request.startswith(f"{bus.line.port} > ")
+    frame = checksums.rtu("01 03 00 02 00 01").hex(" ").upper()
+    assert f" {frame} Message(address=1, function=3, start=2, count=1" in request
+    assert reply.startswith(f"{bus.line.port} < ")
+    assert " 01 03 02 " in reply
+    assert "Message(address=1, function=3" in reply
+
+
+def test_writes_refusals_and_stops_are_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, drive, _ = one(monkeypatch, InvtCHE(1, name="pump-1", maximum_frequency=50))
+    bus: Any = drive.bus
+    with caplog.at_level(logging.INFO, "multidrop"):
+        drive.set_frequency(20)
+        with pytest.raises(Refused):
+            bus.write(drive, drive.register("setpoint"), 1e6)
+        bus.stop_all()
+    told = [text for _, text in messages(caplog, "multidrop.control")]
+    assert any(text.startswith("pump-1: ") and text.endswith(": done") for text in told)
+    assert any(text.startswith("pump-1: stopped after ") for text in told)
