@@ -26,7 +26,7 @@ from multidrop.drive.register import (
 from multidrop.drive.request import read_request, write_request
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import Block, blocks, plan, planned
-from multidrop.planning.bus_time import duration, gap, in_order, sending
+from multidrop.planning.bus_time import gap, in_order, sending, silence
 
 
 class Example(Drive):
@@ -47,6 +47,11 @@ class Example(Drive):
     long = setting(40, number_format=NumberFormat.U32)
     swapped = setting(42, number_format=NumberFormat.I32_SWAPPED)
     run = command(0x2000)
+
+
+def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
+    """Return the seconds of silence, request, response delay and reply."""
+    return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
 
 
 def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from decimal import Decimal
 from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, Generic, TypedDict, TypeVar, Unpack, cast, overload
+from typing import Any, Generic, Protocol, TypedDict, TypeVar, Unpack, cast, overload
 
 from multidrop.core import NumberFormat as NumberFormat
 from multidrop.drive.number_format import FLOATS, LONGS, nearest, raw_span, shortest
@@ -289,29 +290,34 @@ def _short(value: float) -> str:
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
-@overload
-def reading(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
-@overload
-def reading(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
-def reading(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+class Declaration(Protocol):
+    """A function that declares registers, each with its unit or the enumeration of its values."""
+
+    @overload
+    def __call__(self, address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+    @overload
+    def __call__(self, address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+
+
+def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
+    """Decorate a function that takes an address, a unit or an enumeration, and details."""
+    return cast(Declaration, declare)
+
+
+@declaration
+def reading(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can only be read, with its unit or the enumeration of its values."""
     return _declare(Access.READING, address, what, details)
 
 
-@overload
-def setting(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
-@overload
-def setting(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
-def setting(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+@declaration
+def setting(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can be read and written, with its unit or the enumeration of its values."""
     return _declare(Access.SETTING, address, what, details)
 
 
-@overload
-def command(address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
-@overload
-def command(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
-def command(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
+@declaration
+def command(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can only be written, with its unit or the enumeration of its values."""
     return _declare(Access.COMMAND, address, what, details)
 

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 from enum import IntEnum, IntFlag
-from typing import Any
+from typing import Any, Unpack
 
 from multidrop.drive import Advice, BusError, Drive, DriveRefused, Refused, Unconfirmed
-from multidrop.drive.register import COIL, HOLDING, INPUT, NumberFormat, Register, command, reading, setting
+from multidrop.drive.register import (
+    COIL,
+    HOLDING,
+    INPUT,
+    Details,
+    NumberFormat,
+    Register,
+    command,
+    declaration,
+    reading,
+    setting,
+)
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
@@ -57,6 +68,30 @@ class Modes(IntFlag):
     MODULATION_TYPE = 1 << 0
     CONTROL_TYPE = 1 << 4
     AUTOMATIC_VOLTAGE_REGULATOR = 1 << 8
+
+
+@declaration
+def _coil(number: int, what: Any, /, **details: Unpack[Details]) -> Register[Any]:
+    details["table"], details["place"] = COIL, f"section 10, commands: {number}"
+    return command(number, what, **details)
+
+
+@declaration
+def _held(number: int, what: Any, /) -> Register[Any]:
+    return reading(number, what, table=COIL, place=f"section 6, function 01; section 10, commands: {number}")
+
+
+@declaration
+def _state(number: int, what: Any, /, **details: Unpack[Details]) -> Register[Any]:
+    details["table"], details["place"] = INPUT, f"section 10, state: {details.get('place', number)}"
+    return reading(number, what, **details)
+
+
+@declaration
+def _control(number: int, what: Any, /, **details: Unpack[Details]) -> Register[Any]:
+    """Declare a control register; its place is the menu's name for it."""
+    details["place"] = f"{details['place']}; section 10, control: {number}"
+    return setting(number, what, **details)
 
 
 class ErmanERG220(Drive):
@@ -121,42 +156,31 @@ class ErmanERG220(Drive):
     }
 
     # Commands (section 10)
-    start_coil = command(0x0000, Coil, table=COIL, harmless=(Coil.OFF,), place="section 10, commands: 0")
-    stop_coil = command(0x0001, Coil, table=COIL, harmless=(Coil.ON,), place="section 10, commands: 1")
-    emergency_stop_coil = command(
-        0x0002, Coil, table=COIL, harmless=(Coil.ON,), place="section 10, commands: 2"
-    )
-    fault_reset_coil = command(
-        0x0009, Coil, table=COIL, harmless=(Coil.OFF,), place="section 10, commands: 9"
-    )
+    start_coil = _coil(0x0000, Coil, harmless=(Coil.OFF,))
+    stop_coil = _coil(0x0001, Coil, harmless=(Coil.ON,))
+    emergency_stop_coil = _coil(0x0002, Coil, harmless=(Coil.ON,))
+    fault_reset_coil = _coil(0x0009, Coil, harmless=(Coil.OFF,))
 
     # State registers (section 10)
-    output_frequency = reading(0x0001, "Hz", step=0.1, table=INPUT, place="section 10, state: 1")
-    output_current = reading(0x0003, "A", step=0.1, table=INPUT, place="section 10, state: 3")
-    dc_bus_voltage = reading(0x0005, "V", table=INPUT, place="section 10, state: 5")
-    heatsink_temperature = reading(
-        0x0006,
-        "°C",
-        number_format=NumberFormat.I16,
-        table=INPUT,
-        place="section 10, state: 6",
-        note="Whether it is signed is not stated.",
+    output_frequency = _state(0x0001, "Hz", step=0.1)
+    output_current = _state(0x0003, "A", step=0.1)
+    dc_bus_voltage = _state(0x0005, "V")
+    heatsink_temperature = _state(
+        0x0006, "°C", number_format=NumberFormat.I16, note="Whether it is signed is not stated."
     )
-    output_voltage = reading(0x000C, "V", table=INPUT, place="section 10, state: 12")
-    status = reading(
+    output_voltage = _state(0x000C, "V")
+    status = _state(
         0x0400,
         ErmanStatus,
         number_format=NumberFormat.U32_EITHER,
-        table=INPUT,
-        place="section 10, state: 1024-1025",
+        place="1024-1025",
         note="The word order is not stated; all that is defined fits one word.",
     )
-    last_fault = reading(
+    last_fault = _state(
         0x0402,
         ErmanFault,
         number_format=NumberFormat.U32_EITHER,
-        table=INPUT,
-        place="section 10, state: 1026-1027",
+        place="1026-1027",
         note="The last fault, which may be past. The word order is not stated.",
     )
 
@@ -167,37 +191,22 @@ class ErmanERG220(Drive):
         never="it changes the kind of modulation and control, and what its bits mean is not stated",
         place="section 10, control: 1",
     )
-    frequency = setting(
-        0x0002,
-        "Hz",
-        step=0.1,
-        at_least="minimum_frequency",
-        at_most="maximum_frequency",
-        place="b.007; section 10, control: 2",
+    frequency = _control(
+        0x0002, "Hz", step=0.1, at_least="minimum_frequency", at_most="maximum_frequency", place="b.007"
     )
-    maximum_frequency = setting(
-        0x0003, "Hz", step=0.1, at_least="minimum_frequency", place="b.006; section 10, control: 3"
-    )
-    minimum_frequency = setting(
-        0x0004, "Hz", step=0.1, at_most="maximum_frequency", place="b.005; section 10, control: 4"
-    )
-    carrier_frequency = setting(0x000B, "kHz", step=0.1, place="d.006; section 10, control: 11")
-    acceleration_time = setting(0x000C, "s", step=0.1, place="b.003; section 10, control: 12")
-    deceleration_time = setting(0x000D, "s", step=0.1, place="b.004; section 10, control: 13")
-    braking_threshold = setting(
-        0x0015, "V", place="E.06; section 10, control: 21", note="Of dynamic braking."
-    )
+    maximum_frequency = _control(0x0003, "Hz", step=0.1, at_least="minimum_frequency", place="b.006")
+    minimum_frequency = _control(0x0004, "Hz", step=0.1, at_most="maximum_frequency", place="b.005")
+    carrier_frequency = _control(0x000B, "kHz", step=0.1, place="d.006")
+    acceleration_time = _control(0x000C, "s", step=0.1, place="b.003")
+    deceleration_time = _control(0x000D, "s", step=0.1, place="b.004")
+    braking_threshold = _control(0x0015, "V", place="E.06", note="Of dynamic braking.")
 
     # The coils of the commands as they are held (sections 6 and 10); no gap is read across, so that all
     # that is read at once lies in one byte
-    start_held = reading(0x0000, Coil, table=COIL, place="section 6, function 01; section 10, commands: 0")
-    stop_held = reading(0x0001, Coil, table=COIL, place="section 6, function 01; section 10, commands: 1")
-    emergency_stop_held = reading(
-        0x0002, Coil, table=COIL, place="section 6, function 01; section 10, commands: 2"
-    )
-    fault_reset_held = reading(
-        0x0009, Coil, table=COIL, place="section 6, function 01; section 10, commands: 9"
-    )
+    start_held = _held(0x0000, Coil)
+    stop_held = _held(0x0001, Coil)
+    emergency_stop_held = _held(0x0002, Coil)
+    fault_reset_held = _held(0x0009, Coil)
 
     _reset_fault = ErmanFault(0)  # the last fault when this object reset it
 

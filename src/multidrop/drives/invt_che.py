@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Any, TypeVar, Unpack, overload
+from typing import Any, Unpack
 
 from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
-from multidrop.drive.register import HOLDING, Details, Kept, NumberFormat, Register, command, reading, setting
+from multidrop.drive.register import (
+    HOLDING,
+    Details,
+    Kept,
+    NumberFormat,
+    Register,
+    command,
+    declaration,
+    reading,
+    setting,
+)
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
-
-E = TypeVar("E", bound=IntEnum)
 
 CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"
@@ -84,10 +92,7 @@ class CommunicationFault(IntEnum):
     BUSY_STORING = 8
 
 
-@overload
-def parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
-@overload
-def parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+@declaration
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a function code by its ordinal number in one's own model's manual (section 11.6.4).
 
@@ -104,10 +109,7 @@ def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Re
     return setting(ordinal, what, **details)
 
 
-@overload
-def stored_parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
-@overload
-def stored_parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+@declaration
 def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a function code that is written in EEPROM, and outlasts a loss of power.
 

@@ -39,14 +39,6 @@ def sending(drive: Drive, block: Block) -> float:
     return characters(drive.framing, block.table, block.count) * drive.settings.character
 
 
-def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
-    """Return the seconds that a block takes on the line: silence, request, response delay, reply.
-
-    `delay` takes the place of the document's response delay where it was measured.
-    """
-    return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
-
-
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
     """Return the seconds from one drive's reply to the other's request, on a line that is never idle.
 
