@@ -49,14 +49,14 @@ def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
     for register in registers:
         tables.setdefault(register.table, []).append(register)
     found = []
-    for table, wanted in tables.items():
+    for wanted in tables.values():
         groups: list[list[Register[Any]]] = []
         for register in sorted(wanted, key=lambda it: it.address):
             if groups and most_gap >= 0 and joins(drive, groups[-1], register, most_gap):
                 groups[-1].append(register)
             else:
                 groups.append([register])
-        found += [Block(table, it[0].address, end(it[-1]) - it[0].address, tuple(it)) for it in groups]
+        found += [Block.of(drive, group) for group in groups]
     return found
 
 

@@ -151,7 +151,7 @@ def simulated(drives: Iterable[tuple[str, Drive]]) -> Iterator[str]:
             for model, drive in drives
         )
         plant.write_text('[[line]]\nname = "line"\nport = "-"\n' + "".join(entries))
-        command = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", directory]
+        command = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", directory]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None
             yield process.stdout.readline().split()[2]

@@ -1,4 +1,4 @@
-"""What can go wrong on a bus, as one tree with its data in fields.
+"""Errors of a bus, as one tree with its data in fields.
 
 A mistake of the caller is a ValueError or TypeError at the call; everything else is a BusError.
 """
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class BusError(Exception):
-    """Anything that goes wrong between the call and the drive."""
+    """Any failure between the call and the drive."""
 
 
 class LineError(BusError, OSError):
@@ -41,7 +41,7 @@ class NoReply(BusError, TimeoutError):
 
 
 class BadReply(BusError):
-    """Something came, but not the reply to the request."""
+    """Bytes came that are not the reply to the request."""
 
     def __init__(self, drive: str, reason: str, frame: bytes) -> None:
         super().__init__(f"{drive}: {reason} (received {frame.hex(' ').upper() or 'nothing'})")
@@ -51,7 +51,7 @@ class BadReply(BusError):
 
 
 class DriveRefused(BusError):
-    """The drive answered with an exception: it did not do what it was asked."""
+    """The drive answered with an exception: it did not do what the request asked."""
 
     def __init__(self, drive: str, code: int, meaning: str) -> None:
         super().__init__(f"{drive} refuses: code {code:02X}H, {meaning}")
@@ -75,7 +75,7 @@ class Unsupported(BusError):
 
 
 class NotDone(BusError):
-    """The drive is seen not to do what it confirmed: it took another value, or tripped."""
+    """The drive confirmed the write and did not do it: it took another value, or tripped."""
 
     def __init__(self, drive: str, what: str, reason: str) -> None:
         super().__init__(f"{drive}: {what} did not take effect: {reason}")
@@ -126,7 +126,7 @@ class Advice(NamedTuple):
 
 
 class Refused(BusError, ValueError):
-    """The library itself would not send it: which register, by which rule, and where the manual has it."""
+    """The library itself did not send it; with the register, the rule, and its place in the manual."""
 
     def __init__(
         self,
@@ -148,5 +148,5 @@ class Refused(BusError, ValueError):
         return str(self).replace(*self.advice) if self.advice else str(self)
 
 
-class LookAgain(Exception):
-    """A drive answered once as another would: it is looked at again, after the stops of others."""
+class CheckAgain(Exception):
+    """A drive answered once as another would: its identity is checked again, after the stops of others."""

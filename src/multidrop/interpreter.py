@@ -1,4 +1,4 @@
-"""One interpreter of a process is served, the main one."""
+"""Check that this is the main interpreter of its process: no other is served."""
 
 from __future__ import annotations
 

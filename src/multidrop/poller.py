@@ -1,8 +1,7 @@
-"""Poller: plan, schedule and lines together, turned into batches of columns.
+"""Poller: all lines of a plant, polled continuously, as batches of rows.
 
-The lines are kept busy by the core's own thread, which waits for nobody; one thread tends them all
-when the core calls. Rows gather in the core, in chunks of bounded number; whoever takes them gets
-the oldest first.
+The lines are kept busy by the core's own thread; one thread here tends them all when the core calls.
+Rows gather in the core, in chunks of bounded number, and are taken from there, the oldest first.
 """
 
 from __future__ import annotations
@@ -19,15 +18,16 @@ from multidrop.core import RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.plant.model import Plant, PolledDrive
 from multidrop.polling.batch import Batch
-from multidrop.polling.polled_line import Codes, PolledLine
-from multidrop.transport.clock import now_ns, sleep
+from multidrop.polling.jobs import RowNames
+from multidrop.polling.polled_line import PolledLine
+from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
-from multidrop.transport.wakeup import Wake
+from multidrop.transport.wakeup import WakeUp
 
-LOOK_S = 0.05  # the longest that a line waits to be tended, or whoever wants rows to be told of them
-REST_S = 0.5  # the same, where nobody waits for either
-FILLING_NS = 10_000_000  # so long new rows gather before they are taken from a chunk that is not full
-PARTING_NS = 1_000_000_000  # so long the end of the polling waits for what is under way
+LOOK_S = 0.05  # between looks at the lines, while one of them or a reader of `fileno` needs them
+REST_S = 0.5  # the same, where neither does
+FILLING_NS = 10_000_000  # for which new rows gather before they are taken from a chunk that is not full
+ENDING_NS = 1_000_000_000  # for which the end of the polling waits for exchanges under way
 
 
 class Poller:
@@ -36,6 +36,9 @@ class Poller:
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
     missing. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
     of the polling, and are counted in `ledger` and noted in `audit`, as Bus says.
+
+    The logger `multidrop.line` has no polled frames: they never enter Python. `multidrop poll --capture`
+    writes them to a file for Wireshark.
     """
 
     def __init__(
@@ -47,11 +50,11 @@ class Poller:
     ) -> None:
         if not isinstance(plant, Plant):
             raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
-        self._codes = Codes()
+        self._names = RowNames()
         self._row_queue = RowQueue()
-        self._wake = Wake()
-        self._taken_ns = 0  # the newest rows
+        self._wakeup = WakeUp()
         self._is_watched = False  # somebody waits for `fileno`
+        self._taken_ns = 0  # the newest rows
         self._lines: list[PolledLine] = []
         self._closing = False
         self._changing = threading.Lock()  # one drive comes or goes at a time
@@ -60,16 +63,21 @@ class Poller:
         try:
             for number, declared in enumerate(plant.lines):
                 bus = Bus(declared.port, echo=declared.echo, ledger=ledger, audit=audit)
-                self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._codes))
+                self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._names))
         except BaseException:
             self.close()
             raise
 
     def forked(self) -> None:
-        """In the child it is closed, and has no rows."""
+        """Be closed in the child, without rows."""
         self._closing = True
         self._changing = threading.Lock()
-        self._wake.close()
+        self._wakeup.close()
+
+    def __repr__(self) -> str:
+        state = "closed" if self._closing else "polling" if self._thread.is_alive() else "not started"
+        lines = ", ".join(f"{line.name}: {len(line.bus.drives)} drives" for line in self._lines)
+        return f"<Poller {state}; {lines}>"
 
     def __enter__(self) -> Poller:
         for line in self._lines:
@@ -88,7 +96,7 @@ class Poller:
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be.
 
-        What is under way is waited for, for a second at most; every slot that is over by now has a row.
+        Exchanges under way are waited for, for a second at most; every slot that is over by now has a row.
         """
         if self._closing:
             return
@@ -96,36 +104,38 @@ class Poller:
         for line in self._lines:
             line.bus.leave()  # all of them at once
         if self._thread.is_alive():
-            self._wake_up()
+            self._call_thread()
             self._thread.join()
         for line in self._lines:
             line.bus.tended(False)
         for line in self._lines:
             line.bus.part()  # before the port is closed, on which it stops motors
-        given_up_ns = now_ns() + PARTING_NS
-        while sum(line.end() for line in self._lines) and now_ns() < given_up_ns:
-            sleep(0.001)
+        given_up_ns = clock.now_ns() + ENDING_NS
+        while sum(line.end() for line in self._lines) and clock.now_ns() < given_up_ns:
+            clock.sleep(0.001)
         for line in self._lines:
             line.close()
-        self._wake.close()
+        self._wakeup.close()
 
     def _poll(self) -> None:
         called: Iterable[PolledLine] = self._lines
         while not self._closing:
             for line in called:
-                line.tend(now_ns())
+                line.tend(clock.now_ns())
             if self._is_watched and self._row_queue.chunks:
-                self._wake.set()
-            now = now_ns()
+                self._wakeup.set()
+            now = clock.now_ns()
             restless = [line for line in self._lines if not line.is_steady(now)]
             seconds = LOOK_S if restless or self._is_watched else REST_S
             numbers = self._row_queue.await_calls(seconds)
-            lines = [self._lines[it] for it in numbers if it < len(self._lines)]
+            lines = [self._lines[number] for number in numbers if number < len(self._lines)]
             called = dict.fromkeys([*restless, *lines])
 
-    def _wake_up(self) -> None:
-        """Call the thread by a number that no line has."""
+    def _call_thread(self) -> None:
+        """Wake the thread by a number that no line has."""
         self._row_queue.call(len(self._lines))
+
+    # ---- lines and drives ----
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
@@ -145,10 +155,10 @@ class Poller:
         when the same PolledDrive is added again. Raises ValueError when there is none.
         """
         with self._changing:
-            found = self._line(line)
-            for it in found.bus.drives:
-                if it.name == drive:
-                    return found.remove(it)
+            polled = self._line(line)
+            for attached in polled.bus.drives:
+                if attached.name == drive:
+                    return polled.remove(attached)
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
     def _line(self, name: str) -> PolledLine:
@@ -160,10 +170,10 @@ class Poller:
     @property
     def buses(self) -> dict[str, Bus]:
         """The lines' buses, by name."""
-        return {polled.name: polled.bus for polled in self._lines}
+        return {line.name: line.bus for line in self._lines}
 
     def bus(self, line: str) -> Bus:
-        """The bus of the line with this name."""
+        """Return the bus of the line with this name."""
         return self._line(line).bus
 
     def stop_on_exit(self) -> None:
@@ -171,34 +181,39 @@ class Poller:
         for line in self._lines:
             line.bus.stop_on_exit()
 
+    # ---- rows ----
+
     def fileno(self) -> int:
-        """A descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
+        """Return a descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
         self._is_watched = True
-        self._wake_up()
-        return self._wake.fileno()
+        self._call_thread()
+        return self._wakeup.fileno()
 
     def take(self) -> Batch | None:
-        """The oldest rows that wait, at once; None when there are none, or only just a few new ones."""
-        now, chunks = now_ns(), self._row_queue.chunks
+        """Return the oldest rows that wait, at once; None when there are none, or only a few new ones."""
+        now, chunks = clock.now_ns(), self._row_queue.chunks
         if chunks < 2:
             if self._is_watched:
-                self._wake.clear()
+                self._wakeup.clear()
             if now - self._taken_ns < FILLING_NS and not self._closing:
                 return None
             self._taken_ns = now
         columns = self._row_queue.take()
-        return Batch(columns, self._codes.drives, self._codes.registers) if columns else None
+        return Batch(columns, self._names.drives, self._names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
-        """Batches as they come, about one `every` s, for `seconds` s or until the caller leaves off."""
-        end_ns = None if seconds is None else now_ns() + round(seconds * 1e9)
-        while end_ns is None or now_ns() < end_ns:
-            sleep(every if end_ns is None else min(every, max(0.0, (end_ns - now_ns()) / 1e9)))
+        """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops."""
+        end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
+        while end_ns is None or clock.now_ns() < end_ns:
+            left = every if end_ns is None else max(0.0, (end_ns - clock.now_ns()) / 1e9)
+            clock.sleep(min(every, left))
             while batch := self.take():
                 yield batch
 
+    # ---- how it went ----
+
     def statistics(self) -> dict[str, LineStatistics]:
-        """Of each line by name, since polling began or `reset_statistics`, also per drive; cheap."""
+        """Return statistics by line and drive since polling began, or `reset_statistics`; cheap."""
         return {line.name: line.bus.statistics() for line in self._lines}
 
     def reset_statistics(self) -> None:
@@ -207,7 +222,7 @@ class Poller:
             line.bus.reset_statistics()
 
     def summary(self) -> dict[str, Any]:
-        """So far, per line and drive: exchanges, values, misses by reason, rates, utilisation."""
+        """Return exchanges, values, misses by reason, rates and utilisation so far, by line and drive."""
         lines = {line.name: line.summary() for line in self._lines}
         return {
             "lines": lines,

@@ -1,13 +1,13 @@
-"""Text from files and arguments as it may reach a terminal or a page."""
+"""Text from files and arguments, made harmless for a terminal or a page."""
 
 from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    r"""Return the text with all that does not print as it stands spelt out: an escape is `\x1b`.
+    r"""Return the text with all unprintable characters spelt out: an escape is `\x1b`.
 
-    Control characters can move the cursor, change the title or the clipboard of a terminal; marks of
-    direction make a name look like another one.
+    Control characters can move a terminal's cursor, and change its title or clipboard; marks of direction
+    make a name look like another one.
     """
     if text.isprintable():
         return text

@@ -24,14 +24,14 @@ from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position, overvie
 from multidrop.cli.support.live_plant import LivePlant
 from multidrop.cli.support.polling import PollingSession
 from multidrop.cli.support.signals import Interruption
-from multidrop.control.stop_all import Seen, Stopped
+from multidrop.control.outcome import Seen, Stopped
 from multidrop.core import Counters, Result
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_reader
 from multidrop.recording.rows import from_rows
-from multidrop.transport.statistics import LineStatistics, look
+from multidrop.transport.statistics import LineStatistics, line_statistics
 
 __all__ = ["plant", "run"]  # fixtures
 
@@ -69,7 +69,7 @@ def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) ->
         delays=Counter({56: 99, 64: 1}),  # 8.4 to 9.4 ms, 16.8 to 18.9 ms
     )
     counters_by_drive = {f"drive-{at}": busy if at == 1 else Counters() for at in range(1, drives + 1)}
-    return {"hall-1": look(seconds, counters_by_drive, None)}
+    return {"hall-1": line_statistics(seconds, counters_by_drive, None)}
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 from lines import Faulty, patient, proof, until
 from toy import Fault, Toy
 
-from multidrop.bus import READ_ATTEMPTS, Bus, exchange
+from multidrop.bus import Bus
 from multidrop.core import Framing, Message
 from multidrop.drive import Drive, Script
 from multidrop.drive.register import HOLDING, Kept, command, reading, setting
@@ -24,6 +24,7 @@ from multidrop.errors import BadReply, BusError, DriveRefused, LineError, NoRepl
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
+from multidrop.transport.exchange import READ_ATTEMPTS, make_exchange
 
 
 class Rig(Drive):
@@ -119,7 +120,7 @@ def test_all_readings_in_as_few_requests_as_the_family_allows(family: type[Drive
         found = bus.read_many(ours, ours.readings())
         counters = bus.peer(ours).counters()
     assert found == {register.name: proof(ours, register) for register in ours.readings()}
-    echo_probes = 1 if ours.telling else 0  # on a line of which it is not known whether its adapter echoes
+    echo_probes = 1 if ours.echo_probe else 0  # on a line of which it is not known whether its adapter echoes
     assert counters.answered == REQUESTS[family] + echo_probes
     assert there.counters.requests == counters.exchanges == counters.answered
     assert there.counters.refusals == 0
@@ -161,7 +162,7 @@ def test_a_bus_has_a_silence_for_drives_without_their_own() -> None:
         for at in (1, 2):
             drive = bus.attach(ErmanERG220, at)
             assert drive.needed_silence() == 600e-6
-            assert exchange(drive, Message(at, 4, 1, 1), bus.peer(drive)).c.silence_ns == 626042
+            assert make_exchange(drive, Message(at, 4, 1, 1), bus.peer(drive)).c.silence_ns == 626042
             bus.read(drive, drive.output_current)
         assert bus.attach(ErmanERG220, 3, silence=1e-3).needed_silence() == 1e-3
         assert bus.attach(ErmanERG220, 4, silence=None).needed_silence() == 1.75e-3

@@ -153,7 +153,7 @@ def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyP
     log = tmp_path / "audit.jsonl"
     hall, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
     utc = [1_700_000_000 * 10**9]
-    monkeypatch.setattr("multidrop.control.writer.utc_minus_monotonic_ns", lambda: utc[0])
+    monkeypatch.setattr("multidrop.transport.clock.utc_minus_monotonic_ns", lambda: utc[0])
     tried = []
     for second in range(240):
         if second == 120:

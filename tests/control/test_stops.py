@@ -15,9 +15,9 @@ from motors import MAKE, STARTS
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.outcome import Effect
+from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.control.stop_all import LEAST_S, Seen
+from multidrop.control.stop_attempt import LEAST_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
 from multidrop.drive.register import Kept, reading, setting
@@ -832,7 +832,7 @@ def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tm
     for address in (1, 2):
         hall.attach(InvtCHE(address))
     stopped: list[int] = []
-    audit = hall.bus._writer.audit
+    audit = hall.bus._records.audit
     assert audit is not None
     monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(hall))))
     hall.bus.stop_all()

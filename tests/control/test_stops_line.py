@@ -14,13 +14,13 @@ from lines import line as declared_line
 from motors import MAKE, Heard
 
 from multidrop.bus import Bus
-from multidrop.control import performer
 from multidrop.core import Message
 from multidrop.drive import Condition
 from multidrop.errors import BusError, LineError, NoReply, Overtaken, Unconfirmed
 from multidrop.poller import Poller
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import PoweredDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
 from multidrop.transport import exchange as exchanges
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -234,7 +234,7 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
             assert pulled.heard.starts == []
             until(lambda: not pulled.heard.sim.motor.energised)
             waits: list[float] = []
-            monkeypatch.setattr(performer, "sleep", waits.append)
+            monkeypatch.setattr(clock, "sleep", waits.append)
             with pytest.raises(LineError, match="it is closed"):
                 drive.stop()
             assert sum(waits) == 0  # it never comes back

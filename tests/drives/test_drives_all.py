@@ -225,9 +225,9 @@ def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any],
         kept = taken.data
     if register.readable:
         (block,) = blocks(drive, [register])
-        answer = Message(drive.address, block.request(drive.address).function, block.start, data=kept)
+        answer = Message(drive.address, block.request.function, block.start, data=kept)
         frame = build_reply(drive.framing, answer)
-        used, told = parse_reply(drive.framing, frame, block.request(drive.address))
+        used, told = parse_reply(drive.framing, frame, block.request)
         assert told is not None
         assert (used, told.data) == (len(frame), kept)
     assert register.decode(raw_value(kept, 0, register.number_format)) == value

@@ -67,6 +67,7 @@ def by_test_schedule(tree: Path) -> str | None:
 
 TRIALS: dict[str, tuple[Trial, ...]] = {
     "csrc/frame.c": (by_test_core, by_compiler, by_test_frame),
+    "src/multidrop/planning/back_off.py": (by_test_schedule,),
     "src/multidrop/planning/schedule.py": (by_test_schedule,),
 }
 

@@ -22,7 +22,7 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.request import write_request
+from multidrop.drive.request import read_request, write_request
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import Block, blocks, plan, planned
 from multidrop.planning.bus_time import duration, gap, in_order, sending
@@ -75,7 +75,7 @@ def test_what_cannot_be_read_is_refused() -> None:
 
 def test_requests_are_the_standard_s() -> None:
     (block,) = blocks(Example(7), [Example.a, Example.b])
-    assert block.request(7) == Message(7, 3, 1, 2)
+    assert block.request == Message(7, 3, 1, 2)
     assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
     assert write_request(Example(7), Example.run, 2) == Message(7, 6, 0x2000, data=b"\0\2")
     assert write_request(Example(7), Example.long, 0x1_0002) == Message(7, 16, 40, 2, b"\0\1\0\2")
@@ -138,7 +138,7 @@ def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float
             legal = all(at in readable or at in gaps for at in range(start, end))
             if len(group) > 1 and (end - start > limit or not legal):
                 break
-            total += duration(drive, Block(table, start, end - start, tuple(group)), delay)
+            total += duration(drive, Block.of(drive, group), delay)
         else:
             best = min(best, total)
     return best
@@ -238,8 +238,8 @@ def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Tab
     drive = Example(1)
     drive.framing = framing
     for count in range(1, 126):
-        block = Block(table, 0, count, ())
-        request = block.request(1)
+        request = read_request(drive, table, 0, count)
+        block = Block(table, 0, count, (), request)
         if framing is Framing.DELIXI:
             request = Message(1, 7, 0, data=bytes(4))
         frames = len(build_request(framing, request)) + reply_length(framing, request)
@@ -338,4 +338,4 @@ def test_a_gap_is_the_longer_silence_and_the_switch() -> None:
 def test_what_has_no_read_function_is_no_block() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
-        Block(table, 0, 1, ()).request(1)
+        read_request(Example(1), table, 0, 1)

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from multidrop.planning.schedule import FIRST_REST_NS, LONGEST_REST_NS, TURN_SHARE, Job, Schedule
+from multidrop.planning.back_off import FIRST_REST_NS, LONGEST_REST_NS
+from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 MS = 1_000_000
 
@@ -45,7 +46,7 @@ def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, 
 
 
 def fail(made: Schedule[Job], drive: int, failures: int, now_ms: int, late_until_ms: int = 0) -> None:
-    made.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
+    made.back_off.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
 
 
 def test_a_period_keeps_its_own_grid_whenever_it_is_planned() -> None:
@@ -210,13 +211,15 @@ def test_all_silent_drives_together_cost_their_share() -> None:
     cost_ms, asked = 300, 0
     failures = dict.fromkeys(range(10), 2)
     for drive in range(10):
-        made.observe(drive, 2, 0, late_until_ns=0, cost_ns=cost_ms * MS)
+        made.back_off.observe(drive, 2, 0, late_until_ns=0, cost_ns=cost_ms * MS)
     for now in range(0, 3_600_000, 1000):
         for it, _ in take(made, now, 5):
             if it.drive < 10:
                 asked += 1
                 failures[it.drive] += 1
-                made.observe(it.drive, failures[it.drive], now * MS, late_until_ns=0, cost_ns=cost_ms * MS)
+                made.back_off.observe(
+                    it.drive, failures[it.drive], now * MS, late_until_ns=0, cost_ns=cost_ms * MS
+                )
     assert 0.01 < asked * cost_ms / 3_600_000 <= 0.02
 
 
@@ -236,7 +239,7 @@ def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int |
             if it.drive in failures:
                 at += 300 * MS
                 failures[it.drive] += 1
-                made.observe(it.drive, failures[it.drive], at, late_until_ns=at, cost_ns=300 * MS)
+                made.back_off.observe(it.drive, failures[it.drive], at, late_until_ns=at, cost_ns=300 * MS)
             elif at > 20_000 * MS:
                 good += 1
         answered.append(good)
@@ -332,9 +335,9 @@ def test_who_is_asleep_keeps_its_place_in_the_round() -> None:
 
 def test_a_question_to_a_silent_drive_may_take_its_whole_time_out() -> None:
     made = schedule(dead := job(1), job(2))
-    made.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
+    made.back_off.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
     take(made, 1, 400)
-    made.observe(1, 3, 0, late_until_ns=0, cost_ns=300 * MS)
+    made.back_off.observe(1, 3, 0, late_until_ns=0, cost_ns=300 * MS)
     assert take(made, 60_000, 300) == [(dead, 0)]
 
 
@@ -523,7 +526,7 @@ class Operation(RuleBasedStateMachine):
         if len(self.made.jobs) < 8:
             it = job(drive, period, duration)
             self.made.add(it, self.now)
-            self.made.observe(
+            self.made.back_off.observe(
                 drive, self.failures[drive], self.now, late_until_ns=self.silent_until[drive], cost_ns=0
             )
             self.added[it], self.slots[it] = self.now, []
@@ -545,7 +548,7 @@ class Operation(RuleBasedStateMachine):
     def _observe(self, drive: int, failures: int, until: int) -> None:
         if any(it.drive == drive for it in self.made.jobs):
             self.failures[drive], self.silent_until[drive] = failures, until
-            self.made.observe(drive, failures, self.now, late_until_ns=until, cost_ns=30 * MS)
+            self.made.back_off.observe(drive, failures, self.now, late_until_ns=until, cost_ns=30 * MS)
 
     @rule()
     def lose_the_port(self) -> None:
@@ -635,7 +638,7 @@ def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
     made = schedule(silent := job(1), job(2))
     fail(made, 1, 9, 0)
     made.remove(silent)
-    made.forget(1)
+    made.back_off.forget(1)
     made.add(again := job(1), 0)
     assert again in [it for it, _ in take(made, 1, 20)]
 
@@ -646,13 +649,13 @@ def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
 def meet(*jobs: Job) -> Schedule[Job]:
     made = schedule(*jobs)
     for drive in {it.drive for it in jobs}:
-        made.meet(drive)
+        made.back_off.meet(drive)
     return made
 
 
 def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
-    made.conclude(asked)
-    made.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
+    made.back_off.conclude(asked.drive)
+    made.back_off.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
 
 
 def test_a_new_drive_is_asked_one_question_until_its_outcome_is_known() -> None:
@@ -660,7 +663,7 @@ def test_a_new_drive_is_asked_one_question_until_its_outcome_is_known() -> None:
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
     assert made.cycle(10 * MS) == []
-    made.conclude(one)  # its answer was damaged, perhaps: it has not answered yet
+    made.back_off.conclude(one.drive)  # its answer was damaged, perhaps: it has not answered yet
     assert [asked for asked, _ in take(made, 20, 1000)] == [two]
     answer(made, two, 30)
     assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
@@ -680,8 +683,8 @@ def test_a_new_drive_that_does_not_answer_rests_at_once() -> None:
     made = meet(dead := job(1), living := job(2))
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)
-    made.conclude(dead)
-    made.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
+    made.back_off.conclude(dead.drive)
+    made.back_off.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
     rest_ms = 30_000  # in which that is the share of the silent
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
@@ -697,8 +700,8 @@ def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
     for cost_ms, again in {300: {lost}, 500: set()}.items():
         made = meet(lost, living)
         take(made, 0, 100)
-        made.conclude(lost)
-        made.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
+        made.back_off.conclude(lost.drive)
+        made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
         assert lost not in {asked for asked, _ in take(made, 70, 100)}  # nobody knows of the other one yet
         answer(made, living, 90)
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
@@ -709,9 +712,9 @@ def test_new_drives_are_asked_again_at_once_where_few_did_not_answer() -> None:
 def test_when_a_silent_drive_is_back_another_one_is_asked_and_no_more() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for drive in (0, 1, 2):
-        made.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)
+        made.back_off.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1000, 50)} == {jobs[3]}
-    made.observe(2, 0, 1100 * MS, late_until_ns=0, cost_ns=300 * MS)
+    made.back_off.observe(2, 0, 1100 * MS, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1100, 400)} == {jobs[0], jobs[2], jobs[3]}
-    made.observe(0, 3, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
+    made.back_off.observe(0, 3, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}

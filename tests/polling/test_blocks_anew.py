@@ -11,7 +11,7 @@ from worlds import S, World, WorldWire
 
 from multidrop.drive.register import HOLDING, reading
 from multidrop.polling.batch import Row
-from multidrop.polling.polled_line import PolledLine
+from multidrop.polling.jobs import JobMaker
 from multidrop.sim import Faults, SimulatedDrive
 
 SOON, LATE = 0.005, 0.06  # s
@@ -80,7 +80,7 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
         for _ in range(6):
             for sim.response_delay in (SOON, LATE):
                 world.run(6.0)
-                seen.add(len(line._jobs))
+                seen.add(len(line._maker))
     assert seen == {2, 3}
 
 
@@ -88,8 +88,8 @@ def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch:
     """As where delays are those of the host alone, and never the same."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
-    choose, chosen = PolledLine._choose, []
-    monkeypatch.setattr(PolledLine, "_choose", lambda *given: chosen.append(given) or choose(*given))
+    choose, chosen = JobMaker.plan, []
+    monkeypatch.setattr(JobMaker, "plan", lambda *given: chosen.append(given) or choose(*given))
     with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
         for sim.response_delay in (SOON / 20, 2 * SOON, SOON / 5, SOON):
             assert asked_together(world.run(6.0)) == {False}

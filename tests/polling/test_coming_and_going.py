@@ -147,14 +147,14 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         begun, go_on = threading.Event(), threading.Event()
-        step = bus._performer._do_stop
+        step = bus._stopper._do
 
         def slow(*arguments: object) -> object:
             begun.set()
             assert go_on.wait(30)
             return step(*arguments)
 
-        monkeypatch.setattr(bus._performer, "_do_stop", slow)
+        monkeypatch.setattr(bus._stopper, "_do", slow)
         stopping = threading.Thread(target=bus.stop_all)
         stopping.start()
         assert begun.wait(30)

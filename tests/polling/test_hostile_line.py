@@ -25,7 +25,7 @@ from multidrop import poller
 from multidrop.core import Framing, Message, Result
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiNative
-from multidrop.planning import schedule
+from multidrop.planning import back_off
 from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
@@ -140,7 +140,7 @@ class Story:
         It takes until the port is opened again, and silent drives have rested for their share of the line.
         """
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
-        longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
+        longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
         ended = self.world.now
         asked: dict[str, int] = {}

@@ -29,6 +29,7 @@ from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
+from multidrop.transport import clock
 
 # What a machine that has much else to do may add to what a test is about.
 HOST_LATE = {
@@ -147,7 +148,7 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
 def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
     polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
-    before_ns = poller_module.now_ns()
+    before_ns = clock.now_ns()
     with Polling(line(port, PolledDrive(drive(), (*polls[0], *polls[1])))) as polling:
         polling.until("ok", 100)
     for name, every in periods.items():
@@ -517,10 +518,10 @@ def test_what_is_under_way_at_the_end_is_waited_for(
             os.write(master, answers.pop())
         time.sleep(seconds)
 
-    monkeypatch.setattr(poller_module, "PARTING_NS", round(PATIENCE * 1e9))
+    monkeypatch.setattr(poller_module, "ENDING_NS", round(PATIENCE * 1e9))
     with Polling(line(path, patient(every))) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
-        monkeypatch.setattr(poller_module, "sleep", answer)  # when it waits for what is under way
+        monkeypatch.setattr(clock, "sleep", answer)  # when it waits for what is under way
     assert [(row.value, row.status) for row in polling.rows] == [(1.0, "ok")]
     polling.check_summary()
 
@@ -529,7 +530,7 @@ def test_what_is_not_answered_by_the_end_has_a_row(
     far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
-    monkeypatch.setattr(poller_module, "PARTING_NS", 10_000_000)
+    monkeypatch.setattr(poller_module, "ENDING_NS", 10_000_000)
     master, path = far_end
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
     waiting = polled(Patient(3, name="pump-3"), [Patient.fault], 60.0)
@@ -596,7 +597,7 @@ def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
     with World(WorldWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as world:
         world.run(1.0)
         (tended,) = world.poller._lines
-        assert tended._done
+        assert tended._queue._done
         assert world.port
         tended._lose(world.port, world.now)
         tended.bus.line.reopen()

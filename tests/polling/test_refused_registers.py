@@ -11,7 +11,7 @@ from worlds import World, WorldWire
 
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
-from multidrop.polling import polled_line
+from multidrop.polling import refusals
 from multidrop.sim import Faults, SimulatedDrive, Simulator, Wire
 from multidrop.sim.protocol import Reason, Refusal
 
@@ -70,7 +70,7 @@ class Moody(SimulatedDrive):
 def test_what_is_read_after_all_is_polled_as_before(
     says: Reason, is_set_aside: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(polled_line, "SET_ASIDE_NS", 1_000_000_000)
+    monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive, moody = Toy(1, name="pump-1"), Moody(Toy(1))
     with World(WorldWire([moody], Faults()), [polled(drive, [Toy.output_current, Toy.fault])]) as world:
         before = len(world.run(1.0))

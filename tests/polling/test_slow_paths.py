@@ -18,15 +18,12 @@ from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 
 from multidrop import bus
 from multidrop.bus import Bus
-from multidrop.control import call, performer
-from multidrop.control import identity as identity_check
-from multidrop.control import writer as writing
 from multidrop.control.outcome import Effect
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.sim import EncodedDrive, Faults, PoweredDrive, SimulatedDrive, simulated
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import clock
 
 pytestmark = pytest.mark.story
 
@@ -186,9 +183,8 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
         wire.open()
         line = PathLine(wire)
         monkeypatch.setattr(bus, "Line", lambda port, echo: line)
-        for module in (bus, exchanges, writing, identity_check, performer, call):
-            monkeypatch.setattr(module, "now_ns", lambda: line.now, raising=False)
-            monkeypatch.setattr(module, "sleep", line.sleep, raising=False)
+        monkeypatch.setattr(clock, "now_ns", lambda: line.now)
+        monkeypatch.setattr(clock, "sleep", line.sleep)
         opened = Bus("world")
         for sim in sims:
             opened.attach(sim.drive)

@@ -12,7 +12,6 @@ from lines import until
 from test_sim_wire import timeline
 from toy import Toy
 
-from multidrop.bus import exchange
 from multidrop.cli import main
 from multidrop.core import Message, Peer, Result
 from multidrop.drives import YD1000
@@ -20,6 +19,7 @@ from multidrop.errors import LineError
 from multidrop.plant.loader import parse_duration
 from multidrop.sim import Faults, HostileWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
+from multidrop.transport.exchange import make_exchange
 from multidrop.transport.line import Line
 
 READ = checksums.rtu("01 03 00 02 00 01")
@@ -174,7 +174,7 @@ def opened(path: str) -> Line:
 
 def read(line: Line) -> bytes:
     drive = Toy(1)
-    asked = exchange(drive, Message(1, 3, 2, 1), Peer(least_timeout=5, most_timeout=5))
+    asked = make_exchange(drive, Message(1, 3, 2, 1), Peer(least_timeout=5, most_timeout=5))
     found = line.carry_out(asked)
     assert found.result > 0, Result(found.result)
     return found.raw

@@ -8,9 +8,6 @@ from typing import Any
 import pytest
 
 from multidrop import bus
-from multidrop.control import call, performer
-from multidrop.control import identity as identity_check
-from multidrop.control import writer as writing
 from multidrop.core import (
     Completion,
     Exchange,
@@ -23,7 +20,7 @@ from multidrop.core import (
 )
 from multidrop.drive import Drive
 from multidrop.sim import PoweredDrive, SimulatedDrive, simulated
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import clock
 
 EXCHANGE_TIME = 0.02  # s
 TIMEOUT = 0.3
@@ -55,11 +52,9 @@ class Hall:
         self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, echo: self)
-        for module in (performer, exchanges, writing, identity_check):
-            monkeypatch.setattr(module, "sleep", self.sleep)
-        for module in (bus, call, exchanges, performer, writing):
-            monkeypatch.setattr(module, "now_ns", lambda: round(self.seconds * 1e9))
-        monkeypatch.setattr(writing, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
+        monkeypatch.setattr(clock, "sleep", self.sleep)
+        monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
+        monkeypatch.setattr(clock, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
         self.bus = bus.Bus("hall", **details)
 
     def sleep(self, seconds: float) -> None:

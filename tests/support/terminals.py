@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-MULTIDROP = [sys.executable, "-m", "multidrop.cli"]
+MULTIDROP = [sys.executable, "-m", "multidrop"]
 
 
 class Terminal:

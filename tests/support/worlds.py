@@ -25,10 +25,10 @@ from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
-from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
 from multidrop.sim import HostileWire
-from multidrop.transport.exchange import NO_ROWS, exchange
+from multidrop.transport import clock
+from multidrop.transport.exchange import NO_ROWS, make_exchange
 
 S = 1_000_000_000
 BEGIN_NS = 1000 * S
@@ -282,9 +282,8 @@ class World:
         self._threads = {*threading.enumerate()}
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", lambda port, echo: WorldLine(self))
-        for module in (bus, poller, polled_line):
-            patch.setattr(module, "now_ns", lambda: self.now)
-        patch.setattr(poller, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
+        patch.setattr(clock, "now_ns", lambda: self.now)
+        patch.setattr(clock, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
         patch.setattr(poller, "RowQueue", self._row_queue)
         wire.open()
         self.poller = Poller(plant(line("world", *drives)))
@@ -318,7 +317,7 @@ class World:
         """Have a request carried out ahead of the polling, if the port is there."""
         ours = self.poller.bus("line")
         if self.port:
-            self.port.urgent.append(exchange(drive, request, ours.peer(drive), NO_ROWS))
+            self.port.urgent.append(make_exchange(drive, request, ours.peer(drive), NO_ROWS))
 
     # ---- the poller's thread ----
 

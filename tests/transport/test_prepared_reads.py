@@ -23,7 +23,7 @@ class Counted:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
-        blocks, reading = exchanges.blocks, exchanges.reading
+        blocks, make_read = exchanges.blocks, exchanges.make_read
 
         def choose(*given: Any) -> Any:
             self.plans += 1
@@ -31,10 +31,10 @@ class Counted:
 
         def make(*given: Any) -> Any:
             self.made += 1
-            return reading(*given)
+            return make_read(*given)
 
         monkeypatch.setattr(exchanges, "blocks", choose)
-        monkeypatch.setattr(exchanges, "reading", make)
+        monkeypatch.setattr(exchanges, "make_read", make)
 
     def since(self) -> tuple[int, int]:
         """Since it was asked last."""
@@ -101,7 +101,7 @@ def test_what_a_drive_is_told_meanwhile_is_heeded(bus: Bus, name: str, value: ob
     after = bus._exchanges._prepare(drive)
     assert after is not before
     assert bus._exchanges._prepare(drive) is after
-    made = after.exchange(after.blocks(WANTED)[0])
+    made = after.of(WANTED)[0].exchange
     assert made.settings[0] == drive.settings.baudrate
     assert made.request.address == drive.address
     assert made.c.silence_ns == round(silence(drive) * 1e9)
@@ -113,4 +113,4 @@ def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.Mo
     for wanted in permutations(WANTED):
         assert set(bus.read_many(drive, wanted)) == {register.name for register in WANTED}
     prepared = bus._exchanges._prepare(drive)
-    assert prepared.blocks.cache_info().currsize == 3
+    assert prepared.of.cache_info().currsize == 3

@@ -22,7 +22,7 @@ import multidrop.transport.line
 from multidrop import Bus, Poller
 from multidrop.core import Counters, Exchange, Framing, Message, Peer, delay_edge
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport.statistics import Diagnostics, LineStatistics, Statistics, look
+from multidrop.transport.statistics import Diagnostics, LineStatistics, Statistics, line_statistics
 
 __all__ = ["drive", "line"]  # fixtures
 
@@ -181,7 +181,7 @@ def test_what_the_port_lost_is_read_from_its_driver(monkeypatch: pytest.MonkeyPa
 
 
 def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> LineStatistics:
-    return look(seconds, drives, overruns)
+    return line_statistics(seconds, drives, overruns)
 
 
 def test_a_span_is_the_difference_of_two_looks() -> None:

@@ -94,7 +94,7 @@ def _start_motors(line: PlantLine) -> None:
 @contextmanager
 def _simulator(plant: Path, ports: Path) -> Iterator[None]:
     """Simulate in another process: the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", "multidrop.cli", "simulate", str(plant), "--ports", str(ports)]
+    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
     # A session of its own keeps Ctrl-C from it: it must outlive the polling.
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         assert process.stdout is not None

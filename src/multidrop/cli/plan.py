@@ -15,8 +15,9 @@ from multidrop.cli.support.arguments import add_json_argument, add_plant_argumen
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import Row, aligned, shortened, wrapped
 from multidrop.planning.prediction import Prediction, Rate, predict
-from multidrop.planning.suggestions import Remedies, duration_text, remedies
+from multidrop.planning.suggestions import Suggestions, duration_text, suggest
 from multidrop.plant.loader import load_plant
+from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
 
 LONG_CYCLE = 1.0  # s; polling all readings for longer than this may not have been meant
@@ -41,13 +42,13 @@ def run(arguments: argparse.Namespace) -> int:
 class _Plan:
     line: PlantLine
     prediction: Prediction
-    remedies: Remedies | None  # None: the plan fits
+    suggestions: Suggestions | None  # None: the plan fits
 
 
 def _plan(line: PlantLine) -> _Plan:
-    wanted = line.planned()
+    wanted = planned_on(line)
     prediction = predict(wanted, switching=line.switching)
-    return _Plan(line, prediction, None if prediction.fits else remedies(wanted, prediction, line.switching))
+    return _Plan(line, prediction, None if prediction.fits else suggest(wanted, prediction, line.switching))
 
 
 def _misfits(plan: _Plan) -> list[str]:
@@ -98,8 +99,8 @@ def _text(plan: _Plan) -> Iterator[str]:
     yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
     for sentence in _misfits(plan):
         yield from _indented(f"! {sentence}")
-    if plan.remedies:
-        yield from _indented(f"! {plan.remedies}")
+    if plan.suggestions:
+        yield from _indented(f"! {plan.suggestions}")
     for sentence in _warnings(plan):
         yield from _indented(f"? {sentence}")
 
@@ -140,7 +141,7 @@ def _as_json(plan: _Plan) -> dict[str, Any]:
         "switching_ms": plan.line.switching * 1e3,
         "drives": {polled.drive.name: _drive_as_json(plan, polled.drive.name) for polled in plan.line.drives},
         "misfits": _misfits(plan),
-        "remedies": _remedies_as_json(plan.remedies) if plan.remedies else None,
+        "remedies": _suggestions_as_json(plan.suggestions) if plan.suggestions else None,
         "warnings": _warnings(plan),
     }
 
@@ -160,9 +161,9 @@ def _drive_as_json(plan: _Plan, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _remedies_as_json(found: Remedies) -> dict[str, Any]:
+def _suggestions_as_json(found: Suggestions) -> dict[str, Any]:
     return {
-        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every or ()],
+        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every],
         "baudrate": found.baudrate and found.baudrate[0],
         "baudrate_for": [drive.name for drive in found.baudrate[1]] if found.baudrate else [],
         "registers": found.registers,

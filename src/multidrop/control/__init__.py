@@ -1,1 +1,1 @@
-"""Everything that is written to a drive."""
+"""Control: everything that is written to a drive, and every stop."""

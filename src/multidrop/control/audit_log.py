@@ -1,7 +1,7 @@
 """Audit log: every write that was sent, as one line of JSON in a file that only grows.
 
-A write is noted when its outcome is known: the one that a killed process had under way is not there.
-A line that was torn, by a crash or a full disk, harms no other: the next record begins a new one.
+A write is noted when its outcome is known: one that a killed process had under way is not there.
+A line that a crash or a full disk truncated harms no other: the next record begins a new line.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from typing import Any
 
 
 class AuditLog:
-    """The log in this file; OSError when it cannot be opened or written."""
+    """The log in this file. Raises OSError when it cannot be opened or written."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self._file = self.path.open("a+b", buffering=0)  # one call, one write: processes do not mix lines
 
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
-        """Append a record. Raises OSError, also when only a part of it had room."""
+        """Append a record. Raises OSError, also when there was room for a part of it only."""
         time = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         line = json.dumps({"time": f"{time}.{utc_ns % 10**9:09d}Z", **record}, ensure_ascii=False)
-        whole = (b"\n" if self._is_torn() else b"") + line.encode() + b"\n"
+        whole = (b"\n" if self._is_truncated() else b"") + line.encode() + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
 
     def close(self) -> None:
         self._file.close()
 
-    def _is_torn(self) -> bool:
-        """Whether the last line has no end, whichever process began it."""
+    def _is_truncated(self) -> bool:
+        """Return True where the last line has no end, whichever process began it."""
         if self._file.seek(0, SEEK_END) == 0:
             return False
         self._file.seek(-1, SEEK_END)
@@ -41,7 +41,7 @@ class AuditLog:
 
 
 def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
-    """The records of a log in order; what a crash has torn is passed over."""
+    """Yield the records of a log in order, without those that a crash truncated."""
     with Path(path).open("rb") as lines:
         for line in lines:
             try:

@@ -1,24 +1,27 @@
-"""Call: one call of what may move a motor: until when it may be sent, and what of it was."""
+"""Call: one call of what may move a motor: how long it may be sent, and what of it was."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from multidrop.control.outcome import Outcome
 from multidrop.core import Permit
 from multidrop.drive.family import Drive
-from multidrop.errors import Expired, Overtaken
-from multidrop.transport.clock import now_ns
+from multidrop.errors import Expired, Overtaken, Refused
+from multidrop.transport import clock
 
-FRAMES = 64  # characters that a request and its reply have at most, where they are about one register
+MOST_CHARACTERS = 64  # of a request and its reply about one register
+
+_log = logging.getLogger("multidrop.control")
 
 
 class Call:
     """One call of a verb, `verb`, or of a plain write.
 
     Nothing of it is written once a stop was called, nor when it is late by more than `expiry` seconds.
-    It is late by all the time since it began that its own steps do not account for: what a look takes at
+    It is late by all the time since it began that its own steps do not account for: what a read takes at
     most by the drive's document, and the waits of its script. So a process that was held up sends nothing.
     """
 
@@ -29,49 +32,55 @@ class Call:
         self.verb = verb
         self.sent = ""  # the latest write that may have left
         self.is_confirmed = False  # that one
-        self.unheard: Outcome | None = None  # of that one, if nothing was read of the drive after it
-        self._due_ns = now_ns()
+        self.unverified: Outcome | None = None  # of that one, if nothing was read of the drive after it
+        self._due_ns = clock.now_ns()
 
     def anew(self) -> Call:
-        """The same, as if it was called now; but for stops, which end it as before."""
+        """Return the same as if it was called now; stops called since the first one end it all the same."""
         return Call(self.drive, self.permit, self.expiry, self.verb)
 
     @property
     def expires_ns(self) -> int:
-        """When it is too late to send anything, by CLOCK_MONOTONIC."""
+        """The time of CLOCK_MONOTONIC after which nothing is sent."""
         return self._due_ns + round(self.expiry * 1e9)
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
-        """Account for a step that may take so long; what it takes beyond that makes the call late."""
-        begun_ns = now_ns()
+        """Account for a step that may take so long; any time beyond that makes the call late."""
+        begun_ns = clock.now_ns()
         try:
             yield
         finally:
-            self._due_ns += min(now_ns() - begun_ns, round(seconds * 1e9))
+            self._due_ns += min(clock.now_ns() - begun_ns, round(seconds * 1e9))
 
     def look(self) -> AbstractContextManager[None]:
         """Account for one exchange with the drive."""
         drive = self.drive
-        wire = 2 * drive.needed_silence() + FRAMES * drive.settings.character
+        wire = 2 * drive.needed_silence() + MOST_CHARACTERS * drive.settings.character
         return self.step(drive.response_timeout + wire)
 
     def check(self, what: str) -> None:
         """Raise Overtaken once a stop was called."""
         if not self.permit.is_good:
-            raise Overtaken(self.drive.name, what, self.permit.latch.why)
+            raise self.overtaken(what)
+
+    def overtaken(self, what: str) -> Overtaken:
+        return Overtaken(self.drive.name, what, self.permit.latch.why)
 
     def unsent(self, what: str) -> Overtaken | Expired:
-        """Say why the core did not send it."""
-        if not self.permit.is_good:
-            return Overtaken(self.drive.name, what, self.permit.latch.why)
-        return Expired(self.drive.name, what, self.expiry)
+        """Return the reason why the core did not send it."""
+        return (
+            self.overtaken(what) if not self.permit.is_good else Expired(self.drive.name, what, self.expiry)
+        )
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Add what was sent, and what is known of it, to an interruption."""
+        """Log a refusal; add what was sent, and what is known of it, to an interruption."""
         try:
             yield
+        except Refused as refusal:
+            _log.info("refused: %s", refusal)
+            raise
         except KeyboardInterrupt as interruption:
             interruption.add_note(f"{self.drive.name}: {self._known()}")
             raise

@@ -1,8 +1,7 @@
-"""Ledger: how often each register that a drive may keep in EEPROM was written, across restarts.
+"""Ledger: counts writes of each register that a drive may keep in EEPROM, across restarts.
 
-A drive is known by its port, whatever that is called, and its address there.
-It is a file that several processes share. EEPROM bears some 10,000 writes, so a budget keeps them
-for ten years.
+It is a file that several processes share. A drive is known by its port's identity and its address there.
+EEPROM bears some 10,000 writes; a budget makes them last for ten years.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ LEAST_INTERVAL = 60.0  # s between two writes of a register that is known to be 
 
 @dataclass(frozen=True)
 class LedgerCell:
-    """One register of one drive, as a ledger knows it.
+    """One register of one drive in a ledger.
 
     `port` is the port's identity (see port_identity), `spelt` its name, which older entries may have.
     """
@@ -41,7 +40,7 @@ class LedgerCell:
 
 @dataclass(frozen=True)
 class Wear:
-    """What a ledger says of a cell at some time."""
+    """Writes of a cell until some time."""
 
     cell: LedgerCell
     writes: int  # in all
@@ -50,13 +49,13 @@ class Wear:
 
 
 def default_path() -> Path:
-    """Where state that survives restarts belongs (XDG base directory specification)."""
+    """Return the path for state that survives restarts (XDG base directory specification)."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "multidrop" / "wear.sqlite"
 
 
 class Ledger:
-    """The ledger in this file, which is made at its first entry. Times are UTC in s."""
+    """The ledger in this file, which is created at its first entry. Times are UTC in s."""
 
     def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
         self.path = Path(path) if path else default_path()
@@ -64,21 +63,21 @@ class Ledger:
         self._is_the_user_s = not path
 
     def at(self, port: str) -> Ledger:
-        """Return the ledger for this port: a simulated one has its own, and never spends the user's."""
+        """Return the ledger for this port: a simulated one has its own, and leaves the user's alone."""
         if self._is_the_user_s and is_simulated(port):
             return Ledger(ledger_of(port, self.path.parent), budget=self.budget)
         return self
 
     def enter(self, cell: LedgerCell, now: float, least_interval: float) -> str:
-        """Count a write that is about to be sent; a reason why it must not be, and then it is not counted.
+        """Count a write that is about to be sent, or return why it must not be and count nothing.
 
-        The question and the entry are one transaction, so that two processes cannot both have the last
+        The check and the entry are one transaction, so that two processes cannot both have the last
         of the budget. Raises OSError where the file cannot be kept.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
             wear = _wear(ledger, cell, _names(ledger, cell), now)
-            since = now - wear.last  # below 0: the clock was set back, and nobody knows how long it is
+            since = now - wear.last  # below 0: the clock was set back, and the true time is unknown
             if wear.writes and 0 <= since < least_interval:
                 return (
                     f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
@@ -94,12 +93,12 @@ class Ledger:
         return ""
 
     def note(self, cell: LedgerCell, now: float) -> None:
-        """Count a stop, which was sent whatever the budget says. Raises OSError where it cannot be kept."""
+        """Count a stop, which no budget holds back. Raises OSError where the file cannot be kept."""
         with self._opened() as ledger:
             ledger.execute("insert into writes values (?, ?, ?, ?, ?)", (*_key(cell), now))
 
     def wear(self, now: float) -> list[Wear]:
-        """Every cell that was ever written, the most worn in the last year first."""
+        """Return every cell that was ever written, the most worn in the last year first."""
         if not self.path.exists():
             return []
         with self._opened() as ledger:
@@ -108,7 +107,7 @@ class Ledger:
             for port, *place in rows:
                 names.setdefault(LedgerCell(of_name(port), *place), []).append(port)
             found = [_wear(ledger, cell, ports, now) for cell, ports in names.items()]
-        return sorted(found, key=lambda it: (-it.this_year, it.cell.port, it.cell.address, it.cell.register))
+        return sorted(found, key=_by_wear)
 
     @contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
@@ -129,6 +128,10 @@ class Ledger:
 
     def _unkept(self, failure: Exception) -> OSError:
         return OSError(f"the ledger of EEPROM writes {self.path} cannot be kept: {failure}")
+
+
+def _by_wear(wear: Wear) -> tuple[int, str, int, str]:
+    return -wear.this_year, wear.cell.port, wear.cell.address, wear.cell.register
 
 
 def _key(cell: LedgerCell) -> tuple[str, int, str, str]:

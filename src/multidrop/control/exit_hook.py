@@ -1,4 +1,4 @@
-"""ExitHook: what every bus that asked for it does before this process ends, however it ends but by SIGKILL.
+"""ExitHook: does what buses asked for before this process ends, in any way but SIGKILL.
 
 There is one in a process. A signal only begins the last acts, which run in threads of their own, side by
 side: a handler that waited for them could wait for a lock of the very thread that it interrupts.
@@ -21,19 +21,19 @@ from multidrop.core.fork import register_at_fork
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # signals within a second, after which nothing is waited for
-HANDLING_S = 0.05  # after which a signal is handled at the latest
+HANDLING_S = 0.05  # the longest that a signal waits to be handled
 CUT_SHORT = b"multidrop: the stops were cut short by a third signal: motors may still be turning\n"
 
 
 class LastAct:
-    """Something that is done once, by a thread that waits for it from now on."""
+    """Work that is done once, by a thread that waits for its turn from now on."""
 
     def __init__(
         self, begin: Callable[[], object], work: Callable[[], object], over: Callable[[], None]
     ) -> None:
-        self._prepare = begin
+        self._on_begin = begin
         self._work = work
-        self._tell = over
+        self._on_over = over
         self._calls: SimpleQueue[None] = SimpleQueue()  # a signal handler may put to it; not so an Event
         self._over = threading.Event()
         self.is_cut_short = False  # nobody waits for it any more
@@ -44,18 +44,18 @@ class LastAct:
         return self.is_cut_short or self._over.is_set()
 
     def begin(self) -> None:
-        """Have it done, without waiting for that."""
-        self._prepare()
+        """Let it be done, without waiting for that."""
+        self._on_begin()
         self._calls.put(None)
 
     def finish(self) -> None:
-        """Have it done, and wait until it is."""
+        """Let it be done, and wait until it is."""
         self.begin()
         while not self.is_over:  # a signal that another thread was given is handled here
             self._over.wait(HANDLING_S)
 
     def forget(self) -> None:
-        """In the child of a fork it is its parent's business."""
+        """Leave it to the parent: this is the child of a fork."""
         self._over = threading.Event()
         self.is_cut_short = True
 
@@ -64,16 +64,16 @@ class LastAct:
         try:
             self._work()
         except Exception:
-            logging.getLogger("multidrop").exception("the drives could not be stopped")
+            logging.getLogger("multidrop.control").exception("the drives could not be stopped")
         finally:
             self._over.set()
-            self._tell()
+            self._on_over()
 
 
 class ExitHook:
     """Begins all last acts at exit, or on SIGINT or SIGTERM, and holds the signal until they are over.
 
-    Then it has the effect that it had before; so it has where IMPATIENT of them come within a second.
+    Then the signal has the effect that it had before; at once where IMPATIENT of them come within a second.
     """
 
     def __init__(self) -> None:
@@ -81,19 +81,19 @@ class ExitHook:
         self._before: dict[signal.Signals, Any] = {}
         self._held: int | None = None  # the first signal that came
         self._came: list[float] = []  # when it and others did
-        self._telling = threading.Lock()
-        self._has_told = False
+        self._passing = threading.Lock()
+        self._has_passed = False
         atexit.register(self._at_exit)
         register_at_fork(self)
 
     def forked(self) -> None:
-        self._telling = threading.Lock()
+        self._passing = threading.Lock()
         for act in self._acts:
             act.forget()
         self._acts = []
 
     def add(self, begin: Callable[[], object], work: Callable[[], object]) -> LastAct:
-        """Have `work` done before the process ends; `begin` at once, also in a signal handler.
+        """Do `work` before the process ends, and call `begin` as its end begins, also in a signal handler.
 
         Raises ValueError outside the main thread, the only one that may take signals.
         """
@@ -105,7 +105,7 @@ class ExitHook:
         return act
 
     def finish(self, act: LastAct) -> None:
-        """Have it done now, and be done with it."""
+        """Do it now, and forget it."""
         act.finish()
         self._acts = [other for other in self._acts if other is not act]
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
@@ -119,11 +119,11 @@ class ExitHook:
             act.finish()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Take no lock here: the main thread may have it."""
+        """Begin the last acts. Take no lock here: the main thread may hold it."""
         now = time.monotonic()
         self._came = [*(at for at in self._came if now - at < 1.0), now]
         if self._held is None:
-            self._held, self._has_told = number, False
+            self._held, self._has_passed = number, False
         for act in self._acts:
             act.begin()
         if all(act.is_over for act in self._acts):
@@ -135,14 +135,14 @@ class ExitHook:
             self._pass_on(number)
 
     def _one_is_over(self) -> None:
-        """Let the signal that is held have its effect, which is on the main thread's account."""
-        with self._telling:
+        """Send the signal that is held to the main thread, once all last acts are over."""
+        with self._passing:
             held, ident = self._held, threading.main_thread().ident
-            if self._has_told or held is None or ident is None:
+            if self._has_passed or held is None or ident is None:
                 return
             if not all(act.is_over for act in self._acts):
                 return
-            self._has_told = True
+            self._has_passed = True
         signal.pthread_kill(ident, held)
 
     def _pass_on(self, number: int) -> None:
@@ -161,7 +161,7 @@ _hook: ExitHook | None = None
 
 
 def exit_hook() -> ExitHook:
-    """The process's own."""
+    """Return the hook of this process."""
     global _hook
     if _hook is None:
         _hook = ExitHook()

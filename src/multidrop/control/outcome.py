@@ -1,4 +1,4 @@
-"""Outcome: exactly what is known of a write's effect."""
+"""Outcome and Stopped: exactly what is known of the effect of a write, and of a stop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Effect(Enum):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one write: `held` is what the drive then said it holds, None where that cannot be read.
+    """One write's effect: `held` is what the drive then said it holds, None where that cannot be read.
 
     `failure` is the error that `Bus.write` raises for it.
     """
@@ -33,17 +33,37 @@ class Outcome:
 
     @property
     def value(self) -> Any:
-        """What the drive holds, as far as that is known; raises the failure where there is one."""
+        """The value that the drive holds, as far as that is known; raises the failure where there is one."""
         if self.failure is not None:
             raise self.failure
         return self.asked if self.held is None else self.held
 
     def __str__(self) -> str:
-        return f"{self.drive}: {self.register.name} = {self.register.format(self.asked)}: {self._said()}"
+        return f"{self.drive}: {self.register.name} = {self.register.format(self.asked)}: {self._in_words()}"
 
-    def _said(self) -> str:
+    def _in_words(self) -> str:
         if self.failure is not None:
             return f"{self.effect.value}: {self.failure}"
         if self.effect is Effect.TAKEN_AS:
             return f"taken as {self.register.format(self.held)}"
         return "done (cannot be read back)" if self.held is None else "done (read back)"
+
+
+class Seen(Enum):
+    STOPPED = "stopped"  # seen to stand
+    SENT = "sent but unknown"
+    FAILED = "failed"  # no stop was sent
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """One drive's stop: what was seen of it, after how many seconds, and why it is not seen to stand."""
+
+    drive: str
+    seen: Seen
+    seconds: float
+    why: str = ""
+
+    def __str__(self) -> str:
+        why = f": {self.why}" if self.why else ""
+        return f"{self.drive}: {self.seen.value} after {self.seconds:.1f} s{why}"

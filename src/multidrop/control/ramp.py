@@ -1,4 +1,4 @@
-"""Moving several motors, or one gently: staggered starts, and setpoints in steps."""
+"""Staggered starts of several motors, and setpoints in steps for one."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from multidrop.drive.script import Script, read, wait
 from multidrop.drive.state import Direction
 from multidrop.errors import BusError, Refused
 
-__all__ = ["ramp", "start_staggered"]
-
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    At the first that fails the ones already started are stopped, and so is that one; its failure is
-    raised. None is started once its stop was called, on any thread, since this was.
+    When one fails, it and all that were started before are stopped, and its failure is raised. None is
+    started whose stop was called, on any thread, after this call began.
     """
     calls = [drive.begin_call("start") for drive in drives]
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
@@ -33,7 +31,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 
 
 def _stop(drives: Sequence[Drive]) -> None:
-    """All at once: they may be on several buses, and one may be silent."""
+    """Stop them all at once: they may be on several buses, and one may be silent."""
 
     def stop(drive: Drive) -> None:
         with suppress(BusError, ValueError):
@@ -78,7 +76,7 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
 
 
 def _own_rate(drive: Drive) -> Script[float | None]:
-    """Hz/s of the drive's own ramp, where it is known."""
+    """Return the slope of the drive's own ramp in Hz/s, None where it is unknown."""
     most = drive.option.get("maximum_frequency")
     if most is None and "maximum_frequency" in drive.registers:
         most = yield from read(drive.register("maximum_frequency"))
@@ -89,7 +87,7 @@ def _own_rate(drive: Drive) -> Script[float | None]:
 
 
 def _present(drive: Drive, register: Register[float]) -> Script[float]:
-    """The setpoint in force, in Hz."""
+    """Return the setpoint in force, in Hz."""
     if not register.readable:
         held = drive.commanded
         if held is None:

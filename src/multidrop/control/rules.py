@@ -1,6 +1,6 @@
-"""The rules of a register: what must hold before anything is written to it.
+"""Rules of a register, which must hold before anything is written to it.
 
-Whatever is against them is `Refused`, with the register, the rule and the manual's place.
+A write against them is `Refused`, with the register, the rule and the manual's place.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ T = TypeVar("T", bound=float)
 
 
 def refused(drive: Drive, register: Register[Any], rule: str, advice: Advice | None = None) -> Refused:
-    """What says that this rule keeps the register from being written."""
+    """Return the error that says that this rule keeps the register from being written."""
     return _refusal(register, rule, f"{register.name} of {drive.name} is not written: {rule}", advice)
 
 
@@ -29,7 +29,7 @@ def _refusal(register: Register[Any], rule: str, sentence: str, advice: Advice |
 
 
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
-    """The raw count to be sent; Refused what its declaration forbids, TypeError for what is no value."""
+    """Return the raw count to be sent; Refused if its declaration forbids it, TypeError for no value."""
     check_own(drive, register)
     if register.never:
         raise refused(drive, register, register.never)
@@ -42,9 +42,9 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """ValueError for another family's register: the same address means something else there.
+    """Raise ValueError for another family's register: the same address means something else there.
 
-    TypeError for what is none, such as a name.
+    Raises TypeError for what is no register, such as a name.
     """
     if not isinstance(drive, Drive):
         raise TypeError(f"{drive!r} is no drive: it is what attach returns")
@@ -57,7 +57,7 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Refused unless a plain write may do this: nothing but a verb moves a motor or resets a fault.
+    """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
 
     A command that moves nothing by itself is sent to a drive that is known to be of its class.
     """
@@ -89,12 +89,12 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def is_harmless(register: Register[Any], raw: float) -> bool:
-    """Whether it may be sent at any time, to a drive that does not answer too: a stop."""
+    """Return True for what may be sent at any time, even to a drive that does not answer: a stop."""
     return register.harmless is not None and raw in register.harmless
 
 
 def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
-    """Look at what the rules depend on: other registers, and whether the motor stands."""
+    """Read what the rules depend on: other registers, and the state of the motor."""
     for name, sign, word in ((register.at_least, 1, "below"), (register.at_most, -1, "above")):
         bound = (yield from _bound(drive, name)) if name else None
         if bound is not None and (value - bound) * sign < 0:
@@ -105,7 +105,7 @@ def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
 
 
 def _bound(drive: Drive, name: str) -> Script[float | None]:
-    """The value of an option, None where it was not declared, or of a register."""
+    """Return the value of an option, None where it was not declared, or of a register."""
     if name in drive.options:
         return drive.option.get(name)
     register: Register[float] = drive.register(name)
@@ -124,7 +124,7 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
 
 
 def wears(drive: Drive, register: Register[Any]) -> Kept:
-    """How a write to this register of this drive is kept: RAM is not worn, what is not stated may be."""
+    """Return how a write to this register is kept: RAM does not wear, what is not stated may."""
     if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
         return Kept.RAM
     is_bit = register.table.carrier is Carrier.BIT

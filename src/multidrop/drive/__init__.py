@@ -1,32 +1,13 @@
-"""A drive as its manual describes it, without I/O: all names that a family's file needs."""
+"""Drives as their manuals describe them, without I/O: registers, facts of the line, verbs."""
 
 from multidrop.core import Framing
-from multidrop.drive.family import LONGEST_SILENCE, START_TIME, Drive
-from multidrop.drive.script import (
-    Insist,
-    Pulse,
-    Read,
-    Script,
-    Step,
-    Wait,
-    Write,
-    carry_out,
-    insist,
-    read,
-    until,
-    wait,
-    write,
-)
+from multidrop.drive.family import Drive
+from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import MOVING, STOPPING, VERBS, Option, verb
+from multidrop.drive.verbs import Option, verb
 from multidrop.errors import Advice, BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 
 __all__ = [
-    "LONGEST_SILENCE",
-    "MOVING",
-    "START_TIME",
-    "STOPPING",
-    "VERBS",
     "Advice",
     "BusError",
     "Condition",
@@ -34,19 +15,15 @@ __all__ = [
     "Drive",
     "DriveRefused",
     "Framing",
-    "Insist",
     "NotDone",
     "Option",
-    "Pulse",
     "Read",
     "Refused",
     "Script",
     "State",
-    "Step",
     "Unconfirmed",
     "Unsupported",
     "Wait",
-    "Write",
     "carry_out",
     "insist",
     "read",

@@ -1,4 +1,4 @@
-"""Mistakes in a drive's class: all that its declarations get wrong, found when the class is made."""
+"""Check the declarations of a drive's class: all that is wrong with them is found when the class is made."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 
 
 class DeclarationError(ValueError):
-    """All mistakes of a drive's class: each a sentence with the register's name."""
+    """All errors in a drive's class; `mistakes` has each as a sentence with the register's name."""
 
     def __init__(self, owner: str, mistakes: Collection[str]) -> None:
         super().__init__("\n".join(f"{owner}.{mistake}" for mistake in mistakes))
         self.mistakes = tuple(mistakes)
 
 
-def mistakes(
+def declaration_errors(
     registers: Mapping[str, Register[Any]], taken: Collection[str], bounds: Collection[str]
 ) -> list[str]:
-    """Return a sentence for each mistake in a class's registers.
+    """Return a sentence for each error in a class's registers.
 
-    `taken` are the names that its drives have for something else, `bounds` those of its options.
+    `taken` are names that drives have for something else, `bounds` the names of the class's options.
     """
     found = []
     for name, register in registers.items():
@@ -189,7 +189,7 @@ def _functions(register: Register[Any]) -> Iterator[str]:
 
 
 def _access(register: Register[Any]) -> Iterator[str]:
-    """Find an access for which the table has no function code."""
+    """Find accesses for which the table has no function code."""
     table, word = register.table, register.access.value
     if register.access is not Access.COMMAND and table.read is None:
         yield f"a {table.name} cannot be read, and so holds no {word}"
@@ -203,9 +203,9 @@ def _access(register: Register[Any]) -> Iterator[str]:
 
 
 def _shared(registers: list[Register[Any]]) -> Iterator[str]:
-    """Find two registers that are written at one place and do not mean the same there.
+    """Find registers that are written at the same address and do not mean the same there.
 
-    A reading may share its place with anything, and different tables may use the same addresses.
+    A reading may share its address with anything, and different tables may use the same addresses.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     for one, other in combinations(written, 2):

@@ -1,7 +1,7 @@
-"""Drive: what a family's manual says, collected from its registers, and the verbs that command it.
+"""Drive: the base of all families: facts of the line, registers, and the verbs that command the motor.
 
-A family is a subclass that declares registers. Its verbs are scripts; called on a drive that is
-attached to a bus, a verb is carried out there.
+A family is a subclass that declares registers. Its verbs are scripts; a verb of a drive that is attached
+to a bus is carried out there.
 """
 
 from __future__ import annotations
@@ -9,42 +9,32 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, cast
 
 from multidrop.core import Framing
-from multidrop.drive.declaration_check import DeclarationError, mistakes
+from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.register import Access, Kept, Register, Table
-from multidrop.drive.script import (
-    Script,
-    read,
-    until,
-    write,
-)
+from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb
 from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
-LONGEST_SILENCE = 1.0  # s, that a line may be given
-START_TIME = 5.0  # s in which a motor that was started is to be seen to run
+LONGEST_SILENCE = 1.0  # s
+START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
-T = TypeVar("T", bound=float)
-
-
 _CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
-
-
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
 
 class Drive:
-    """One drive on a line; its class is the family: the table of the manual, in the manual's order.
+    """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
     `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
     family's. `silence`, in s, takes the place of the standard's t3.5 where all drives on the line bear
     it; what the family's document demands is kept all the same. Options are facts that only the owner
-    knows (see `options`); `ram` names the registers that its owner knows to be kept in RAM although the
+    knows (see `options`); `ram` names registers that the owner knows to be kept in RAM although the
     document does not say so. Raises ValueError for anything the family's document does not allow.
     """
 
@@ -62,7 +52,7 @@ class Drive:
     response_delay: float = 0.005  # s, typical, from the request's end to the reply's begin
     response_delay_characters: ClassVar[float] = 0.0  # the same, in characters, where that is more
     response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
-    answering_time: ClassVar[float] = 0.0  # s, that the document gives the drive for a reply; 0: it is silent
+    answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
     most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; 1 where a table is not named
@@ -75,10 +65,10 @@ class Drive:
         5: "acknowledged, still working",
         6: "busy",
     }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # of these, those that say the request came damaged
-    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and those that say the drive will answer later
-    broadcasts: ClassVar[bool] = False  # the document has broadcasts, which nobody answers
-    identity_is_inferred: ClassVar[bool] = False  # what `identify` refuses may be one of the family
+    damaged: ClassVar[frozenset[int]] = frozenset()  # of these, codes of a damaged request
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and codes of a drive that will answer later
+    broadcasts: ClassVar[bool] = False  # the document has them; nobody answers one
+    identity_is_inferred: ClassVar[bool] = False  # a drive that `identify` refuses may be of the family
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
     remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
@@ -89,33 +79,35 @@ class Drive:
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
 
     def __init_subclass__(cls) -> None:
-        """Collect the registers; raises DeclarationError with all that is wrong with them."""
+        """Collect the registers. Raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
         found: dict[str, Register[Any]] = {}
         for owner in reversed(cls.__mro__):
-            for name, it in vars(owner).items():
-                if isinstance(it, Register):
-                    found[name] = it
+            for name, attribute in vars(owner).items():
+                if isinstance(attribute, Register):
+                    found[name] = attribute
                 else:
                     found.pop(name, None)  # a subclass has something else of this name
         cls.registers = found
         cls.options = cls._all_options()
-        if wrong := mistakes(found, _NAMES, cls.options):
+        if wrong := declaration_errors(found, _NAMES, cls.options):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Those of the class, and where it commands a motor but has no `identify` its owner's word."""
-        commands = any(it.commands or it.access is Access.COMMAND for it in cls.registers.values())
+        """Return the class's options, and `confirmed` where it commands a motor but cannot identify it."""
+        commands = any(
+            register.commands or register.access is Access.COMMAND for register in cls.registers.values()
+        )
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
         if cls.identify is not Drive.identify or not (commands or verbs):
             return cls.options
         return {"confirmed": _CONFIRMED, **cls.options}
 
     def check_confirmed(self, what: str) -> None:
-        """Refused where the class cannot tell its drives from others, and nobody has said what it is.
+        """Raise Refused where the class cannot identify its drives, and the owner has not confirmed this one.
 
         The same address means different things to different makes, and may start their motor.
         """
@@ -155,20 +147,24 @@ class Drive:
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
-        if not self.name.isprintable():  # in a text recording a torn line must be seen to be torn
+        if not self.name.isprintable():  # a truncated line of a text recording must be recognised
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = self._options(options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
-        self.commanded: float | None = None  # the setpoint register that set_frequency wrote last
+        self.commanded: float | None = None  # setpoint that set_frequency wrote last
+        self.bus: Any = None  # that it is attached to
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
-        self.check_identity: Callable[[], None] = lambda: None  # a bus looks at it
-        self.begin_call: Callable[[str], Any] = lambda verb: (
-            None
-        )  # what keeps it from being sent after a stop
+        self.check_identity: Callable[[], None] = lambda: None  # a bus does
+        self.begin_call: Callable[[str], Any] = lambda verb: None  # its permit, which a stop ends
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.carry_out_stop: Callable[[str, Callable[[], Script[Any]], float | None], Any] = (
             lambda verb, make, seconds: self.perform(make())
         )
+
+    def __repr__(self) -> str:
+        where = f"on {self.bus.line.port}" if self.bus else "not attached"
+        line = f"{self.framing}, {self.settings}"
+        return f"<{type(self).__name__} {self.name!r}, address {self.address}, {line}, {where}>"
 
     def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
         self.check_identity()
@@ -222,7 +218,7 @@ class Drive:
 
     @classmethod
     def register(cls, name: str) -> Register[Any]:
-        """The register of this name; ValueError with the nearest names when there is none."""
+        """Return the register of this name; ValueError with the nearest names when there is none."""
         try:
             return cls.registers[name]
         except KeyError:
@@ -232,19 +228,26 @@ class Drive:
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """What is polled when nothing else is said."""
-        return tuple(it for it in cls.registers.values() if it.access is Access.READING and it.readable)
+        """Return the registers that are polled by default."""
+        return tuple(
+            register
+            for register in cls.registers.values()
+            if register.access is Access.READING and register.readable
+        )
 
     @property
-    def telling(self) -> Register[Any] | None:
-        """Where a reply may be a copy of its request, as an echo is: a register whose reply is none."""
+    def echo_probe(self) -> Register[Any] | None:
+        """Register whose reply is never a copy of its request, where a family has others; else None.
+
+        It is read first while it is unknown whether the adapter echoes.
+        """
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers that are known to hold raw counts from the least to the most given here.
+        """Return registers that hold raw counts in a known range, from the least to the most.
 
-        Where a family reads one register at a time its replies differ in nothing else: an answer that
-        comes late is told from another's by its value, so no two of the ranges may overlap.
+        Where a family reads one register at a time its replies differ in nothing else: a late reply is told
+        from another register's by its value, so no two of the ranges may overlap.
         """
         return {}
 
@@ -254,22 +257,22 @@ class Drive:
         super().__setattr__(name, value)
 
     def exception(self, code: int) -> str:
-        """The meaning of an exception code in this family."""
+        """Return the meaning of an exception code in this family."""
         return self.exceptions.get(code, "a code that the document does not explain")
 
     def is_passing(self, code: int) -> bool:
-        """Whether this exception says nothing against what was asked: it came damaged, or at a bad time."""
+        """Return True where the request may be right, and came damaged or at a bad time."""
         return code in self.exceptions and code in self.damaged | self.later
 
     def needed_silence(self) -> float:
-        """Silence in s that this drive demands before a request and after its reply."""
+        """Return the silence in s that this drive needs before a request and after its reply."""
         own = max(self.silence, self.silence_characters * self.settings.character)
         if self.framing is not Framing.RTU:
             return own
         return max(self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence, own)
 
     def _check_silence(self) -> None:
-        """A shorter one would end frames in their middle: pauses within them may be that long."""
+        """Refuse a silence that may also occur within a frame, or that is no time at all."""
         agreed, least = self.agreed_silence, 1.5 * self.settings.character
         if agreed is None:
             return
@@ -291,7 +294,7 @@ class Drive:
         return Unsupported(f"{self.name}: the document of {self.title or type(self).__name__} has no {what}")
 
     def _stopped(self, look: Callable[[], Script[bool]], limit: float) -> Script[None]:
-        """Wait until the drive is seen to have stopped; Unconfirmed when it is not after `limit` seconds."""
+        """Wait until the drive is seen to have stopped; Unconfirmed after `limit` seconds."""
         if not (yield from until(look, limit=limit)):
             raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
 
@@ -305,27 +308,30 @@ class Drive:
         self.commanded = held
 
     def _setpoint_in_force(self) -> Script[None]:
-        """Refused unless the setpoint is known, is not 0, and is still the one that was written."""
+        """Raise Refused unless the setpoint is known, is not 0, and is still the one that was written."""
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
-            raise Refused(
-                f"{self.name} cannot say its setpoint: call set_frequency before start",
-                advice=_SETPOINT_FIRST,
-            )
-        if held == 0:
-            raise Refused(
-                f"the setpoint of {self.name} is 0: call set_frequency before start", advice=_SETPOINT_FIRST
-            )
-        if self.commanded is not None and held != self.commanded:
-            raise Refused(
-                f"{self.name} holds {register.format(held)} and not {register.format(self.commanded)} as it "
-                "was told: it may have lost its power; call set_frequency before start",
-                advice=_SETPOINT_FIRST,
-            )
+            why = f"{self.name} cannot say its setpoint:"
+        elif held == 0:
+            why = f"the setpoint of {self.name} is 0:"
+        elif self.commanded is not None and held != self.commanded:
+            shown = f"{register.format(held)} and not {register.format(self.commanded)}"
+            why = f"{self.name} holds {shown} as it was told: it may have lost its power;"
+        else:
+            return
+        raise Refused(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
+
+    def _stop_first(self, why: str) -> Refused:
+        return Refused(f"{self.name} {why} call stop() first", advice=Advice.call("stop"))
+
+    def _reset_first(self, fault: str = "") -> Refused:
+        shown = f"a fault, {fault}" if fault else "a fault"
+        why = f"{self.name} has {shown}: see to it, then call reset_fault()"
+        return Refused(why, advice=Advice.call("reset_fault"))
 
     def _started(self) -> Script[None]:
-        """Look whether it runs: NotDone when it trips, Unconfirmed when it is not seen to run."""
+        """Wait until the motor is seen to run; NotDone when the drive trips, Unconfirmed when it is not."""
         if not (yield from until(self._runs, limit=START_TIME)):
             reason = f"after {START_TIME:g} s it is not seen to run; {self.remote}"
             raise Unconfirmed(self.name, "the start", reason)
@@ -338,14 +344,14 @@ class Drive:
 
     @verb
     def identify(self) -> Script[None]:
-        """Look, without writing, whether this is a drive of the family; Refused when it is another.
+        """Check by reading that this is a drive of the family; Refused when it is another.
 
-        What is not refused is not proven: few families say who they are.
+        A drive that passes is not proven to be one: few families say who they are.
         """
         yield from ()
 
     def resembles(self) -> Script[bool]:
-        """Whether it reads like one of the family where `identify` refuses it: good for a guess alone."""
+        """Return True where a drive that `identify` refuses reads like the family: good for a guess alone."""
         yield from ()
         return False
 
@@ -393,13 +399,13 @@ class Drive:
 
     @verb
     def state(self) -> Script[State]:
-        """What the drive says of itself."""
+        """Report condition, direction and fault."""
         raise self._unsupported("state")
         yield
 
 
-# What a drive has besides registers.
+# Names that a register cannot have.
 _NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "commanded", "perform", "check_identity"}
+    | {"option", "ram", "commanded", "bus", "perform", "check_identity"}
 )

@@ -1,7 +1,7 @@
-"""Registers: what a drive's manual says about one quantity, as a typed declaration without I/O.
+"""Registers: typed declarations of what a drive's manual says about one quantity.
 
-Three words carry the access: a `reading` can be read, a `setting` read and written, a `command`
-only written. `Register[float]` has a unit and a step, `Register[E]` has the names of an enumeration.
+A `reading` can be read, a `setting` read and written, a `command` only written. `Register[float]` has a
+unit and a step, `Register[E]` the names of an enumeration.
 """
 
 from __future__ import annotations
@@ -13,26 +13,10 @@ from decimal import Decimal
 from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, Generic, NotRequired, TypedDict, TypeVar, Unpack, cast, overload
+from typing import Any, Generic, TypedDict, TypeVar, Unpack, cast, overload
 
-from multidrop.core import NumberFormat
-from multidrop.drive import float32
-
-__all__ = [
-    "COIL",
-    "DISCRETE",
-    "HOLDING",
-    "INPUT",
-    "Access",
-    "Carrier",
-    "Kept",
-    "NumberFormat",
-    "Register",
-    "Table",
-    "command",
-    "reading",
-    "setting",
-]
+from multidrop.core import NumberFormat as NumberFormat
+from multidrop.drive.number_format import FLOATS, LONGS, nearest, raw_span, shortest
 
 T = TypeVar("T", bound=float)
 E = TypeVar("E", bound=IntEnum | IntFlag)
@@ -45,7 +29,7 @@ class Access(Enum):
 
 
 class Kept(Enum):
-    """Where a drive keeps what is written: EEPROM bears a limited number of writes."""
+    """Memory in which a drive keeps what is written; EEPROM bears a limited number of writes."""
 
     RAM = "RAM"
     EEPROM = "EEPROM"
@@ -53,7 +37,7 @@ class Kept(Enum):
 
 
 class Carrier(Enum):
-    """Where in a frame a table's values travel."""
+    """Field of a frame that carries a table's values."""
 
     BIT = "bit"
     WORD = "word"
@@ -63,7 +47,7 @@ class Carrier(Enum):
 
 @dataclass(frozen=True)
 class Table:
-    """One of a drive's address spaces, the function codes that reach it, and what a write there wears."""
+    """One of a drive's address spaces, and the function codes that read and write it."""
 
     name: str
     read: int | None
@@ -77,65 +61,37 @@ INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
 
-FLOAT_WIRES = (NumberFormat.F32, NumberFormat.F32_SWAPPED)
-_LONG_WIRES = (
-    NumberFormat.U32,
-    NumberFormat.I32,
-    NumberFormat.U32_SWAPPED,
-    NumberFormat.I32_SWAPPED,
-    NumberFormat.U32_EITHER,
-    *FLOAT_WIRES,
-)
-_LARGEST_FLOAT = float.fromhex("0x1.fffffep127")
 
+class Details(TypedDict, total=False):
+    """Facts of a declaration besides address and unit; each may be left out."""
 
-class Details(TypedDict):
-    """What a declaration may say besides address and unit; all of it may be left out.
-
-    step: value of one raw count; None where the document does not state it
-    span: smallest and largest value that may be written
-    at_least, at_most: the register or option whose present value bounds it besides
-    number_format: how the number lies in the frame
-    table: address space and function codes
-    kept: RAM or EEPROM; that of the table where the table has one
-    ram_address: where the same quantity can be written without wearing the EEPROM
-    default: value from the factory
-    while_running: may be changed while the motor turns; None where not stated
-    broadcast: the raw counts that are documented and harmless as a broadcast
-    moves: a write to it may start, stop or reset something, and is left to the verbs; if not stated, a
-        command does, and a setting does not unless it has `harmless`
-    harmless: of a register that moves the motor, the raw counts that anyone may write at any time,
-        and again when their answer is lost; all others are for verbs, which send them once
-    never: why the library never writes it
-    never_together: masks of bits that are never set in one write
-    place: where the manual says so
-    outside: the source, where it is not the family's own document
-    note: what else a user must know
-    """
-
-    step: NotRequired[float | None]
-    span: NotRequired[tuple[float, float]]
-    at_least: NotRequired[str]
-    at_most: NotRequired[str]
-    number_format: NotRequired[NumberFormat]
-    table: NotRequired[Table]
-    kept: NotRequired[Kept]
-    ram_address: NotRequired[int]
-    default: NotRequired[float]
-    while_running: NotRequired[bool]
-    broadcast: NotRequired[tuple[int, ...]]
-    moves: NotRequired[bool]
-    harmless: NotRequired[tuple[int, ...]]
-    never: NotRequired[str]
-    never_together: NotRequired[tuple[int, ...]]
-    place: NotRequired[str]
-    outside: NotRequired[str]
-    note: NotRequired[str]
+    step: float | None  #: value of one raw count; None where the document does not state it
+    span: tuple[float, float]  #: smallest and largest value that may be written
+    at_least: str  #: register or option whose present value is the least that may be written
+    at_most: str  #: register or option whose present value is the most
+    number_format: NumberFormat  #: width, sign and word order in the frame
+    table: Table  #: address space and function codes
+    kept: Kept  #: RAM or EEPROM; that of the table where the table has one
+    ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
+    default: float  #: value from the factory
+    while_running: bool  #: may be changed while the motor turns; None where not stated
+    broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
+    #: A write may start, stop or reset something, and is left to the verbs. Where it is not stated, that
+    #: holds for a command, and for a setting that has `harmless`.
+    moves: bool
+    #: Of a register that moves the motor, the raw counts that anyone may write at any time, and again when
+    #: the reply is lost. All others are for verbs, which send them once.
+    harmless: tuple[int, ...]
+    never: str  #: reason why the library never writes it
+    never_together: tuple[int, ...]  #: masks of bits that are never set in one write
+    place: str  #: section of the manual
+    outside: str  #: source, where it is not the family's own document
+    note: str  #: further facts for users
 
 
 @dataclass(frozen=True, eq=False)
 class Register(Generic[T]):
-    """One quantity of a drive: where it is, what it means, what may be done with it."""
+    """One quantity of a drive: its address, its meaning, its limits; see `Details` for each fact."""
 
     address: int
     access: Access
@@ -162,7 +118,7 @@ class Register(Generic[T]):
     name: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        carrier = getattr(self.table, "carrier", Carrier.WORD)  # a wrong table is told with the class
+        carrier = getattr(self.table, "carrier", Carrier.WORD)  # the class reports a wrong table
         if self.number_format == NumberFormat.U16 and carrier is not Carrier.WORD:
             object.__setattr__(
                 self, "number_format", NumberFormat.BIT if carrier is Carrier.BIT else NumberFormat.U32
@@ -181,10 +137,10 @@ class Register(Generic[T]):
     def __str__(self) -> str:
         return self.name
 
-    @property
+    @cached_property
     def words(self) -> int:
-        """How many addresses it takes in its table."""
-        return 2 if self.table.carrier is Carrier.WORD and self.number_format in _LONG_WIRES else 1
+        """Addresses that it takes in its table."""
+        return 2 if self.table.carrier is Carrier.WORD and self.number_format in LONGS else 1
 
     @property
     def readable(self) -> bool:
@@ -197,7 +153,7 @@ class Register(Generic[T]):
     @property
     def is_float(self) -> bool:
         """True where the raw count is a float32."""
-        return self.table.carrier is Carrier.WORD and self.number_format in FLOAT_WIRES
+        return self.table.carrier is Carrier.WORD and self.number_format in FLOATS
 
     @property
     def commands(self) -> bool:
@@ -208,17 +164,17 @@ class Register(Generic[T]):
 
     @cached_property
     def scale(self) -> Fraction:
-        """The step as an exact fraction, 1 where it is unknown: 3 * 1/10 is 0.3, not 0.30000000000000004."""
+        """Exact step, 1 where it is unknown: 3 * 1/10 is 0.3, and not 0.30000000000000004."""
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
 
     @property
     def decimals(self) -> int:
-        """Digits after the point that the step needs."""
+        """Digits that the step needs after the point."""
         exponent = Decimal(f"{float(self.scale):.6g}").normalize().as_tuple().exponent
         return max(0, -int(exponent))
 
     def decode(self, raw: float) -> T:
-        """The value of a raw count."""
+        """Return the value of a raw count; a number where the enumeration has no name for it."""
         if self.values is not None:
             try:
                 return self.values(int(raw))
@@ -242,7 +198,7 @@ class Register(Generic[T]):
             raise ValueError(
                 f"{self.name} = {_short(value)} is outside {low:g} to {high:g} {self.unit}".rstrip()
             )
-        bottom, top = self._raw_span()
+        bottom, top = raw_span(self.number_format)
         try:
             raw = self._raw(value)
         except OverflowError:
@@ -259,25 +215,25 @@ class Register(Generic[T]):
             raise OverflowError
         count = Fraction(str(value)) / self.scale
         if self.is_float:
-            return float32.nearest(count)
+            return nearest(count)
         if count.denominator != 1 and self._counts:
             raise ValueError(f"{self.name} takes a whole number, not {value:g}")
         return round(count)
 
     def takes(self, value: T) -> bool:
-        """Return True for a value that a drive may have been given: it has a name, or is in the span."""
+        """Return True where a drive may hold this value: it has a name, or is in the span."""
         if self.values is not None:
             return isinstance(value, self.values)
         if self.span is None:
             return True
         low, high = self.span
-        if self.is_float:  # a drive holds the float32 nearest to an end
-            low, high = (float(self.scale * Fraction(float32.nearest(end / self.scale))) for end in self.span)
+        if self.is_float:  # the drive holds the float32 nearest to an end
+            low, high = (float(self.scale * Fraction(nearest(end / self.scale))) for end in self.span)
         return low <= value <= high
 
     @property
     def _counts(self) -> bool:
-        """Its numbers are choices or raw counts, of which the nearest one may mean something else."""
+        """True where numbers are choices or raw counts: the nearest one may mean something else."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -296,20 +252,8 @@ class Register(Generic[T]):
         choices = ", ".join(member.name for member in values)
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
 
-    def _raw_span(self) -> tuple[Fraction, Fraction]:
-        low, high = self._whole_span() if not self.is_float else (-_LARGEST_FLOAT, _LARGEST_FLOAT)
-        return Fraction(low), Fraction(high)
-
-    def _whole_span(self) -> tuple[int, int]:
-        if self.number_format is NumberFormat.BIT:
-            return 0, 1
-        bits = 16 if self.number_format in (NumberFormat.U16, NumberFormat.I16) else 32
-        if self.number_format in (NumberFormat.I16, NumberFormat.I32, NumberFormat.I32_SWAPPED):
-            return -(1 << bits - 1), (1 << bits - 1) - 1
-        return 0, (1 << bits) - 1
-
     def parse(self, text: str) -> T:
-        """The value that a person typed: a number, or names joined by "|"; ValueError if it is neither."""
+        """Return the value that a person typed: a number, or names joined by "|"; ValueError otherwise."""
         if self.values is None:
             try:
                 return cast(T, float(text))
@@ -330,18 +274,18 @@ class Register(Generic[T]):
         return cast(T, total)
 
     def format(self, value: T) -> str:
-        """The value as a person reads it, with its unit."""
+        """Return the value as a person reads it, with its unit."""
         if isinstance(value, Flag):
             return "|".join(str(member.name) for member in value) or "none"
         if isinstance(value, IntEnum):
             return value.name
         unit = self.unit if self.step is not None else "(scale not stated)"
-        number = float32.shortest(value, self.scale) if self.is_float else f"{value:.{self.decimals}f}"
+        number = shortest(value, self.scale) if self.is_float else f"{value:.{self.decimals}f}"
         return f"{number} {unit}".rstrip()
 
 
 def _short(value: float) -> str:
-    """Return a number as a sentence shows it; it may be larger than any float."""
+    """Return a number for a sentence; it may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
@@ -350,7 +294,7 @@ def reading(address: int, unit: str = "", /, **details: Unpack[Details]) -> Regi
 @overload
 def reading(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
 def reading(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """A quantity that can only be read, with its unit or the enumeration of its values."""
+    """Declare a quantity that can only be read, with its unit or the enumeration of its values."""
     return _declare(Access.READING, address, what, details)
 
 
@@ -359,7 +303,7 @@ def setting(address: int, unit: str = "", /, **details: Unpack[Details]) -> Regi
 @overload
 def setting(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
 def setting(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """A quantity that can be read and written, with its unit or the enumeration of its values."""
+    """Declare a quantity that can be read and written, with its unit or the enumeration of its values."""
     return _declare(Access.SETTING, address, what, details)
 
 
@@ -368,7 +312,7 @@ def command(address: int, unit: str = "", /, **details: Unpack[Details]) -> Regi
 @overload
 def command(address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
 def command(address: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """A quantity that can only be written, with its unit or the enumeration of its values."""
+    """Declare a quantity that can only be written, with its unit or the enumeration of its values."""
     return _declare(Access.COMMAND, address, what, details)
 
 

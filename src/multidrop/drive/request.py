@@ -1,4 +1,4 @@
-"""Build the request that writes a register."""
+"""Build the requests that read and write registers."""
 
 from __future__ import annotations
 
@@ -7,13 +7,25 @@ from typing import Any
 
 from multidrop.core import Message
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Carrier, Register
+from multidrop.drive.register import Carrier, Register, Table
+
+_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once
+
+
+def read_request(drive: Drive, table: Table, start: int, count: int) -> Message:
+    """Return the request that reads `count` addresses of a table; ValueError where none can."""
+    if table.read is None:
+        raise ValueError(f"a {table.name} cannot be read")
+    if table.carrier in (Carrier.LONG, Carrier.NUMBER):
+        return Message(drive.address, table.read, start, data=bytes(4))
+    return Message(drive.address, table.read, start, count)
 
 
 def write_request(drive: Drive, register: Register[Any], raw: float, address: int | None = None) -> Message:
-    """The request that writes a raw count to a register, to its RAM alias where it has one.
+    """Return the request that writes a raw count to a register, or to its RAM alias where it has one.
 
-    Raises ValueError where the register cannot be written.
+    `address` takes the place of the drive's own, for a broadcast. Raises ValueError where the register
+    cannot be written.
     """
     table = register.table
     if not register.writable or table.write is None:
@@ -32,12 +44,8 @@ def write_request(drive: Drive, register: Register[Any], raw: float, address: in
         return Message(to, table.write, at, data=b"\xff\x00" if raw else b"\x00\x00")
     if register.words == 1:
         word = struct.pack(">H", int(raw) & 0xFFFF)
-        count = 1 if table.write == _WRITE_WORDS else 0
-        return Message(to, table.write, at, count, word)
+        return Message(to, table.write, at, count=1 if table.write == _WRITE_WORDS else 0, data=word)
     words = struct.pack(">f", raw) if register.is_float else struct.pack(">I", int(raw) & 0xFFFF_FFFF)
     if register.number_format.name.endswith("_SWAPPED"):
         words = words[2:] + words[:2]
     return Message(to, _WRITE_WORDS, at, count=2, data=words)
-
-
-_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once

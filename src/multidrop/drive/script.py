@@ -1,6 +1,6 @@
-"""Scripts: the steps a verb consists of, written down as a generator without any I/O.
+"""Scripts: the steps of a verb, as a generator without any I/O.
 
-A script yields steps (read, write, wait) and receives what they gave.
+A script yields steps (read, write, wait) and receives their results.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 from multidrop.drive.register import Register
 from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Unconfirmed
 
-MOST_UNHEARD = 3  # looks in a row
+MOST_UNANSWERED = 3  # looks in a row
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -31,12 +31,12 @@ class Write:
 
 @dataclass(frozen=True)
 class Insist(Write):
-    """A write that does no harm at any time, nor when it is repeated: a stop, or a command taken back."""
+    """A write that does no harm at any time, nor when it is repeated, such as a stop."""
 
 
 @dataclass(frozen=True)
 class Pulse(Insist):
-    """One that is sent once in a call, whatever becomes of it: a stop that is itself a fault."""
+    """A harmless write that is sent once in a call: a stop that is itself a fault."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ Script = Generator[Step, Any, R]
 
 
 def read(register: Register[T]) -> Script[T]:
-    """The register's value, as `value = yield from read(register)`."""
+    """Read a register's value: `value = yield from read(register)`."""
     return cast(T, (yield Read(register)))
 
 
 def write(register: Register[T], value: T) -> Script[T]:
-    """Write once; what the drive then holds, where that can be read, else `value`."""
+    """Write once; return what the drive then holds where that can be read, else `value`."""
     return cast(T, (yield Write(register, value)))
 
 
@@ -63,7 +63,7 @@ def wait(seconds: float) -> Script[None]:
 
 
 def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
-    """Do a script's steps; what it returns. A step's failure is raised in it, and may be mended there."""
+    """Do a script's steps and return its result. A step's BusError or ValueError is raised in the script."""
     try:
         step = next(script)
         while True:
@@ -78,7 +78,7 @@ def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
 
 
 def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
-    """Write what does no harm when it is repeated, such as a stop: again when its answer is lost."""
+    """Write what does no harm when it is repeated, such as a stop, and again when the reply is lost."""
     for attempt in range(1, attempts + 1):
         try:
             yield Insist(register, value)
@@ -90,21 +90,21 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Look again and again until it is true; False when `limit` seconds have passed.
+    """Look again and again until it is true; return False when `limit` seconds have passed.
 
-    A motor that starts brings noise: a look at a drive that cannot be heard sees nothing, but for the
-    third in a row, whose failure is raised.
+    A motor that starts brings noise: a look without a good reply sees nothing. The third such look in a row
+    raises NoReply or BadReply.
     """
     waited = 0.0
-    unheard = 0
+    unanswered = 0
     while True:
         try:
             if (yield from look()):
                 return True
-            unheard = 0
+            unanswered = 0
         except (NoReply, BadReply):
-            unheard += 1
-            if unheard == MOST_UNHEARD:
+            unanswered += 1
+            if unanswered == MOST_UNANSWERED:
                 raise
         if waited >= limit:
             return False

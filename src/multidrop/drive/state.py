@@ -1,4 +1,4 @@
-"""State: what a drive says of itself."""
+"""State: condition, direction and fault, as a drive reports them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Condition(Enum):
 
 @dataclass(frozen=True)
 class State:
-    """What a drive says of itself: never more than its document lets it say."""
+    """A drive's report of itself: never more than its document lets it say."""
 
     condition: Condition
     direction: Direction | None = None

@@ -1,4 +1,4 @@
-"""How long things take on the wire: characters, silences, frames. Pure arithmetic, in seconds."""
+"""Line settings, and the time in seconds that characters and silences take with them."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class Settings:
 
     @property
     def character(self) -> float:
-        """One character: start bit, data bits, parity bit if any, stop bits."""
+        """Seconds of one character: start bit, data bits, parity bit if any, stop bits."""
         bits = 1 + self.databits + (self.parity != "N") + self.stopbits
         return bits / self.baudrate
 
     @property
     def t3_5(self) -> float:
-        """Silence between RTU frames: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
+        """Silence between RTU frames, s: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
         return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character
 
     @property

@@ -1,4 +1,4 @@
-"""Verbs: methods of a drive that are scripts, carried out on the bus that the drive is on."""
+"""Verbs: methods of a drive that are scripts, and are carried out on its bus."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
-from multidrop.drive.script import (
-    Script,
-)
+from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
 
 if TYPE_CHECKING:
@@ -23,7 +21,7 @@ P = ParamSpec("P")
 class Option:
     """A fact about one drive that only its owner knows, such as its maximum frequency.
 
-    One without a unit is a choice or a number of something: a whole number.
+    Without a unit it is a whole number: a choice, or a number of something.
     """
 
     unit: str
@@ -31,15 +29,15 @@ class Option:
     meaning: str
 
 
-# Verbs before which the drive must be known to be of its family, and which a stop ends.
+# Sent only to a drive that is known to be of its family, and not after a stop was called.
 MOVING = ("start", "jog", "reset_fault", "set_frequency")
 
-
-# A stop goes to a silent drive too, again and again.
+# Sent to a silent drive too, again and again.
 STOPPING = ("stop", "coast", "emergency_stop")
 
+VERBS = ("start", "stop", "coast", "emergency_stop", "jog", "reset_fault", "set_frequency", "state")
 
-# What a verb is given, its types, and in words: "reverse" is not Direction.REVERSE, and would go forward.
+# Each verb's argument, its types, and these in words: "reverse", a string, would go forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -48,9 +46,9 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
 
 
 class _BoundVerb(Generic[P, R]):
-    """A verb of one drive: calling it carries it out.
+    """A verb of one drive; a call carries it out.
 
-    A stop takes `seconds`: for so long it is repeated until the motor is seen to stand; without it for 30 s
+    A stop takes `seconds`: it is repeated for so long until the motor is seen to stand; without it for 30 s
     at least, and as long as the motor's ramp may take.
     """
 
@@ -76,17 +74,17 @@ class _BoundVerb(Generic[P, R]):
         return cast(R, self.drive.perform(script))
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
-        """The steps, to be carried out by someone else: another verb or a test."""
+        """Return the steps, for another verb or a test. Raises TypeError for a wrong argument."""
         if self.name in _TAKES:
             keyword, types, right = _TAKES[self.name]
-            for given in (*args[:1], *(it for key, it in kwargs.items() if key == keyword)):
+            for given in (*args[:1], *(value for key, value in kwargs.items() if key == keyword)):
                 if isinstance(given, bool) or not isinstance(given, types):
                     raise TypeError(f"{self.name} of {self.drive.name} takes {right}, not {given!r}")
         return self._script(self.drive, *args, **kwargs)
 
 
 class Verb(Generic[P, R]):
-    """A method that is a script, and is carried out on the drive's bus when it is called."""
+    """Decorator of a script that becomes a verb: a call carries it out on the drive's bus."""
 
     def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
         self._script = script
@@ -101,16 +99,4 @@ class Verb(Generic[P, R]):
         return self if drive is None else _BoundVerb(self.name, drive, self._script)
 
 
-verb = Verb  # as a decorator
-
-
-VERBS = (
-    "start",
-    "stop",
-    "coast",
-    "emergency_stop",
-    "jog",
-    "reset_fault",
-    "set_frequency",
-    "state",
-)
+verb = Verb

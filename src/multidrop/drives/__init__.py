@@ -1,4 +1,4 @@
-"""The built-in families, by the names that a plant file and the command line know them by."""
+"""The built-in families, by the names that a plant file and the command line use."""
 
 from multidrop.drive import Drive
 from multidrop.drives.delixi_modbus import DelixiModbus
@@ -8,16 +8,8 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
 
-__all__ = [
-    "MODELS",
-    "YD1000",
-    "DelixiModbus",
-    "DelixiNative",
-    "ErmanERG220",
-    "InnovertIBD",
-    "InvtCHE",
-]
+__all__ = ["MODELS", "YD1000", "DelixiModbus", "DelixiNative", "ErmanERG220", "InnovertIBD", "InvtCHE"]
 
 MODELS: dict[str, type[Drive]] = {
-    it.model: it for it in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000)
+    family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000)
 }

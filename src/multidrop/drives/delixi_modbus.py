@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import Advice, Condition, Direction, Framing, Refused, Script, State, insist, read, write
+from multidrop.drive import Framing, Refused
 from multidrop.drive.register import HOLDING, Kept, Register, command, setting
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 from multidrop.drives.delixi_parameters import KEYPAD, DelixiBaudrate, DelixiParameters, parameter
 
@@ -89,14 +91,14 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     _jogged = False  # by this object, since it was last seen to stand
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """P04.30, its address, P04.28, its baud rate, or a bus voltage that no address reaches."""
+        """Return P04.30, its address, P04.28, its baud rate, and a bus voltage that no address reaches."""
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
         code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
         return known if code == self.address else known | {self.baudrate_setting: (code, code)}
 
     @verb
     def identify(self) -> Script[None]:
-        """P04.30 is its address, P04.28 its baud rate, and P05.31 a fault code."""
+        """Check that P04.30 is its address, P04.28 its baud rate, and P05.31 a fault code."""
         yield from self._shows_its_line()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
@@ -106,10 +108,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction forward, and only from rest."""
         if self._jogged and not (yield from self._stands()):
-            raise Refused(
-                f"{self.name} may still jog, which a start may not end: call stop() first",
-                advice=Advice.call("stop"),
-            )
+            raise self._stop_first("may still jog, which a start may not end:")
         forward = yield from self._forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise Refused(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
@@ -149,7 +148,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def state(self) -> Script[State]:
-        """The fault by name, or that the motor turns; at rest, unknown."""
+        """Report the fault by name, or that the motor turns; at rest the state is unknown."""
         fault = yield from read(self.fault)
         if fault:
             return State(Condition.FAULT, fault=self.fault.format(fault))

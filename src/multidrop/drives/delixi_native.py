@@ -5,19 +5,10 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import (
-    Condition,
-    Direction,
-    Framing,
-    NotDone,
-    Refused,
-    Script,
-    State,
-    insist,
-    read,
-    write,
-)
+from multidrop.drive import Framing, NotDone, Refused
 from multidrop.drive.register import Carrier, Kept, Register, Table, command, reading, setting
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 from multidrop.drives.delixi_parameters import KEYPAD, DelixiParameters, parameter
 
@@ -99,40 +90,26 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     )
     status = reading(0, DelixiNativeStatus, table=STATE, place="part 3, section 5: K = 03")
     frequency = command(
-        0x0001,
-        "Hz",
-        step=0.01,
-        table=SETPOINT,
-        moves=False,
-        place="part 3, section 5: K = 04, 0001",
+        0x0001, "Hz", step=0.01, table=SETPOINT, moves=False, place="part 3, section 5: K = 04, 0001"
     )
     pi_setpoint = command(
-        0x0007,
-        step=0.1,
-        table=SETPOINT,
-        moves=False,
-        place="part 3, section 5: K = 04, 0007",
+        0x0007, step=0.1, table=SETPOINT, moves=False, place="part 3, section 5: K = 04, 0007"
     )
     stored_frequency = setting(
-        parameter(0, 2),
-        "Hz",
-        step=0.01,
-        table=PARAMETER,
-        place="P00.02",
-        note="Used if P00.01 = 1.",
+        parameter(0, 2), "Hz", step=0.01, table=PARAMETER, place="P00.02", note="Used if P00.01 = 1."
     )
     format_setting = setting(
         parameter(4, 29), DelixiNativeFormat, table=PARAMETER, never=KEYPAD, place="P04.29"
     )
 
     @property
-    def telling(self) -> Register[Any]:
-        """A parameter's request has the value 0 in it; no state is 0 (part 3, section 5: K = 03 and 07)."""
+    def echo_probe(self) -> Register[Any]:
+        """The run state: none is 0, the value in a parameter's request (part 3, section 5: K = 03, 07)."""
         return self.status
 
     @verb
     def identify(self) -> Script[None]:
-        """P04.30 is its address and P04.28 its baud rate; a drive of another protocol does not answer."""
+        """Check that P04.30 is its address and P04.28 its baud rate; drives of other protocols are silent."""
         yield from self._shows_its_line()
 
     @verb
@@ -179,7 +156,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def state(self) -> Script[State]:
-        """Its run state, with the direction; the fault by name."""
+        """Report the run state with its direction, and the fault by name."""
         status = yield from read(self.status)
         if status in CONDITIONS:
             condition, direction = CONDITIONS[status]

@@ -1,12 +1,13 @@
-"""What Delixi's two protocols share: the numbered parameters, and the codes of faults."""
+"""Parameters and fault codes that Delixi's two protocols share."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from enum import IntEnum
 
-from multidrop.drive import Drive, Refused, Script, read
+from multidrop.drive import Drive, Refused
 from multidrop.drive.register import Register, Table, reading, setting
+from multidrop.drive.script import Script, read
 from multidrop.drive.verbs import Option
 
 STOP_TIME = 60.0  # s; the deceleration time's number is not known
@@ -15,7 +16,7 @@ KEYPAD = "it belongs to the line or to the command over the motor; set it on the
 
 
 def parameter(group: int, index: int) -> int:
-    """The number of a parameter: 500 for P05.00."""
+    """Return the number of a parameter: 500 for P05.00."""
     return group * 100 + index
 
 
@@ -77,9 +78,7 @@ class DelixiParameters(Drive):
         "P04.28 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400), P04.29 format (its codes are those "
         "of format_setting), P04.30 address"
     )
-    options = {
-        "stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it"),
-    }
+    options = {"stop_time": Option("s", (1, 3600), "longest time that a stop may take; 60 without it")}
 
     run_source = setting(parameter(0, 0), DelixiRunSource, never=KEYPAD, place="P00.00")
     frequency_source = setting(
@@ -136,7 +135,7 @@ class DelixiParameters(Drive):
         super().__init_subclass__()
 
     def _shows_its_line(self) -> Script[None]:
-        """Refused unless P04.30 and P04.28 are the address and baud rate at which it answers."""
+        """Raise Refused unless P04.30 and P04.28 are the address and baud rate at which it answers."""
         address = yield from read(self.address_setting)
         if address != self.address:
             raise Refused(f"{self.name} has {address:g} as P04.30, not its address: it is not a Delixi")
@@ -145,7 +144,7 @@ class DelixiParameters(Drive):
             raise Refused(f"{self.name} has {int(baudrate)} as P04.28, not its baud rate: it is not a Delixi")
 
     def _may_start(self) -> Script[None]:
-        """Refused with a fault, without a setpoint, and where the line does not command it."""
+        """Raise Refused with a fault, without a setpoint, and where the line does not command it."""
         fault = yield from read(self.fault)
         if fault:
             raise Refused(

@@ -5,22 +5,10 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import Any
 
-from multidrop.drive import (
-    Advice,
-    BusError,
-    Condition,
-    Direction,
-    Drive,
-    DriveRefused,
-    Refused,
-    Script,
-    State,
-    Unconfirmed,
-    insist,
-    read,
-    write,
-)
+from multidrop.drive import Advice, BusError, Drive, DriveRefused, Refused, Unconfirmed
 from multidrop.drive.register import COIL, HOLDING, INPUT, NumberFormat, Register, command, reading, setting
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
@@ -64,7 +52,7 @@ class ErmanFault(IntFlag):
 
 
 class Modes(IntFlag):
-    """What 0 and 1 mean is not stated."""
+    """Bits of 0001H; the meaning of 0 and 1 is not stated."""
 
     MODULATION_TYPE = 1 << 0
     CONTROL_TYPE = 1 << 4
@@ -83,7 +71,7 @@ class ErmanERG220(Drive):
     - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
       Coils are written one at a time (05), and reset and start are two calls.
     - The order of the bytes in a reply to function 01 is doubtful: coils are read where one byte holds
-      them, and not polled unless that is asked for. They tell what was commanded. Whether the
+      them, and not polled unless that is asked for. They show what was commanded. Whether the
       motor runs is read from 0400H, whose bits 0 and 1 are one number and not two flags.
     - Of the diagnostics, function 08, only the example is described, subfunction 0, and its error reply
       has the code 89H instead of 88H. `bus.raw(drive, 0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
@@ -129,7 +117,7 @@ class ErmanERG220(Drive):
     options = {
         "acknowledged_fault": Option(
             "", (0, 0xFFFF_FFFF), "the drive's last fault, as its number, once it has been dealt with"
-        ),
+        )
     }
 
     # Commands (section 10)
@@ -215,12 +203,12 @@ class ErmanERG220(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """All but the coils, which tell what was commanded."""
+        """Return all but the coils, which show what was commanded."""
         return tuple(register for register in super().readings() if register.table is not COIL)
 
     @verb
     def identify(self) -> Script[None]:
-        """0400H can be read; on the models -03 and -04 function 04 does not exist."""
+        """Check that 0400H can be read; on the models -03 and -04 function 04 does not exist."""
         try:
             yield from read(self.status)
         except DriveRefused as refusal:
@@ -292,7 +280,7 @@ class ErmanERG220(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """The phase of its ramp; its last fault is a note, because it may be past."""
+        """Report the phase of the ramp; the last fault is a note, because it may be past."""
         status = yield from read(self.status)
         fault = yield from read(self.last_fault)
         notes = ["motor overloaded"] if status & OVERLOAD else []

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 from enum import IntEnum, IntFlag
 
-from multidrop.drive import (
-    Advice,
-    BusError,
-    Condition,
-    Direction,
-    Drive,
-    DriveRefused,
-    Framing,
-    Refused,
-    Script,
-    State,
-    insist,
-    read,
-    write,
-)
+from multidrop.drive import Advice, BusError, Drive, DriveRefused, Framing, Refused
 from multidrop.drive.register import HOLDING, command, reading, setting
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
@@ -31,7 +19,7 @@ OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 
 
 
 def parameter(name: str) -> int:
-    """The address of a parameter: 3 for PrA.03, 107 for Prb.07 (appendix 2, table 2).
+    """Return the address of a parameter: 3 for PrA.03, 107 for Prb.07 (appendix 2, table 2).
 
     The digits of A and b are known from examples; the table is lost, and C to H are inferred to go on.
     """
@@ -69,7 +57,7 @@ class Terminals(IntFlag):
 
 
 class Output(IntEnum):
-    """What an output says; only these codes are named."""
+    """Functions of an output; only these codes are named."""
 
     RUNNING = 1
     FAULT = 3
@@ -107,7 +95,7 @@ class InnovertIBD(Drive):
 
     Where the document errs or is silent, the safest reading is taken:
 
-    - What Prb.01 means is contradictory (5 is the line in the text, the potentiometer in an
+    - The meaning of Prb.01 is contradictory (5 is the line in the text, the potentiometer in an
       example): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
     - The bits for the direction are ambiguous (their order is printed the other way round than that
       of the bits before): a direction is refused, unless the option `forward_bit` says which bit was
@@ -219,7 +207,7 @@ class InnovertIBD(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """PrH.00 and PrH.02 are its own baud rate and address; their addresses are inferred.
+        """Check that PrH.00 and PrH.02 are its own baud rate and address; these places are inferred.
 
         A drive that has something else there may be an IBD all the same, which nothing can tell: its
         owner declares confirmed = 1, once, in the plant file.
@@ -242,7 +230,7 @@ class InnovertIBD(Drive):
         return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
     def resembles(self) -> Script[bool]:
-        """Bits 11 and 12 of PrA.22 are 1, as in the example, 14 and 15 are 0, and what is named is there."""
+        """Return True where bits 11 to 15 of PrA.22 are as in the example, and what is named is there."""
         try:
             yield from read(self.output_current)
             yield from read(self.motor_speed)
@@ -266,17 +254,11 @@ class InnovertIBD(Drive):
         sent = word if direction is None else IBDControl(word | self._bit(direction))
         yield from self._commanded_by_line()
         if (yield from self._programmed()) and (yield from read(self.terminals)) & Terminals.VIRTUAL:
-            raise Refused(
-                f"{self.name} has a fault: see to it, then call reset_fault()",
-                advice=Advice.call("reset_fault"),
-            )
+            raise self._reset_first()
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise Refused(
-                f"{self.name} turns, and a jog would go on through this: call stop() first",
-                advice=Advice.call("stop"),
-            )
+            raise self._stop_first("turns, and a jog would go on through this:")
         yield from write(self.control, sent)
         yield from self._started()
 
@@ -326,7 +308,7 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """From the outputs, where they are programmed for it; unknown otherwise."""
+        """Report the state by the outputs where they are programmed for it; unknown otherwise."""
         terminals = yield from read(self.terminals)
         if not (yield from self._programmed()):
             return State(
@@ -339,7 +321,7 @@ class InnovertIBD(Drive):
         return State(Condition.STOPPED)
 
     def _programmed(self) -> Script[bool]:
-        """The outputs have the functions of the example; their addresses are inferred, but four match."""
+        """Check that the outputs work as in the example; their addresses are inferred, but four match."""
         try:
             for register, function in (
                 (self.output_m01, Output.RUNNING),
@@ -354,7 +336,7 @@ class InnovertIBD(Drive):
         return True
 
 
-OUTPUTS = {  # what the outputs then say, the gravest first
+OUTPUTS = {  # the gravest first
     Terminals.VIRTUAL: Condition.FAULT,
     Terminals.YABC: Condition.DECELERATING,
     Terminals.M02: Condition.ACCELERATING,

@@ -5,22 +5,10 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, TypeVar, Unpack, overload
 
-from multidrop.drive import (
-    Advice,
-    Condition,
-    Direction,
-    Drive,
-    DriveRefused,
-    NotDone,
-    Refused,
-    Script,
-    State,
-    Unconfirmed,
-    insist,
-    read,
-    write,
-)
+from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.register import HOLDING, Details, Kept, NumberFormat, Register, command, reading, setting
+from multidrop.drive.script import Script, insist, read, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
 
 E = TypeVar("E", bound=IntEnum)
@@ -101,7 +89,7 @@ def parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]) -> Re
 @overload
 def parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """A function code by its ordinal number in the table of one's own model's manual (section 11.6.4).
+    """Declare a function code by its ordinal number in one's own model's manual (section 11.6.4).
 
     It is kept in EEPROM, and written to its alias in RAM: bit 15 of the address set. That is lost with the
     power; what is to outlast it is a `stored_parameter`. Compare what is read with the keypad before
@@ -121,7 +109,7 @@ def stored_parameter(ordinal: int, unit: str = "", /, **details: Unpack[Details]
 @overload
 def stored_parameter(ordinal: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
 def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """A function code that is written where it is kept, in EEPROM, and outlasts a loss of power.
+    """Declare a function code that is written in EEPROM, and outlasts a loss of power.
 
     Every write wears the EEPROM (section 11.6.4): it is written on change, and its writes are counted.
     """
@@ -257,7 +245,7 @@ class InvtCHE(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """3016H is 0101H or 0102H."""
+        """Check that 3016H is 0101H or 0102H."""
         device = yield from read(self.device)
         if not isinstance(device, Device):
             raise Refused(f"{self.name} says that it is device {int(device):04X}H; a CHE is 0101H or 0102H")
@@ -266,10 +254,7 @@ class InvtCHE(Drive):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force; without a direction, in the one it turns in, or forward."""
         if self._jogged and not (yield from self._stands()):
-            raise Refused(
-                f"{self.name} may still jog, which a start may not end: call stop() first",
-                advice=Advice.call("stop"),
-            )
+            raise self._stop_first("may still jog, which a start may not end:")
         forward = yield from self._forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
@@ -288,10 +273,7 @@ class InvtCHE(Drive):
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = self.fault.format((yield from read(self.fault)))
-            raise Refused(
-                f"{self.name} has a fault, {fault}: see to it, then call reset_fault()",
-                advice=Advice.call("reset_fault"),
-            )
+            raise self._reset_first(fault)
         if direction is None:
             return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
@@ -318,7 +300,7 @@ class InvtCHE(Drive):
         yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
 
     def _stands(self) -> Script[bool]:
-        """The drive gives no voltage: in a fault, neither."""
+        """Return True where the drive gives no voltage, as in a fault."""
         return (yield from read(self.status)) in (CHEStatus.STANDBY, CHEStatus.FAULT)
 
     @verb
@@ -346,7 +328,7 @@ class InvtCHE(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Its state word, and its fault by name."""
+        """Report the state word, and the fault by name."""
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = yield from read(self.fault)

@@ -1,7 +1,7 @@
-"""Finds a family by the name that a person writes: a built-in one, or a class in a file of their own.
+"""Find a family by the name that a person writes: a built-in one, or a class in a file of their own.
 
-A file of one's own is a program: looking a class up in it runs it, with all the rights of whoever asks.
-Each file that is run is told to the logger `multidrop.drives.registry`, before.
+Such a file is a program: looking a class up runs it, with all rights of the caller. Each file is logged to
+`multidrop.drives.registry` before it is run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.drives import MODELS
 
 
 def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
-    """The family called `text`: one of MODELS, or "path/to/file.py:Class".
+    """Return the family called `text`: one of MODELS, or "path/to/file.py:Class".
 
     A relative path begins at `relative_to`, or at the working directory. The file is run, once a process.
     Raises ValueError, also for whatever the file itself does wrong.
@@ -42,11 +42,11 @@ def _drive(module: ModuleType, path: str, name: str) -> type[Drive]:
     if isinstance(found, type) and issubclass(found, Drive) and found.registers:
         return found
     drives = [
-        key
-        for key, it in vars(module).items()
-        if isinstance(it, type) and issubclass(it, Drive) and it.registers
+        f"{path}:{key}"
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Drive) and value.registers
     ]
-    choices = f"write {' or '.join(f'{path}:{it}' for it in drives)}" if drives else "it declares no drive"
+    choices = f"write {' or '.join(drives)}" if drives else "it declares no drive"
     if not name:
         raise ValueError(f"{path} names no class; {choices}")
     if found is None:
@@ -83,7 +83,7 @@ def _load_once(path: Path) -> ModuleType:
 
 
 def _line(mistake: BaseException, path: Path) -> str:
-    """Where in the file it happened, as far as that is known."""
+    """Return the line of the file in which it happened, where that is known."""
     if isinstance(mistake, SyntaxError):
         return ""  # its text has the line
     lines = [at.lineno for at in traceback.extract_tb(mistake.__traceback__) if at.filename == str(path)]

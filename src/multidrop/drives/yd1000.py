@@ -8,25 +8,10 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import (
-    Advice,
-    BusError,
-    Condition,
-    Direction,
-    Drive,
-    DriveRefused,
-    Pulse,
-    Refused,
-    Script,
-    State,
-    Unconfirmed,
-    insist,
-    read,
-    until,
-    wait,
-    write,
-)
+from multidrop.drive import BusError, Drive, DriveRefused, Refused, Unconfirmed
 from multidrop.drive.register import Details, Kept, Register, command, reading, setting
+from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
+from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
@@ -104,33 +89,33 @@ class Parity(IntEnum):
 
 
 def choice(number: int, place: str, most: int | None = None, /, **more: Unpack[Details]) -> Register[float]:
-    """A parameter from 0 to `most`, or of unknown range."""
+    """Declare a parameter from 0 to `most`, or of unknown range."""
     if most is not None:
         more["span"] = (0, most)
     return setting(number, **_parameter(place, more))
 
 
 def seconds(number: int, place: str, /, **more: Unpack[Details]) -> Register[float]:
-    """A time; its unit is from outside the document."""
+    """Declare a time; its unit is from outside the document."""
     more["step"], more["span"] = 0.1, (0.1, 3600)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 34"
     return setting(number, "s", **_parameter(place, more))
 
 
 def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details]) -> Register[float]:
-    """A frequency up to the highest FH; its unit is from outside the document."""
+    """Declare a frequency up to the highest FH; its unit is from outside the document."""
     more["step"], more["span"] = 0.01, (least, 320)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 35"
     return setting(number, "Hz", **_parameter(place, more))
 
 
 def preset(number: int, place: str, /) -> Register[float]:
-    """A preset speed, from LL to UL."""
+    """Declare a preset speed, from LL to UL."""
     return hertz(number, place, at_least="minimum_frequency", at_most="upper_limit_frequency", default=0.0)
 
 
 def extended(name: str, unit: str = "", /, **details: Unpack[Details]) -> Register[float]:
-    """An extended parameter by its name in one's own manual: F800 is 0800H (section 6.2).
+    """Declare an extended parameter by its name in one's own manual: F800 is 0800H (section 6.2).
 
     It is kept in EEPROM. Whoever has the manual at hand, for the numbers alone are known here, declares it
     in a subclass:
@@ -367,12 +352,12 @@ class YD1000(Drive):
     _record: float | None = None  # the latest entry of the fault record when it was last looked at
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """0802H, the drive's own address, and 0011H, a maximum frequency of 30 to 320 Hz."""
+        """Return 0802H, the drive's own address, and 0011H, a maximum frequency of 30 to 320 Hz."""
         return {self.address_setting: (self.address, self.address), self.maximum_frequency: (3000, 32000)}
 
     @verb
     def identify(self) -> Script[None]:
-        """0802H is the drive's own address, and 0011H a maximum frequency."""
+        """Check that 0802H is the drive's own address, and 0011H a maximum frequency."""
         address = yield from read(self.address_setting)
         if address != self.address:
             raise Refused(f"{self.name} has {address:g} at 0802H, not its address: it is not a YD1000")
@@ -400,16 +385,13 @@ class YD1000(Drive):
         return bool(self.option.get("setpoint_by_fnod"))
 
     def _preset(self) -> Script[YD1000Control]:
-        """The bits of the preset speed, once 1202H has shown, at rest, that they select it."""
+        """Return the bits of the preset speed once 1202H has shown, at rest, that they select it."""
         number = int(self.option["preset_speed"])
         hz = yield from read(self.registers[f"preset_speed_{number}"])
         if hz == 0:
             raise Refused(f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first")
         if (yield from self._without_fault()).condition is Condition.RUNNING:
-            raise Refused(
-                f"{self.name} turns: a preset speed is started from rest, so call stop() first",
-                advice=Advice.call("stop"),
-            )
+            raise self._stop_first("turns: a preset speed is started from rest, so")
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise Refused(
@@ -446,20 +428,17 @@ class YD1000(Drive):
         yield from self._started()
 
     def _valid(self) -> YD1000Control:
-        """Bit 15, and bit 14 unless FNOD is to say where the setpoint comes from."""
+        """Return bit 15, and bit 14 unless FNOD selects the setpoint."""
         return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
         state = yield from self.state.script()
         if state.condition is Condition.FAULT:
-            raise Refused(
-                f"{self.name} has a fault, {state.fault}: see to it, then call reset_fault()",
-                advice=Advice.call("reset_fault"),
-            )
+            raise self._reset_first(str(state.fault))
         return state
 
     def _direction(self) -> Script[Direction]:
-        """Of a motor that turns: then 1201H is not frozen."""
+        """Read the direction of a motor that turns: 1201H is frozen in a trip alone."""
         status = yield from read(self.status)
         return Direction.REVERSE if status & YD1000Status.REVERSE else Direction.FORWARD
 
@@ -528,7 +507,7 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return that it turns, or its fault: one that freezes 1200H, or is new since the last look."""
+        """Report that it turns, or its fault: one that freezes 1200H, or is new since the last look."""
         if not (yield from self._stands()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
@@ -539,7 +518,7 @@ class YD1000(Drive):
         return State(Condition.STOPPED, note="a trip at rest before the first look would not show")
 
     def _is_frozen(self) -> Script[bool]:
-        """1200H is held in a trip and 1100H is not (section 8.2); one that has just started has both."""
+        """Return True where 1200H is held and 1100H is 0 (section 8.2); a motor that starts has both."""
         if (yield from read(self.held_frequency)) == 0:
             return False
         return (yield from read(self.output_frequency)) == 0

@@ -1,1 +1,1 @@
-"""What is asked, in which order and how often. Pure."""
+"""Planning: requests, their order and rates, and what a line will reach. No I/O, no clock."""

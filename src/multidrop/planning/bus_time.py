@@ -1,4 +1,4 @@
-"""Time that exchanges take of the line, and the order of drives that keeps the bus cycle short. Pure."""
+"""Compute the time that exchanges take on the wire, and the order of drives with the shortest bus cycle."""
 
 from __future__ import annotations
 
@@ -13,57 +13,56 @@ from multidrop.drive.register import Carrier, Table
 if TYPE_CHECKING:
     from multidrop.planning.blocks import Block
 
+# Characters of a read's request and reply without its data, and of each byte of that.
+_FRAMES = {Framing.RTU: (8 + 5, 1), Framing.ASCII: (17 + 11, 2), Framing.DELIXI: (21 + 21, 0)}
+
 
 def silence(drive: Drive) -> float:
-    """Seconds that are kept around its exchanges: a bit more, for the other side's second stop bit.
+    """Return the seconds of silence around a drive's exchanges: one bit more, for its second stop bit.
 
-    ASCII frames need none; but after 1.5 characters it shows whether more is to come, such as a second
-    copy of the reply, which could else be taken for the next one.
+    ASCII frames need none. They get 1.5 characters, in which it shows whether more is to come, such as a
+    second copy of the reply, which could otherwise be taken for the next one.
     """
     settings = drive.settings
     least = 0.0 if drive.framing is Framing.RTU else 1.5 * settings.character
     return max(drive.needed_silence(), least) + settings.bit
 
 
-# Characters of a read's request and reply without its data, and of each byte of that.
-_FRAMES = {Framing.RTU: (8 + 5, 1), Framing.ASCII: (17 + 11, 2), Framing.DELIXI: (21 + 21, 0)}
-
-
 def characters(framing: Framing, table: Table, count: int) -> int:
-    """Characters of the request that reads so many registers, and of its reply."""
+    """Return the characters of the request that reads so many registers and of its reply."""
     around, each = _FRAMES[framing]
     return around + each * ((count + 7) // 8 if table.carrier is Carrier.BIT else 2 * count)
 
 
 def sending(drive: Drive, block: Block) -> float:
-    """Seconds in which characters of the request and of the reply are on the wire."""
+    """Return the seconds in which characters of the request and of the reply are on the wire."""
     return characters(drive.framing, block.table, block.count) * drive.settings.character
 
 
 def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
-    """Seconds of the line that a block takes: silence, request, response delay, reply.
+    """Return the seconds that a block takes on the line: silence, request, response delay, reply.
 
-    `delay` is the response delay, where it was measured, in place of the document's.
+    `delay` takes the place of the document's response delay where it was measured.
     """
     return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
-    """Seconds from one drive's reply to the other's request, on a line that is never idle.
+    """Return the seconds from one drive's reply to the other's request, on a line that is never idle.
 
-    `switching` is what the port needs to change baud rate or format, once the silence is over.
+    `switching` is the time that the port takes to change baud rate or format once the silence is over.
     """
     switched = switching if before.settings != after.settings else 0.0
     return max(silence(before), silence(after)) + switched
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Drives of one kind follow each other in the least time."""
+    """Return the key of drives that follow each other in the least time: silence and settings."""
     return silence(drive), str(drive.settings)
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
-    """The bus cycle with the least silence, and of those as short one with the fewest switches.
+    """Return the bus cycle with the least silence, and of those as short one with the fewest switches.
 
     The longer of two neighbours' silences is kept, so drives of like silence and settings stand side
     by side. They are put into the cycle by rising silence, each kind where it costs least; where
@@ -81,7 +80,7 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
 
 
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
-    """What it costs to visit a drive between two others: ns, which compare well, and switches."""
+    """Return the cost of visiting a drive between two others: ns, which compare well, and switches."""
     seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
     switches = sum(one.settings != other.settings for one, other in pairwise((before, drive, after)))
     return round(seconds * 1e9), switches - (before.settings != after.settings)

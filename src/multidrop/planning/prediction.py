@@ -1,7 +1,7 @@
-"""What a line will reach: bus cycle, utilisation, the rate of each drive; before its port is opened. Pure.
+"""Predict what a line will reach before its port is opened: bus cycle, utilisation, each drive's rate.
 
-Every exchange is taken to succeed at once, and the host to be late by what is usual. Which exchange
-follows which is asked of the schedule itself, on a line of which only the clock exists.
+Every exchange is taken to succeed at once, and the host to be late by the usual time. The schedule itself
+says which exchange follows which, on a simulated clock.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
+from multidrop.core import build_request, reply_length
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Planned
@@ -19,7 +20,7 @@ from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # s of each exchange in which a common machine wakes up and writes the request
 ENOUGH = 0.97  # of a wanted rate: it counts as kept
-LEAST_EXCHANGES = 1000  # for so many the schedule is asked
+LEAST_EXCHANGES = 1000  # that are scheduled
 LEAST_ROUNDS = 3
 FAR_NS = 1 << 62
 
@@ -41,9 +42,9 @@ class Rate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of one line: `cycle` is that of everything polled as fast as the line allows, in s."""
+    """The figures that one line reaches."""
 
-    cycle: float
+    cycle: float  # s, of all that is polled as fast as the line allows
     switches: int  # of line settings in it
     utilisation: float  # over 1: so many times as fast the line would have to be
     rates: tuple[Rate, ...]
@@ -53,7 +54,7 @@ class Prediction:
         return all(rate.fits for rate in self.rates)
 
     def requests(self, drive: Drive) -> int:
-        """Requests of a bus cycle that go to this drive."""
+        """Return how many requests of a bus cycle go to this drive."""
         return sum(rate.requests for rate in self.rates if rate.drive is drive)
 
     def exchanges_per_second(self, drive: Drive) -> float:
@@ -61,8 +62,8 @@ class Prediction:
 
 
 @dataclass(eq=False, kw_only=True)
-class _Asked(Job):
-    """A job with what became of it on the line of which only the clock exists."""
+class _PredictedJob(Job):
+    """A job, and its exchanges on the simulated clock."""
 
     planned: Planned
     own: float  # s from the end of the silence to that of the reply
@@ -73,12 +74,12 @@ class _Asked(Job):
 
     @property
     def cost(self) -> float:
-        """Seconds of the line that it takes on average."""
+        """Mean seconds of the line that it takes."""
         return self.taken / self.count if self.count else self.own + silence(self.planned.drive)
 
     @property
     def reached(self) -> float:
-        """How many times per second; for a job with a period."""
+        """Times per second, of a job with a period."""
         if self.skipped == 0 and self.planned.every:
             return 1 / self.planned.every
         return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
@@ -90,65 +91,63 @@ def predict(
     switching: float = 0.0,
     lateness: float = LATENESS,
 ) -> Prediction:
-    """What a line reaches on which these are polled.
+    """Return what a line reaches on which these are polled.
 
-    `delays` are the response delays in s that were measured, of drives that have any; `switching` is
-    what the port needs to change baud rate or format, as a poll has measured it, and `lateness` what
-    the host adds to each exchange: 0 for what the line alone would reach.
+    `delays` are the response delays in s that were measured, of drives that have any; `switching` is the
+    time in s that the port takes to change baud rate or format, as a poll has measured it; `lateness` is
+    what the host adds to each exchange: 0 for what the line alone would reach.
     """
     jobs = _jobs(exchanges, delays or {}, switching, lateness)
     _run(jobs, switching)
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    groups: dict[tuple[Drive, float | None], list[_Asked]] = {}
+    groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
+    cycle, switches, before = 0.0, 0, jobs[-1].planned.drive
     for job in jobs:
-        groups.setdefault((job.planned.drive, job.planned.every), []).append(job)
-    return Prediction(
-        sum(
-            job.own + gap(jobs[at - 1].planned.drive, job.planned.drive, switching)
-            for at, job in enumerate(jobs)
-        ),
-        sum(job.planned.drive.settings != jobs[at - 1].planned.drive.settings for at, job in enumerate(jobs)),
-        max(load, 1.0) if turn else load,
-        tuple(
-            Rate(
-                drive,
-                every,
-                tuple(register for job in group for register in job.planned.block.registers),
-                len(group),
-                turns if every is None else min(job.reached for job in group),
-            )
-            for (drive, every), group in groups.items()
-        ),
-    )
+        drive = job.planned.drive
+        cycle += job.own + gap(before, drive, switching)
+        switches += drive.settings != before.settings
+        before = drive
+        groups.setdefault((drive, job.planned.every), []).append(job)
+    rates = [
+        Rate(
+            drive,
+            every,
+            registers=tuple(register for job in group for register in job.planned.block.registers),
+            requests=len(group),
+            reached=turns if every is None else min(job.reached for job in group),
+        )
+        for (drive, every), group in groups.items()
+    ]
+    return Prediction(cycle, switches, max(load, 1.0) if turn else load, tuple(rates))
 
 
 def _jobs(
     exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching: float, lateness: float
-) -> list[_Asked]:
-    """In the order of the bus cycle."""
+) -> list[_PredictedJob]:
+    """Return the jobs in the order of the bus cycle."""
     of_drive: dict[Drive, list[Planned]] = {}
     for exchange in exchanges:
         of_drive.setdefault(exchange.drive, []).append(exchange)
     return [
-        _Asked(
+        _PredictedJob(
             drive=drive.address,
             kind=kind(drive),
-            period_ns=None if it.every is None else round(it.every * 1e9),
+            period_ns=None if planned.every is None else round(planned.every * 1e9),
             duration_ns=round((silence(drive) + own) * 1e9),
-            planned=it,
+            planned=planned,
             own=own,
         )
         for drive in in_order(of_drive, switching)
-        for it in of_drive[drive]
-        for own in [lateness + sending(drive, it.block) + delays.get(drive, drive.response_delay)]
+        for planned in of_drive[drive]
+        for own in [lateness + sending(drive, planned.block) + delays.get(drive, drive.response_delay)]
     ]
 
 
-def _run(jobs: Sequence[_Asked], switching: float) -> None:
-    """Carry out one job after another, as the schedule says."""
-    schedule: Schedule[_Asked] = Schedule()
+def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
+    """Carry out one job after another in the schedule's order."""
+    schedule: Schedule[_PredictedJob] = Schedule()
     for job in jobs:
         schedule.add(job, 0)
     gaps = cache(partial(gap, switching=switching))
@@ -163,3 +162,40 @@ def _run(jobs: Sequence[_Asked], switching: float) -> None:
         job.count += 1
         job.taken += silent + job.own
         at, before = begin_ns + round(job.own * 1e9), job.planned.drive
+
+
+# ---- as a recording carries it ----
+
+
+def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
+    """Return the prediction for a line, and what each drive's blocks take of it, as plain numbers.
+
+    A reader of a recording holds it against what was measured. Characters are those on the wire, of a
+    reply those of a good one.
+    """
+    prediction = predict(exchanges, switching=switching)
+    drives = dict.fromkeys(planned.drive for planned in exchanges)
+    return {
+        "utilisation": round(prediction.utilisation, 4),
+        "cycle_ms": round(prediction.cycle * 1e3, 3),
+        "drives": {
+            drive.name: {
+                "exchanges_per_second": round(prediction.exchanges_per_second(drive), 3),
+                "silence_ms": round(silence(drive) * 1e3, 6),
+                "character_ms": round(drive.settings.character * 1e3, 6),
+                "response_delay_ms": drive.response_delay * 1e3,
+                "blocks": [_block_metadata(planned) for planned in exchanges if planned.drive is drive],
+            }
+            for drive in drives
+        },
+    }
+
+
+def _block_metadata(planned: Planned) -> dict[str, Any]:
+    framing, request = planned.drive.framing, planned.block.request
+    return {
+        "registers": [register.name for register in planned.block.registers],
+        "every_ms": None if planned.every is None else planned.every * 1e3,
+        "request_characters": len(build_request(framing, request)),
+        "reply_characters": reply_length(framing, request),
+    }

@@ -1,9 +1,9 @@
-"""Proofs: questions to a drive whose replies cannot be taken for each other's. Pure.
+"""Choose proofs: requests to a drive whose replies cannot be taken for each other's.
 
-After a time-out an answer may still come, at any time and for any question that is outstanding. The
-reply to a question that no outstanding answer could be taken for proves that all of them have come, or
-never will: a line and the path to it keep the order. Replies differ by function, by length, in
-Delixi's own protocol by parameter, and else by the values that two registers are known to hold.
+After a time-out a reply may still come, at any time and to any request that is outstanding. The reply
+to a request that no outstanding reply could be taken for proves that all of them have come, or never
+will: a line and the path to it keep the order. Replies differ by function, by length, in Delixi's own
+protocol by parameter, and otherwise by the values that two registers are known to hold.
 """
 
 from __future__ import annotations
@@ -13,38 +13,40 @@ from typing import Any
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register
-from multidrop.planning.blocks import Block, alone, runs
+from multidrop.planning.blocks import Block, all_blocks
 
-MOST = 4  # each costs memory for every drive
+MOST_PROOFS = 4  # each costs memory for every drive
 
-Answer = tuple[int, int]  # the least and the most that the one register of a reply holds
+RawRange = tuple[int, int]  # the least and the most that the one register of a reply holds
 
 
-def proofs(drive: Drive) -> list[tuple[Block, Answer | None]]:
-    """Return what to read from this drive, with the raw counts that its reply is known to hold.
+def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
+    """Return blocks to read from this drive, with the raw counts that the reply is known to hold.
 
     The last one is the least likely to be polled. There is none where a family can tell no two replies apart.
     """
-    known = [(alone(register), counts) for register, counts in drive.known_counts().items()]
+    known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     shapes: dict[Hashable, Block] = {}
     for block in _candidates(drive):
         shapes.setdefault(_shape(block), block)
-    found: list[tuple[Block, Answer | None]] = [(block, None) for block in shapes.values()]
+    found: list[tuple[Block, RawRange | None]] = [(block, None) for block in shapes.values()]
     if known:
         found = [*known, *found[1:]]
-    return [*found[: MOST - 1], found[-1]] if len(found) >= MOST else found if len(found) > 1 else []
+    if len(found) >= MOST_PROOFS:
+        return [*found[: MOST_PROOFS - 1], found[-1]]
+    return found if len(found) > 1 else []
 
 
 def _candidates(drive: Drive) -> Iterator[Block]:
-    """What is polled anyway comes first, and what is short."""
+    """Yield all blocks: first those that are polled anyway, and of those the short ones."""
     readable: list[Register[Any]] = [register for register in drive.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
     for registers in (readings, readable):
-        yield from sorted(runs(drive, registers), key=lambda block: block.count)
+        yield from sorted(all_blocks(drive, registers), key=lambda block: block.count)
 
 
 def _shape(block: Block) -> Hashable:
-    """What a reply shows of its question."""
+    """Return what a reply shows of its request."""
     if block.table.carrier is Carrier.LONG:
         return block.table.read, block.start
     if block.table.carrier is Carrier.BIT:

@@ -1,4 +1,4 @@
-"""Read a plant file: find every mistake in it before anything is done with it, and tell all at once."""
+"""Load a plant file; every error in it is found before anything is done with it. Opens no port."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from multidrop.plant.toml_check import Key, TomlPlace, read_document
 
 
 class PlantError(ValueError):
-    """All mistakes of a plant file: each a sentence that says where it is and what would be right."""
+    """All errors of a plant file; `mistakes` has a sentence for each: its place, and what would be right."""
 
     def __init__(self, mistakes: tuple[str, ...]) -> None:
         super().__init__("\n".join(mistakes))
@@ -26,19 +26,19 @@ class PlantError(ValueError):
 
 
 def load_plant(path: Path | str) -> Plant:
-    """The plant that the file describes; PlantError when anything in it is wrong."""
+    """Return the plant that the file describes; PlantError when anything in it is wrong."""
     path = Path(path)
     place = TomlPlace(path)
     document = place.attempt(read_document, path, "plant file")
     tables = [] if document is None else place.check(document, _PLANT).get("line", [])
     lines = tuple(_line(table, at) for table, at in place.inside("line", tables))
-    if place.mistakes:
-        raise PlantError(tuple(place.mistakes))
+    if place.config_errors:
+        raise PlantError(tuple(place.config_errors))
     return Plant(lines, path)
 
 
 def parse_duration(text: str) -> float:
-    """Seconds in a duration that a person wrote, such as "50 ms"; ValueError if it is none."""
+    """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
     units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
     seconds = float(match[1]) * units[match[2]] if match else 0
@@ -48,7 +48,7 @@ def parse_duration(text: str) -> float:
 
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """The duration under this key; None if it is not given, or a mistake."""
+    """Return the duration under this key in s; None where it is not given, or wrong."""
     return place.attempt(_duration_under, key, given[key]) if key in given else None
 
 
@@ -64,7 +64,6 @@ _SHORTEST, _LONGEST = 100e-6, 86400.0  # s
 
 _PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
 
-
 _LINE = {
     "name": Key(str, 'name = "hall-1"', needed=True),
     "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
@@ -75,7 +74,6 @@ _LINE = {
     "echo": Key(str, 'echo = "auto"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
-
 
 _DRIVE = {
     "name": Key(str, 'name = "pump-1"', needed=True),
@@ -89,12 +87,10 @@ _DRIVE = {
     "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
 }
 
-
 _POLL = {
     "register": Key(str, 'register = "output_current"', needed=True),
     "every": Key(str, 'every = "50 ms"'),
 }
-
 
 _NOT_ARGUMENTS = ("name", "model", "every", "poll")  # of a drive's class
 
@@ -121,7 +117,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
-    before = len(place.mistakes)
+    before = len(place.config_errors)
     model = _model(table, place)
     given = place.check(table, _DRIVE | _option_keys(model))
     if "name" in given:
@@ -136,7 +132,7 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     inherited = {key: value for key, value in line.items() if value is not None and key not in given}
     _try_each(model, arguments, inherited, place)
     polls = _polls(given.get("poll"), model, every, place)
-    if len(place.mistakes) > before:
+    if len(place.config_errors) > before:
         return None
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
     return PolledDrive(drive, polls) if drive else None
@@ -150,7 +146,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """The options of the family; of all families, as long as it is not known which one it is."""
+    """Return keys for the family's options, or for those of all families where it is not known."""
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")
@@ -162,7 +158,7 @@ def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
 def _try_each(
     model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: TomlPlace
 ) -> None:
-    """Try one argument at a time, so that every one that the family refuses is reported."""
+    """Try one argument at a time, so that each one that the family refuses has its sentence."""
     least: dict[str, Any] = {"address": model.addresses[0]}
     if "framing" in arguments:
         framing = {"framing": arguments["framing"]}
@@ -174,7 +170,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # what it may be depends on the others
+        if key not in right:  # their values depend on the others
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)

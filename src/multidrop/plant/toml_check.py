@@ -1,4 +1,4 @@
-"""Collects every mistake in a file of nested tables, each as a sentence with its place."""
+"""Check a file of nested tables: every error in it becomes a sentence with its place."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ T = TypeVar("T")
 
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
-    """A TOML file's tables; ValueError, without the path, when there are none to be had.
+    """Return a TOML file's tables; ValueError, without the path, where it cannot be read.
 
-    Some editors put a byte order mark before the text.
+    A byte order mark before the text is skipped: some editors write one.
     """
     try:
         document = tomllib.loads(path.read_text("utf-8-sig"))
@@ -35,7 +35,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
 
 
 def _fits(value: Any) -> bool:
-    """Whether every number is one of TOML's, which has integers of 64 bits."""
+    """Return True where every integer fits into 64 bits, as in TOML."""
     if isinstance(value, dict):
         return all(map(_fits, value.values()))
     if isinstance(value, list):
@@ -45,7 +45,7 @@ def _fits(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """What a table may hold under a name: its type, and an example of it that is right."""
+    """A key that a table may have: the type of its value, and an example."""
 
     kind: type | tuple[type, ...]
     example: str
@@ -54,33 +54,33 @@ class Key:
 
 @dataclass(frozen=True)
 class TomlPlace:
-    """Somewhere in the file; all places share the list of mistakes and of what must not come twice."""
+    """A place in the file; all places share the errors found so far, and what must not come twice."""
 
     path: Path
     labels: tuple[str, ...] = ()
-    mistakes: list[str] = field(default_factory=list)
+    config_errors: list[str] = field(default_factory=list)
     seen: dict[tuple[object, ...], str] = field(default_factory=dict)
 
     def inside(self, kind: str, tables: list[Any]) -> Iterator[tuple[Any, TomlPlace]]:
-        """Each table with its own place, called by its name or else its number."""
+        """Yield each table with its place, which is called by the table's name or else its number."""
         for number, table in enumerate(tables, 1):
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
-            yield table, TomlPlace(self.path, (*self.labels, label), self.mistakes, self.seen)
+            yield table, TomlPlace(self.path, (*self.labels, label), self.config_errors, self.seen)
 
     def wrong(self, sentence: object) -> None:
-        """This is a mistake. What a terminal would not print as it stands is spelt out."""
+        """Add an error. What a terminal would not print as it stands is spelt out."""
         text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
-        self.mistakes.append(f"{self.path}: {printable(text)}")
+        self.config_errors.append(f"{self.path}: {printable(text)}")
 
     def once(self, *what: object, sentence: str) -> None:
-        """It is a mistake if this has been seen before; `{first}` in the sentence is where."""
+        """Add an error if this was seen before; `{first}` in the sentence is the place."""
         if what in self.seen:
             self.wrong(sentence.format(first=self.seen[what]))
         self.seen.setdefault(what, ", ".join(self.labels))
 
     def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "") -> T | None:
-        """What it makes of the arguments; None if they are a mistake, whose sentence ends with the hint."""
+        """Return make(*arguments); None where that is a ValueError or TypeError, which gets the hint."""
         try:
             return make(*arguments)
         except (ValueError, TypeError) as mistake:
@@ -88,7 +88,7 @@ class TomlPlace:
             return None
 
     def check(self, table: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
-        """Those entries of the table that have a known key and the right type."""
+        """Return the entries of the table that have a known key and the right type."""
         if not isinstance(table, dict):
             self.wrong(f"{table!r} is not a table with {', '.join(keys)}")
             return {}
@@ -108,7 +108,7 @@ class TomlPlace:
         return good
 
     def _unknown(self, table: Mapping[str, Any], keys: Mapping[str, Key]) -> set[str]:
-        """Report the unknown keys; the known ones that they probably mean."""
+        """Add an error for each unknown key; return the known ones that they probably mean."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:
             near = difflib.get_close_matches(name, keys, n=1)

@@ -1,1 +1,1 @@
-"""What keeps a line busy."""
+"""Polling: jobs of a line, their turn on its port, registers that are refused, and batches of rows."""

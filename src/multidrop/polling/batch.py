@@ -1,10 +1,10 @@
-"""Rows of samples and misses: as columns for Arrow's users, and one by one for people.
+"""Rows of samples and misses: columns for Arrow's users, and single rows for people.
 
-Any library that speaks the Arrow PyCapsule interface takes a batch as it is, and none of them is
-needed here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.DataFrame.from_arrow(batch)`,
+Any library that speaks the Arrow PyCapsule interface takes a batch as it is, and none of them is needed
+here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.DataFrame.from_arrow(batch)`,
 `duckdb.sql("from batch")`; where pandas is older than 3.0, `pyarrow.table(batch).to_pandas()`.
-`pandas.DataFrame(batch)` does not know the interface, and would go through the rows, whose times are whole
-numbers: that is refused. For NumPy, with NaN for every miss:
+`pandas.DataFrame(batch)` does not know the interface, and would go through the rows with times as plain
+integers: that is refused. For NumPy, with NaN for every miss:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
@@ -21,11 +22,11 @@ _STATUSES = Names(STATUSES)
 
 
 class Row(NamedTuple):
-    """A sample, or a miss: that has no value, and its status says why."""
+    """A sample, or a miss, which has no value and a status that says why."""
 
     time: int  # UTC, ns: the request was sent
     monotonic_ns: int
-    uncertainty_ns: int | None  # the value was taken between time and time + uncertainty_ns
+    uncertainty_ns: int | None  # the drive took the value between time and time + uncertainty_ns
     drive: str
     register: str
     value: float | None
@@ -33,7 +34,7 @@ class Row(NamedTuple):
 
 
 class Rows(ABC):
-    """What all rows offer, wherever they are kept: their number, each one, and Arrow's capsules."""
+    """Rows, wherever they are kept: their number, each one, and Arrow's capsules."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -43,10 +44,10 @@ class Rows(ABC):
 
     @abstractmethod
     def arrow(self) -> Any:
-        """The rows as a nanoarrow array."""
+        """Return the rows as a nanoarrow array."""
 
     def __array__(self, *how: object, **details: object) -> NoReturn:
-        """Refuse to be one array, which is what `pandas.DataFrame(batch)` asks for. Raises TypeError."""
+        """Refuse to be one array, which `pandas.DataFrame(batch)` would take. Raises TypeError."""
         raise TypeError(
             "rows are columns of several types, not one array: take them with "
             "pandas.DataFrame.from_arrow(batch), where pandas is older than 3.0 with "
@@ -66,7 +67,7 @@ class Rows(ABC):
 
 
 class Batch(Rows):
-    """Rows that the core made, and the names whose codes they hold."""
+    """Rows that the core made, and the names whose numbers they hold."""
 
     def __init__(self, columns: Columns, drives: Names, registers: Names) -> None:
         self._columns = columns
@@ -86,7 +87,13 @@ class Batch(Rows):
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
 
     def __repr__(self) -> str:
-        return f"<Batch of {len(self)} rows>"
+        times = self._columns.array("time")
+        if not times:
+            return "<Batch: no rows>"
+        first, last = min(times), max(times)
+        drives = len(set(self._columns.array("drive")))
+        begin = datetime.fromtimestamp(first / 1e9, UTC).isoformat(timespec="milliseconds")
+        return f"<Batch: {len(self)} rows of {drives} drives, {(last - first) / 1e9:.3f} s from {begin}>"
 
     def arrow(self) -> Any:
         column = self._columns.array
@@ -105,7 +112,7 @@ class Batch(Rows):
 
 @cache
 def schema() -> Any:
-    """The columns of every batch and of every recording."""
+    """Return the columns of every batch and of every recording."""
     import nanoarrow as arrow
 
     return arrow.c_schema(
@@ -125,9 +132,9 @@ def schema() -> Any:
 
 
 def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
-    """An array of the schema from each column's buffers, in Arrow's layout; nothing is copied.
+    """Return an array of the schema from each column's buffers, in Arrow's layout; nothing is copied.
 
-    ValueError or RuntimeError when the buffers are not those of so many rows.
+    Raises ValueError or RuntimeError when the buffers are not those of so many rows.
     """
     from nanoarrow import c_array_from_buffers
 

@@ -28,7 +28,7 @@ these. The reader here takes one off.
 
 The metadata is one JSON object. It lies in the schema's metadata under the key `multidrop` (.arrows,
 .parquet) or in the file beside (.csv). `multidrop poll` puts into it `plant`, the plant file; `planned`,
-for each line's name what it should reach (multidrop.planning.forecast says how); and `drives`: for each
+for each line's name what it should reach (multidrop.planning.prediction says how); and `drives`: for each
 drive's name its line, model, address, settings and framing, and `registers`, for each register's
 name its unit and step.
 

@@ -105,5 +105,5 @@ def _perform(drive: Drive, script: Script[Any], ask: Ask) -> Any:
 
 def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
     (block,) = blocks(drive, [register])
-    reply = ask(drive, block.request(drive.address))
+    reply = ask(drive, block.request)
     return register.decode(raw_value(reply.data, block.offset(register), register.number_format))

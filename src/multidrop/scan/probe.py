@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Completion, Message, Peer, Result
 from multidrop.drive.family import Drive
 from multidrop.errors import BadReply, DriveRefused, NoReply
 from multidrop.scan.identify import recognise
 from multidrop.scan.results import Found
 from multidrop.scan.sweep import Sweep
+from multidrop.transport.exchange import LEAST_TIMEOUT
 
 MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
 TRIES = 3

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from multidrop.bus import LEAST_TIMEOUT
 from multidrop.core import Framing, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.timing import Settings
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
+from multidrop.transport.exchange import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
@@ -190,12 +190,11 @@ def _sweep(
     setting: Setting, families: tuple[type[Drive], ...], register: Register[Any], addresses: tuple[int, ...]
 ) -> Sweep:
     settings, framing = setting
-    block = Block(register.table, register.address, register.words, (register,))
-    request = block.request(addresses[0])
     drives = [
         family(family.addresses[0], framing=framing, baudrate=settings.baudrate, format=settings.format)
         for family in families
     ]
+    request = Block.of(drives[0], [register]).request
     return Sweep(
         settings,
         framing,

@@ -80,6 +80,6 @@ def load_faults(path: Path | str) -> Faults:
     for name in [name for name in given if name in _DURATIONS]:
         given[name] = duration_of(given, name, place)
     faults = {name: place.attempt(partial(Faults, **{name: value})) for name, value in given.items()}
-    if place.mistakes:
-        raise ValueError("\n".join(place.mistakes))
+    if place.config_errors:
+        raise ValueError("\n".join(place.config_errors))
     return Faults(**{name: getattr(it, name) for name, it in faults.items()})

@@ -14,7 +14,7 @@ from typing import Any
 
 from multidrop.core import Framing, NumberFormat, raw_value
 from multidrop.drive.family import Drive
-from multidrop.drive.float32 import nearest_or_infinite
+from multidrop.drive.number_format import nearest_or_infinite
 from multidrop.drive.register import Access, Carrier, Register, Table
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once

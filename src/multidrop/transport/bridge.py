@@ -1,4 +1,4 @@
-"""Bridge: a descriptor for a port that pyserial gives none for, such as a network's (RFC 2217)."""
+"""Bridge: a descriptor for a port that has none, such as a network's serial port (RFC 2217)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from contextlib import suppress
 
 import serial
 
-# every way in which a port can fail
+# All exceptions with which a port can fail.
 PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
 
-# A write's caller is told nothing before both are over (WRITE_TIMEOUT): what it is told then stays true.
-MOST_STALL_MS = 750  # of a network: what it does not take within this time it never gets
+# Both are shorter than WRITE_TIMEOUT: an outcome that a write's caller was given stays true.
+MOST_STALL_MS = 750  # of a network, after which it is sent nothing more
 MOST_AGE = 0.25  # s, of a request that leaves
 MOST_CHUNK = 1024  # bytes that the core reads at once
-LOOK_EVERY = 0.1  # s, until a thread sees that the bridge is closed
-CLOSING_TIME = 2.0  # s, for a thread that a port holds up
+LOOK_EVERY = 0.1  # s, between looks of a thread whether the bridge is closed
+CLOSING_TIME = 2.0  # s, that a thread which the port holds up is waited for
 
-# Linux keeps the requests on such a socket apart, and stamps each with the time when the core wrote it.
+# On Linux such a socket keeps requests apart, and stamps each with the time at which the core wrote it.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; also the type of what it adds, a struct timespec
@@ -30,7 +30,7 @@ _TIMESPEC = struct.Struct("@ll")
 
 
 def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
-    """Have pyserial set the port up, which may take it a while."""
+    """Give the port its baud rate and format; pyserial may take a while for it."""
     baudrate, format = settings
     port.baudrate = baudrate
     port.bytesize = int(format[0])
@@ -39,9 +39,9 @@ def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
 
 
 def hand_on_nothing_late(connection: socket.socket) -> None:
-    """Make the kernel cut a connection that stalls, and throw away what waits when it is closed.
+    """Make the kernel cut a connection that stalls, and discard unsent bytes when it is closed.
 
-    What waits may start a motor. A process that dies closes its connections too.
+    Those bytes may start a motor, also after this process has died.
     """
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -52,8 +52,8 @@ def hand_on_nothing_late(connection: socket.socket) -> None:
 class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
-    Nothing waits in it. A request that its thread finds too late was given up meanwhile, and is thrown
-    away: the process stood still, or the port held an earlier one up.
+    No request waits in it: one that is older than MOST_AGE when its thread takes it was given up by the
+    core, because the process stood still or the port held an earlier one up, and is discarded.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:
@@ -93,7 +93,7 @@ class Bridge:
         self._hang_up()
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Give the core what came. While it takes nothing, the port keeps what comes."""
+        """Give the core these bytes. While it takes none, more wait in the port."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]
@@ -103,7 +103,7 @@ class Bridge:
             self._ours.shutdown(socket.SHUT_RDWR)
 
     def forget(self) -> None:
-        """Close without hanging up: others still use it."""
+        """Close without hanging up: the parent of a fork still uses it."""
         self._ours.close()
         self.theirs.close()
 
@@ -116,7 +116,7 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True for a request that was written just now; a doubt, as when the clock was set, is False."""
+    """Return True for a request that was written just now, False in doubt, as when the clock was set."""
     if not _STAMPED:
         return True
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]

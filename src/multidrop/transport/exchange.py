@@ -1,7 +1,8 @@
-"""Exchanges with the drives on a line, one at a time and ahead of any polling: what is read from them."""
+"""Exchanges with the drives on a line, one at a time and ahead of any polling."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -10,24 +11,24 @@ from multidrop.core import Completion, Exchange, Message, Peer, Permit, Result, 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
-from multidrop.planning.blocks import Block, alone, blocks
+from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
-from multidrop.transport.clock import now_ns, sleep
+from multidrop.transport import clock
 from multidrop.transport.line import Line
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
-WRITE_TIMEOUT = 1.0  # s: a write that is wrongly told to be unconfirmed costs more than the wait
-MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; those that were not read for longest go
+WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
+MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
 NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
 
 
-def exchange(
+def make_exchange(
     drive: Drive,
     request: Message,
     peer: Peer,
-    block: core.RowLayout | None = None,
+    rows: core.RowLayout | None = None,
     *,
     period: float = 0.0,
     insists: bool = False,
@@ -36,7 +37,7 @@ def exchange(
     echo_probe: Exchange | None = None,
     permit: Permit | None = None,
 ) -> Exchange:
-    """What the core needs to carry out a request to this drive."""
+    """Return the exchange that carries this request to this drive at its settings."""
     settings = drive.settings
     return Exchange(
         drive.framing,
@@ -51,13 +52,13 @@ def exchange(
         insists=insists,
         timeout=timeout,
         answer=answer,
-        block=block,
+        block=rows,
         echo_probe=echo_probe,
         permit=permit,
     )
 
 
-def reading(
+def make_read(
     drive: Drive,
     block: Block,
     peer: Peer,
@@ -67,45 +68,62 @@ def reading(
     insists: bool = False,
     timeout: float = 0.0,
 ) -> Exchange:
-    """What reads a block from this drive, whose reply is not taken from an adapter's echo."""
-    echo_probe = None
-    if drive.telling and drive.telling not in block.registers:
-        echo_probe = exchange(drive, alone(drive.telling).request(drive.address), peer, NO_ROWS)
-    request = block.request(drive.address)
-    return exchange(
-        drive, request, peer, rows, period=period, insists=insists, timeout=timeout, echo_probe=echo_probe
+    """Return the exchange that reads a block, with the probe for an adapter's echo where it needs one."""
+    probe, register = None, drive.echo_probe
+    if register and register not in block.registers:
+        probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
+    request = block.request
+    return make_exchange(
+        drive, request, peer, rows, period=period, insists=insists, timeout=timeout, echo_probe=probe
     )
 
 
-class Prepared:
-    """What reads a drive's registers: made once, as long as all that it was made for is as it was."""
+class PreparedRead:
+    """A block of one drive's registers, the exchange that reads it, and where each lies in the reply."""
+
+    def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
+        self.block = block
+        self.exchange = make_read(drive, block, peer)
+        self._places = [(register, block.offset(register)) for register in block.registers]
+
+    def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
+        """Yield the name and the value of each register."""
+        data = reply.data
+        for register, at in self._places:
+            yield register.name, register.decode(raw_value(data, at, register.number_format))
+
+
+class PreparedReads:
+    """Reads of one drive, made once and kept while all that they depend on stays as it was."""
 
     def __init__(self, drive: Drive, peer: Peer, made_for: tuple[object, ...]) -> None:
         self.made_for = made_for
 
         @lru_cache(MOST_PREPARED)
-        def best(registers: tuple[Register[Any], ...]) -> tuple[Block, ...]:
-            return blocks(drive, registers)
+        def prepare(block: Block) -> PreparedRead:
+            return PreparedRead(drive, block, peer)
 
         @lru_cache(MOST_PREPARED)
-        def read(block: Block) -> Exchange:
-            return reading(drive, block, peer)
+        def of(registers: tuple[Register[Any], ...]) -> tuple[PreparedRead, ...]:
+            return tuple(prepare(block) for block in blocks(drive, registers))
 
-        self.blocks = best
-        self.exchange = read
+        self.of = of
 
 
 class Exchanges:
-    """What passes between a line and its drives, and what is learnt of each drive from it."""
+    """Exchanges with the drives on one line, and what is learnt of each drive from them."""
 
     def __init__(self, line: Line) -> None:
         self.line = line
         self._peers: dict[Drive, Peer] = {}
-        self._known: dict[tuple[object, ...], Peer] = {}  # by what they are, also of those that left
-        self._heard: dict[Drive, object] = {}  # the open port on which it answered last
-        self._prepared: dict[Drive, Prepared] = {}
+        self._known: dict[tuple[object, ...], Peer] = {}  # by what they are; also of those that left
+        self._answered_on: dict[Drive, object] = {}  # the open port on which it answered last
+        self._prepared: dict[Drive, PreparedReads] = {}
+
+    # ---- the drives ----
 
     def add(self, drive: Drive) -> None:
+        """Begin to know a drive; one that comes back is known from before."""
         documented = max(LEAST_TIMEOUT, drive.answering_time, 4 * drive.response_delay)
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
@@ -114,7 +132,7 @@ class Exchanges:
             made = self._known[key] = Peer(least_timeout=least, most_timeout=drive.response_timeout)
             made.prove_by(
                 [
-                    exchange(drive, block.request(drive.address), made, NO_ROWS, answer=answer)
+                    make_exchange(drive, block.request, made, NO_ROWS, answer=answer)
                     for block, answer in proofs(drive)
                 ]
             )
@@ -126,8 +144,9 @@ class Exchanges:
                 self.line.inherit(peer, known)
 
     def remove(self, drive: Drive) -> None:
+        """Exchange nothing more with this drive."""
         del self._peers[drive]
-        self._heard.pop(drive, None)
+        self._answered_on.pop(drive, None)
         self._prepared.pop(drive, None)
 
     @property
@@ -136,44 +155,44 @@ class Exchanges:
         return dict(self._peers)
 
     def peer(self, drive: Drive) -> Peer:
-        """What is known of how this drive answers; ValueError for a drive that is not on this bus."""
+        """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
         peer = self._peers.get(drive)
         if peer is None:
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
         return peer
 
-    def is_heard(self, drive: Drive) -> bool:
-        """Whether it has answered since the port was opened."""
-        return self._heard.get(drive, self) is self.line.queue
+    def has_answered(self, drive: Drive) -> bool:
+        """Return True where it has answered a read since the port was opened."""
+        return self._answered_on.get(drive, self) is self.line.queue
+
+    # ---- reading ----
 
     def values(
         self,
         drive: Drive,
-        registers: list[Register[Any]],
+        registers: Sequence[Register[Any]],
         attempts: int,
         *,
         insists: bool = False,
         timeout: float = 0.0,
     ) -> dict[str, Any]:
-        """Registers' values by name, each block asked for so many times until it is answered.
+        """Return registers' values by name, each block asked for up to `attempts` times.
 
         One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
         answers are known to be late, for as long as `timeout` seconds.
         """
-        raw: dict[str, Any] = {}
-        for block in self._prepare(drive).blocks(tuple(registers)):
-            reply = self._ask(drive, block, attempts, insists, timeout)
-            for register in block.registers:
-                raw[register.name] = register.decode(
-                    raw_value(reply.data, block.offset(register), register.number_format)
-                )
-        return {register.name: raw[register.name] for register in registers}
+        found: dict[str, Any] = {}
+        for read in self._prepare(drive).of(tuple(registers)):
+            exchange = read.exchange
+            if insists:
+                exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
+            found.update(read.decode(self._ask(drive, exchange, attempts)))
+        return {register.name: found[register.name] for register in registers}
 
-    def _prepare(self, drive: Drive) -> Prepared:
-        """What is prepared for this drive, if nothing has changed since; else what will be from now on."""
-        peer = self.peer(drive)
+    def _prepare(self, drive: Drive) -> PreparedReads:
+        """Return what is prepared for this drive; anew where anything that it depends on has changed."""
         made_for = (
-            peer,
+            self.peer(drive),
             self.line.queue,
             drive.address,
             drive.framing,
@@ -183,34 +202,33 @@ class Exchanges:
         )
         prepared = self._prepared.get(drive)
         if prepared is None or prepared.made_for != made_for:
-            prepared = self._prepared[drive] = Prepared(drive, peer, made_for)
+            prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
         return prepared
 
     def values_as(self, other: Drive, drive: Drive, register: Register[Any]) -> dict[str, Any]:
-        """What a drive says to the question of another family, asked once, without waiting for anything."""
+        """Return what a drive replies to the request of another family, sent once and without waiting."""
         (block,) = blocks(other, [register])
-        made = reading(other, block, self.peer(drive), insists=True)
-        reply = self._read(drive, self._carry_out(made))
-        return {
-            register.name: register.decode(
-                raw_value(reply.data, block.offset(register), register.number_format)
-            )
-        }
+        read = PreparedRead(other, block, self.peer(drive))
+        insisting = make_read(other, block, self.peer(drive), insists=True)
+        return dict(read.decode(self._ask(drive, insisting, 1)))
 
-    def _ask(self, drive: Drive, block: Block, attempts: int, insists: bool, timeout: float) -> Message:
-        if insists:
-            made = reading(drive, block, self.peer(drive), insists=True, timeout=timeout)
-        else:
-            made = self._prepare(drive).exchange(block)
-        for _ in range(attempts - 1):
+    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
+        """Return the reply to a read, which is sent again where it is lost."""
+        while True:
+            attempts -= 1
+            completion = self._carry_out(exchange)
+            if completion.result > 0:  # an exception also says that the drive is there
+                self._answered_on[drive] = self.line.queue
             try:
-                return self._read(drive, self._carry_out(made))
+                return self.reply(drive, completion)
             except (NoReply, BadReply):
-                continue
-            except DriveRefused as refusal:
-                if refusal.code not in drive.damaged:
+                if not attempts:
                     raise
-        return self._read(drive, self._carry_out(made))
+            except DriveRefused as refusal:
+                if not attempts or refusal.code not in drive.damaged:
+                    raise
+
+    # ---- writing ----
 
     def carry_out(
         self,
@@ -222,21 +240,15 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Write once, ahead of any polling; first an answer that may still come late is waited for.
+        """Write once, ahead of any polling; first wait for an answer that may still come late.
 
         After `expires_ns` (0: never), and without a good permit, it is not sent. Its answer is waited for
         for `timeout` seconds at least. One that insists waits for no earlier answer, and for its own, where
         answers are known to be late, for as long as `timeout`. Raises NoReply, and nothing was sent,
         where answers may still come late and the drive is silent.
         """
-        made = exchange(
-            drive,
-            request,
-            self.peer(drive),
-            NO_ROWS,
-            insists=insists,
-            timeout=timeout,
-            permit=permit,
+        made = make_exchange(
+            drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
         )
         completion = self._carry_out(made, expires_ns)
         if completion.result == Result.LATE_ANSWER_DUE:
@@ -249,22 +261,16 @@ class Exchanges:
         completion = self.line.carry_out(made, expires_ns=expires_ns)
         if completion.result != Result.LATE_ANSWER_DUE:
             return completion
-        sleep(max(0, late_until_ns - now_ns()) / 1e9)
+        clock.sleep(max(0, late_until_ns - clock.now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
 
     def reply(self, drive: Drive, completion: Completion) -> Message:
-        """The good reply; raises NoReply, BadReply or DriveRefused."""
-        if completion.result in (Result.NO_REPLY, Result.LATE_ANSWER_DUE):
+        """Return the good reply; raises NoReply, BadReply or DriveRefused."""
+        result, reply = completion.result, completion.reply
+        if result > 0 and not reply.exception:
+            return reply
+        if result > 0:
+            raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
+        if result in (Result.NO_REPLY, Result.LATE_ANSWER_DUE):
             raise NoReply(drive.name)
-        if completion.result <= 0:
-            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
-        if completion.reply.exception:
-            code = completion.reply.exception
-            raise DriveRefused(drive.name, code, drive.exception(code))
-        return completion.reply
-
-    def _read(self, drive: Drive, completion: Completion) -> Message:
-        """The reply to a read: that the drive is there, an exception says too."""
-        if completion.result > 0:
-            self._heard[drive] = self.line.queue
-        return self.reply(drive, completion)
+        raise BadReply(drive.name, str(Result(result)), completion.raw)

@@ -1,36 +1,23 @@
-"""Opening a port and carrying out exchanges on it: the one place, besides the simulator, that meets
-the operating system and its clocks.
-"""
+"""Line: a port on which exchanges are carried out, lost and opened again."""
 
 from __future__ import annotations
 
-import errno
 import fcntl
+import logging
 import os
-import socket
 import struct
 import threading
 from contextlib import suppress
-from typing import cast
-from urllib.parse import urlsplit
 
 import serial
 
-from multidrop.core import (
-    REFUSALS,
-    Completion,
-    Echo,
-    Exchange,
-    Peer,
-    Port,
-    Result,
-    Tap,
-)
+from multidrop.core import REFUSALS, Completion, Echo, Exchange, Peer, Port, Result, Tap
 from multidrop.core.fork import register_at_fork
 from multidrop.errors import LineError, NoSuchPort, PortLost
-from multidrop.transport import port_identity
+from multidrop.transport import clock
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
-from multidrop.transport.rfc2217 import RFC2217Port
+from multidrop.transport.frame_log import log_exchange
+from multidrop.transport.opening import connection_of, identity_of, is_pseudo_terminal, reason_of, unopened
 
 _ALL_SETTINGS = sum(REFUSALS)
 _BAUDRATE = min(REFUSALS)
@@ -41,48 +28,8 @@ _TIOCGICOUNT = 0x545D
 _ICOUNTER = struct.Struct("20i")
 _OVERRUN, _BUF_OVERRUN = 7, 10
 
-_OPEN_REASONS = {
-    errno.ENOENT: "there is no such port",
-    errno.EACCES: "no permission to open it (is the user in the group that owns it?)",
-    errno.EAGAIN: "it is in use by another program",
-    errno.EBUSY: "it is in use by another program",
-    errno.ENOTTY: "it is not a serial port",
-    errno.EISDIR: "it is a directory, not a serial port",
-    errno.ECONNREFUSED: "nothing listens there",
-}
-
-
-def reason_of(failure: BaseException) -> str:
-    """Why, in words: pyserial hides the system's error in its own, or behind it."""
-    for error in (failure, failure.__context__):
-        if isinstance(error, socket.gaierror):
-            return error.strerror or str(error)
-        code = error.args[0] if error and error.args else None
-        if isinstance(code, int):
-            return _OPEN_REASONS.get(code) or os.strerror(code)
-    return str(failure)
-
-
-def unopened(port: str) -> serial.Serial:
-    """The port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
-    if not isinstance(port, str):
-        raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
-    try:
-        url = urlsplit(port)
-        needs_place = url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
-    except ValueError as mistake:
-        raise NoSuchPort(port, str(mistake)) from mistake
-    if needs_place:
-        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
-    try:
-        if url.scheme == "rfc2217":
-            found = RFC2217Port()
-            found.port = port
-            return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
-        return serial.serial_for_url(port, do_not_open=True)
-    except ValueError as mistake:
-        right = "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
-        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {right}") from mistake
+LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
+_log = logging.getLogger("multidrop.line")
 
 
 class Line:
@@ -93,24 +40,24 @@ class Line:
 
     def __init__(self, port: str, echo: Echo = Echo.AUTO) -> None:
         self.port = port
-        self.identity = port  # what it is, however its name is spelt, once it is open
+        self.identity = port  # see port_identity; known once the port is open
         self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
         self._core: Port | None = None  # dropped before the descriptor that it looks at
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
+        self._is_loss_logged = False
         self._make_locks()
         register_at_fork(self)
         self._open()
 
     def _make_locks(self) -> None:
-        self._lock = threading.RLock()  # one opens or closes at a time
-        self._waiting = 0  # callers that wait for an exchange
-        self._left = threading.Condition(self._lock)  # one of them has left
+        self._lock = threading.RLock()  # one thread opens or closes at a time
+        self._callers: list[None] = []  # in `carry_out`; a list grows and shrinks without a lock
 
     def forked(self) -> None:
-        """In the child it is closed, at once: a descriptor left open there would keep the port in use."""
+        """Close it in the child at once: a descriptor left open there would keep the port in use."""
         self._make_locks()
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
@@ -119,10 +66,12 @@ class Line:
             self._bridge.forget()
             self._bridge = None
         # Of a network port the socket alone: pyserial would end the connection, which the parent has too.
-        port = getattr(self._serial, "_socket", self._serial)
+        port = connection_of(self._serial) or self._serial
         if port:
             with suppress(*PORT_FAILURES):
                 port.close()
+
+    # ---- opening and closing ----
 
     def _open(self) -> None:
         self._why_closed = "it is closed"
@@ -133,11 +82,12 @@ class Line:
             if isinstance(port, serial.Serial):
                 port.exclusive = True
             port.open()
-            self.identity = self._identify(port)
-            self._core = self._drive(port)
-            self._core.tell_echo(self._echo)
+            self.identity = identity_of(port, self.port)
+            core = self._drive(port)
+            core.tell_echo(self._echo)
             if self._tap:
-                self._core.tap(self._tap)
+                core.tap(self._tap)
+            self._core = core
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except NoSuchPort:
@@ -145,21 +95,15 @@ class Line:
         except PORT_FAILURES as failure:
             self._let_go()
             raise LineError(self.port, reason_of(failure)) from failure
-
-    def _identify(self, port: serial.SerialBase) -> str:
-        if connection := getattr(port, "_socket", None):
-            return port_identity.of_connection(connection)
-        try:
-            return port_identity.of_device(os.ttyname(port.fileno()))
-        except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
-            return port_identity.of_name(self.port)
+        _log.info("%s: opened%s (%s)", self.port, " again" if self._is_loss_logged else "", self.identity)
+        self._is_loss_logged = False
 
     def _drive(self, port: serial.SerialBase) -> Port:
+        """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
-            pseudo = port_identity.is_pseudo_terminal(os.ttyname(port.fileno()))
-            # A pty stays at 8 bits without parity whatever it is told.
-            return Port(port.fileno(), _BAUDRATE if pseudo else _ALL_SETTINGS)
-        if connection := getattr(port, "_socket", None):
+            fd = port.fileno()
+            return Port(fd, _BAUDRATE if is_pseudo_terminal(os.ttyname(fd)) else _ALL_SETTINGS)
+        if connection := connection_of(port):
             hand_on_nothing_late(connection)
         if self.port.startswith("socket://"):
             os.set_blocking(port.fileno(), False)
@@ -170,20 +114,28 @@ class Line:
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
 
     def drop(self) -> None:
-        """Carry out nothing more; what is queued and not yet sent never will be. The port itself, which
+        """Carry out nothing more; what is queued and not yet sent never will be.
 
-        may take its time, is closed by `close` or `reopen`.
+        The port itself, which may take its time, is closed by `close` or `reopen`.
         """
         with self._lock:
             core, self._core = self._core, None
-            if core:
-                core.stop()
-                if self._left.wait_for(lambda: not self._waiting, timeout=1.0):
-                    core.close()  # nobody looks at it any more
+            if core is None:
+                return
+            if core.lost:
+                self._log_loss("it failed")
+            core.stop()
+            given_up_ns = clock.now_ns() + LEAVING_NS
+            while self._callers and clock.now_ns() < given_up_ns:
+                clock.sleep(0.001)
+            if not self._callers:  # nobody looks at its memory any more
+                core.close()
 
     def close(self) -> None:
         """Drop the port and close it; no `regain` opens it any more."""
         with self._lock:
+            if not self._is_over:
+                _log.info("%s: closed", self.port)
             self._is_over = True
             self._let_go()
 
@@ -194,18 +146,11 @@ class Line:
                 self._bridge.close()
                 self._bridge = None
             if self._serial:
-                connection = getattr(self._serial, "_socket", None)
+                connection = connection_of(self._serial)
                 with suppress(*PORT_FAILURES):
                     self._serial.close()
                 if connection:  # pyserial leaves one open that has ended already
                     connection.close()
-
-    def tap(self, tap: Tap) -> None:
-        """Tell this tap, and no other any more, of all that goes over the line."""
-        with self._lock:
-            self._tap = tap
-            if self._core:
-                self._core.tap(tap)
 
     def reopen(self) -> None:
         """Close what is left of the port and open it again; LineError when it is not there."""
@@ -215,7 +160,7 @@ class Line:
 
     @property
     def is_lost(self) -> bool:
-        """It failed, and was neither opened again nor closed since."""
+        """True when the port failed, and was neither opened again nor closed since."""
         core = self._core
         return not self._is_over and (core is None or core.lost)
 
@@ -231,8 +176,17 @@ class Line:
             except LineError as failure:
                 raise PortLost(self.port, failure.reason) from failure
 
+    # ---- what the port must do ----
+
+    def tap(self, tap: Tap) -> None:
+        """Give this tap, and no other any more, all bytes that go over the line."""
+        with self._lock:
+            self._tap = tap
+            if self._core:
+                self._core.tap(tap)
+
     def require(self, settings: tuple[int, str]) -> None:
-        """Exchanges with these settings will come: a port that is bridged can only have one kind of them.
+        """Prepare for exchanges with these settings: a bridged port can have only one kind of them.
 
         Raises LineError when it has others already, or does not take these.
         """
@@ -248,54 +202,56 @@ class Line:
             self._settings = settings
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Have a drive take the place of another at its address, whose answers may still come."""
+        """Let a drive take the place of another at its address, whose answers may still come."""
         with self._lock:
             if self._core:
                 self._core.inherit(peer, before)
             else:
                 peer.inherit(before)
 
-    def _opened(self, settings: tuple[int, str]) -> Port:
-        if self._core is None:
-            raise self._closed()
-        self.require(settings)
-        return self._core
+    # ---- exchanges ----
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
-        if self._core is None:  # at once, also while it is being opened again
-            raise self._closed()
-        with self._lock:
-            core = self._opened(exchange.settings)
-            self._waiting += 1
+        if self._core and self._bridge and self._settings != exchange.settings:
+            self.require(exchange.settings)
+        self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
         try:
+            core = self._core
+            if core is None:
+                raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            waits_in_vain = found.result == Result.LATE_ANSWER_DUE and core.lost
+            is_lost = found.result == Result.LATE_ANSWER_DUE and core.lost
         finally:
-            with self._lock:
-                self._waiting -= 1
-                self._left.notify_all()
-        failure = self._failure(Result.LINE_LOST if waits_in_vain else found.result, found.error)
-        if failure:
+            self._callers.pop()
+        if _log.isEnabledFor(logging.DEBUG):
+            log_exchange(_log, self.port, exchange, found)
+        if is_lost or found.result in (Result.LINE_LOST, Result.SETTINGS_REFUSED):
+            failure = self._failure(found.result, found.error)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
 
-    def _failure(self, result: int, error: int) -> LineError | None:
-        if result == Result.LINE_LOST and self._core is None:
-            return self._closed()
-        if result == Result.LINE_LOST:
-            return PortLost(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
+    def _failure(self, result: int, error: int) -> LineError:
         if result == Result.SETTINGS_REFUSED:
             refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
             return LineError(self.port, f"the port does not take the {refused} that the drive needs")
-        return None
+        if self._core is None:
+            return self._closed()
+        why = os.strerror(error) if error else "hung up"
+        self._log_loss(why)
+        return PortLost(self.port, f"the port was lost ({why})")
+
+    def _log_loss(self, why: str) -> None:
+        if not self._is_loss_logged:
+            self._is_loss_logged = True
+            _log.warning("%s: lost (%s)", self.port, why)
 
     def _closed(self) -> LineError:
         return (LineError if self._is_over else PortLost)(self.port, self._why_closed)
 
     def overruns(self) -> int | None:
-        """Characters that came too fast for the port, since its driver was loaded.
+        """Return how many characters came too fast for the port, since its driver was loaded.
 
         None while it is closed, and where the driver does not count them.
         """
@@ -311,7 +267,7 @@ class Line:
 
     @property
     def has_echo(self) -> bool:
-        """The adapter is known to repeat what is sent."""
+        """True where the adapter is known to repeat what is sent."""
         return self._core is not None and self._core.has_echo
 
     @property

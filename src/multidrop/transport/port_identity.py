@@ -1,4 +1,4 @@
-"""Identities of ports: what a port is, however its name is spelt."""
+"""Identities of ports: one text for each port, however its name is spelt."""
 
 from __future__ import annotations
 
@@ -20,11 +20,6 @@ def of_device(path: str) -> str:
     except OSError:
         links = []
     return next((str(link) for link in links if os.path.realpath(link) == device), device)
-
-
-def is_pseudo_terminal(path: str) -> bool:
-    """Tell a pseudo-terminal's device from a serial port's."""
-    return path.startswith(("/dev/pts/", "/dev/ttys"))  # Linux, macOS
 
 
 def of_connection(connection: socket.socket) -> str:

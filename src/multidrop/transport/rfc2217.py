@@ -1,7 +1,7 @@
 """RFC2217Port: pyserial's client of a network's serial port (RFC 2217), bounded in memory and in time.
 
-pyserial keeps all that comes, however much that is, and waits for seconds until a stalled network takes
-a request. Here what comes too fast is lost, as on a serial line, and a request leaves at once or never.
+pyserial keeps received bytes without a bound, and waits for seconds until a stalled network takes a
+request. Here bytes that come too fast are lost, as on a serial line, and a request leaves at once or never.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import serial
 from serial import rfc2217
 
 MOST_RECEIVED = 4096  # bytes taken from the network at once
-MOST_CHUNKS = 64  # of them that wait to be read
+MOST_CHUNKS = 64  # that wait to be read
 MOST_SUBOPTION = 256  # bytes: those of RFC 2217 are short, only its signature is a text
-LOCK_TIME = 0.1  # s, that another thread may take to answer an option
+LOCK_TIME = 0.1  # s, for another thread to answer an option
 
 _IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 _NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
 
 
 class Telnet:
-    """The data and the commands in a telnet stream (RFC 854), in whatever pieces the stream comes."""
+    """Parser of a telnet stream (RFC 854) into data and commands; the stream may come in any pieces."""
 
     def __init__(self) -> None:
         self._command = b""  # begun and not yet whole
         self._suboption: bytearray | None = None
 
     def split(self, received: bytes) -> Iterator[tuple[bytes, bytes]]:
-        """Yield (b"", data), (command, option) and (SB, suboption), in the order in which they came."""
+        """Yield (b"", data), (command, option) and (SB, suboption), in the order of the stream."""
         at = 0
         while at < len(received):
             if self._command:
@@ -75,7 +75,7 @@ class Telnet:
 
 
 class RFC2217Port(rfc2217.Serial):
-    """A network's serial port; `port` is rfc2217://host:port."""
+    """A serial port on a network; `port` is rfc2217://host:port."""
 
     # pyserial's own attributes, which its type stubs leave out
     _socket: Any
@@ -111,7 +111,7 @@ class RFC2217Port(rfc2217.Serial):
             self._telnet_negotiate_option(kind, content)
 
     def write(self, data: Any) -> int:
-        """Send all of it at once; raises SerialException where the network does not take it."""
+        """Send all of it at once; raises SerialException when the network does not take it."""
         self._internal_raw_write(bytes(data).replace(_IAC, _IAC + _IAC))
         return len(data)
 

@@ -1,7 +1,7 @@
-"""Ports of simulated drives, whose writes wear no EEPROM: how a client recognises them.
+"""Marks by which a client recognises ports of simulated drives, whose writes wear no EEPROM.
 
 A simulator holds a name for each of its ports in the kernel (an abstract Unix address, unix(7)). The
-name is gone when the process ends, in whatever way. Other systems have no such names: there a simulated
+name is gone when the process ends, even by SIGKILL. Other systems have no such names: there a simulated
 drive's writes are counted as a real one's.
 """
 

@@ -1,7 +1,7 @@
-"""How well a line and its drives did: what became of exchanges, response delays, utilisation. Pure.
+"""Statistics of a line and its drives: results of exchanges, response delays, utilisation.
 
-All of it is derived from numbers that only grow, so that the figures of any span of time are the
-difference of two looks, and taking one costs the line nothing.
+All of it is derived from counters that only grow: the figures of any span of time are the difference of
+two readings, and taking one costs the line nothing.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from operator import add, sub
 
 from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, Counters, Result, delay_edge, status_text
+from multidrop.transport import clock
+from multidrop.transport.exchange import Exchanges
 
 # Bytes came instead of the reply, and no good frame among them.
 _DAMAGED = (Result.BAD_CHECKSUM, Result.BAD_CHARACTER, Result.CUT_SHORT, Result.NO_START)
@@ -21,13 +23,13 @@ _DAMAGED = (Result.BAD_CHECKSUM, Result.BAD_CHARACTER, Result.CUT_SHORT, Result.
 class Diagnostics:
     """The eight counters of the MODBUS serial-line guide (V1.02, appendix A), from the client's side.
 
-    The guide has a drive count what it hears; here the client counts what it sends to and hears from
-    a drive, or all drives of a line.
+    In the guide a drive counts what it receives; here the client counts what it sends to and receives
+    from a drive, or all drives of a line.
     """
 
     bus_messages: int
-    """Good frames that were heard: replies, also exceptions and late ones, and confirmations of
-    another write. Frames of other addresses are not known to be whole, and are not counted."""
+    """Good frames received: replies, also exceptions and late ones, and confirmations of another write.
+    Frames of other addresses are not known to be whole, and are not counted."""
 
     bus_communication_errors: int
     """Exchanges that ended in damage: a bad checksum or character, a reply cut short, no frame at all.
@@ -35,11 +37,11 @@ class Diagnostics:
     cannot be told from one, and is not counted."""
 
     bus_exception_errors: int
-    """Exception replies. What a drive finds wrong with a broadcast is never told."""
+    """Exception replies. A drive never says what it finds wrong with a broadcast."""
 
     server_messages: int
     """Requests that left, broadcasts too (which count for the drive whose register was written).
-    Whether the drive heard them is not known."""
+    Nothing says that the drive received them."""
 
     server_no_responses: int
     """Broadcasts, and requests to which nothing came within the time-out."""
@@ -52,8 +54,8 @@ class Diagnostics:
 
     bus_character_overruns: int | None
     """Characters, not messages, that the port lost because they came too fast. Of a line only, and
-    None where the driver does not count them, as on pseudo-terminals and the network. What a drive
-    loses it alone knows."""
+    None where the driver does not count them, as on pseudo-terminals and the network. Only the drive
+    itself knows what it loses."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Delays:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What became of the exchanges with one drive, or with all drives of a line, in so many seconds."""
+    """Results of the exchanges with one drive, or with all drives of a line, in `seconds` s."""
 
     seconds: float
     counters: Counters
@@ -81,7 +83,7 @@ class Statistics:
 
     @property
     def exchanges(self) -> int:
-        """Requests that left, whatever became of them."""
+        """Requests that left, whatever their result."""
         return self.counters.sent
 
     @property
@@ -94,7 +96,7 @@ class Statistics:
 
     @property
     def misses(self) -> Counter[str]:
-        """Values that are missing, by the reason that stands in their rows."""
+        """Values that are missing, by the reason in their rows."""
         found = Counter({status_text(-result): n for result, n in self.counters.missed.items()})
         found.update({status_text(EXCEPTION_STATUS + code): n for code, n in self.counters.refused.items()})
         return found
@@ -106,9 +108,9 @@ class Statistics:
 
     @property
     def timeout(self) -> float:
-        """How long a reply is waited for at present, in s; of a line, the longest.
+        """Present time-out in s; of a line, the longest of its drives.
 
-        It follows a drive's own response delay, and grows where answers come late again and again.
+        It follows a drive's own response delay, and grows where replies come late again and again.
         """
         return self.counters.timeout_ns / 1e9
 
@@ -119,7 +121,7 @@ class Statistics:
 
     @property
     def utilisation(self) -> float:
-        """The time that the answered exchanges had to take of the line, as a part of all time.
+        """Part of all time that the answered exchanges had to take of the line.
 
         Silence, request, response delay and reply, at the line's settings. A port that is faster than its
         settings, such as a network's or a pseudo-terminal, needs no more than it took: never more than 1.
@@ -149,32 +151,60 @@ class Statistics:
 
 @dataclass(frozen=True)
 class LineStatistics(Statistics):
-    """Those of a line, and of each drive on it by name."""
+    """Statistics of a line, and of each drive on it by name."""
 
     drives: Mapping[str, Statistics] = field(default_factory=dict)
 
     def since(self, earlier: LineStatistics) -> LineStatistics:
-        """Of the time between: `earlier` is an earlier look at the same line."""
+        """Return the statistics of the time between; `earlier` is an earlier reading of the same line."""
         seconds = max(self.seconds - earlier.seconds, 1e-9)
         lost = None
         if self.overruns is not None and earlier.overruns is not None:
             lost = self.overruns - earlier.overruns
+        before = {name: drive.counters for name, drive in earlier.drives.items()}
         counters_by_drive = {
-            name: _difference(
-                it.counters, earlier.drives[name].counters if name in earlier.drives else Counters()
-            )
-            for name, it in self.drives.items()
+            name: _difference(drive.counters, before.get(name, Counters()))
+            for name, drive in self.drives.items()
         }
-        return look(seconds, counters_by_drive, lost)
+        return line_statistics(seconds, counters_by_drive, lost)
 
 
-def look(seconds: float, counters_by_drive: Mapping[str, Counters], overruns: int | None) -> LineStatistics:
-    """What drives' numbers say, by their names, after so many seconds."""
+def line_statistics(
+    seconds: float, counters_by_drive: Mapping[str, Counters], overruns: int | None
+) -> LineStatistics:
+    """Return the statistics that drives' counters, by their names, amount to after so many seconds."""
     drives = {name: Statistics(seconds, counters) for name, counters in counters_by_drive.items()}
-    return LineStatistics(seconds, _together(counters_by_drive.values()), overruns, drives)
+    return LineStatistics(seconds, _sum(counters_by_drive.values()), overruns, drives)
 
 
-def _together(counters_by_drive: Iterable[Counters]) -> Counters:
+class LineMeter:
+    """Statistics of a line since it was opened, or last reset; frozen when it is closed."""
+
+    def __init__(self, exchanges: Exchanges) -> None:
+        self._exchanges = exchanges
+        self._opened_ns = clock.now_ns()
+        self._frozen: LineStatistics | None = None
+        self._reset_at = line_statistics(0.0, {}, exchanges.line.overruns())
+
+    def read(self) -> LineStatistics:
+        return self._now().since(self._reset_at)
+
+    def reset(self) -> None:
+        self._reset_at = self._now()
+
+    def freeze(self, overruns: int | None) -> None:
+        """Count nothing more: the line is closed, which had lost so many characters until then."""
+        self._frozen = self._frozen or self._count(overruns)
+
+    def _now(self) -> LineStatistics:
+        return self._frozen or self._count(self._exchanges.line.overruns())
+
+    def _count(self, overruns: int | None) -> LineStatistics:
+        counters_by_drive = {drive.name: peer.counters() for drive, peer in self._exchanges.peers.items()}
+        return line_statistics((clock.now_ns() - self._opened_ns) / 1e9, counters_by_drive, overruns)
+
+
+def _sum(counters_by_drive: Iterable[Counters]) -> Counters:
     found = Counters()
     for counters in counters_by_drive:
         longest = max(found.longest_ns, counters.longest_ns)
@@ -192,7 +222,7 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
 
 
 def _quantile(counters: Counters, part: float) -> float:
-    """The middle of the bucket in which it lies."""
+    """Return the middle of the bucket in which the quantile lies, in s."""
     wanted = part * counters.delays.total()
     seen = 0
     for bucket, count in sorted(counters.delays.items()):

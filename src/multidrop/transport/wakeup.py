@@ -1,4 +1,4 @@
-"""A descriptor that becomes readable when it is set."""
+"""WakeUp: tells select, poll or an asyncio loop that something waits."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import os
 from contextlib import suppress
 
 
-class Wake:
-    """A descriptor that becomes readable when it is set: for select, poll or an asyncio loop."""
+class WakeUp:
+    """A descriptor that is readable from `set` to `clear`."""
 
     def __init__(self) -> None:
         self._reader, self._writer = os.pipe()

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from multidrop.bus import LEAST_TIMEOUT, Bus, exchange
+from multidrop.bus import Bus
 from multidrop.cli.doctor.adapter import find_adapter, low_latency, rs485_mode
 from multidrop.cli.doctor.findings import (
     ROUNDS,
@@ -31,8 +31,9 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import blocks
+from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
-from multidrop.transport.port_identity import is_pseudo_terminal
+from multidrop.transport.opening import is_pseudo_terminal
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
@@ -180,7 +181,7 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
     (block,) = blocks(drive, [register])
     with Bus(port) as bus:
         bus.attach(drive)
-        poll = exchange(drive, block.request(drive.address), bus.peer(drive))
+        poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
     # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
     wire = (len(build_request(drive.framing, poll.request)) + 1) * drive.settings.character

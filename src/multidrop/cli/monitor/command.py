@@ -23,7 +23,7 @@ from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.polling import PollingSession, polling_session
-from multidrop.control.stop_all import Seen
+from multidrop.control.outcome import Seen
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from multidrop.cli.support.values import aligned, shortened
 from multidrop.planning.prediction import Prediction, predict
+from multidrop.plant.metadata import planned_on
 from multidrop.plant.model import PlantLine
 
 Figures = dict[str, Any]
@@ -23,9 +24,9 @@ def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
     polls = [poll for polled in line.drives for poll in polled.polls]
     is_timed = any(poll.every is not None for poll in polls)  # cycles then do not follow each other
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
-    by_delays = predict(line.planned(delays), delays, summary["switching_ms"] / 1e3)
+    by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {
-        "predicted": _figures(predict(line.planned(), switching=line.switching)),
+        "predicted": _figures(predict(planned_on(line), switching=line.switching)),
         "predicted_with_measured_delays": _figures(by_delays),
         "measured": {
             "cycle_ms": None if is_timed or not cycles else round(summary["seconds"] / cycles * 1e3, 3),

@@ -13,7 +13,7 @@ from multidrop.cli.support.values import value_text
 from multidrop.core import UNASKED, Counters
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.batch import Row
-from multidrop.transport.statistics import LineStatistics, Statistics, look
+from multidrop.transport.statistics import LineStatistics, Statistics, line_statistics
 
 HISTORY = 240  # points, one a second
 LATELY = 5.0  # s over which rates are taken
@@ -99,7 +99,7 @@ class LivePlant:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.drives = [LiveDrive(line, polled) for line in plant.lines for polled in line.drives]
-        self.so_far = {line.name: look(1.0, {}, None) for line in plant.lines}
+        self.so_far = {line.name: line_statistics(1.0, {}, None) for line in plant.lines}
         self.lately = self.so_far
         self._by_name = {drive.name: drive for drive in self.drives}
         self._earlier: deque[tuple[float, Mapping[str, LineStatistics]]] = deque()

@@ -1,4 +1,4 @@
-"""`python -m multidrop.cli`: the same as `multidrop`."""
+"""`python -m multidrop`: the same as `multidrop`."""
 
 import sys
 

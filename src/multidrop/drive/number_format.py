@@ -1,4 +1,4 @@
-"""Single-precision numbers (IEEE 754 binary32): the nearest one, and the shortest text that means it."""
+"""Number formats: the numbers that fit them, and arithmetic with float32 (IEEE 754 binary32)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,22 @@ import math
 import struct
 from fractions import Fraction
 
-MOST_DIGITS = 9  # enough to tell any two of them apart
+from multidrop.core import NumberFormat
+
+FLOATS = (NumberFormat.F32, NumberFormat.F32_SWAPPED)
+LONGS = frozenset(NumberFormat) - {NumberFormat.BIT, NumberFormat.U16, NumberFormat.I16}  # of two words
+MOST_DIGITS = 9  # enough to tell any two float32 apart
+_SIGNED = (NumberFormat.I16, NumberFormat.I32, NumberFormat.I32_SWAPPED)
+_LARGEST_FLOAT = float.fromhex("0x1.fffffep127")
+
+
+def raw_span(number_format: NumberFormat) -> tuple[Fraction, Fraction]:
+    """Return the least and the greatest raw count of a format."""
+    if number_format in FLOATS:
+        return Fraction(-_LARGEST_FLOAT), Fraction(_LARGEST_FLOAT)
+    bits = 1 if number_format is NumberFormat.BIT else 32 if number_format in LONGS else 16
+    least = -(1 << bits - 1) if number_format in _SIGNED else 0
+    return Fraction(least), Fraction(least + (1 << bits) - 1)
 
 
 def nearest(value: float | Fraction) -> float:

@@ -1,0 +1,77 @@
+"""Broadcaster: writes to all drives of a bus at once, where that is harmless to each of them.
+
+The same address means different things to different families (a stop of one may be the run of another):
+so all drives must be of one family, share settings and framing, and be known to be of that family.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, cast
+
+from multidrop.control.latches import Latches
+from multidrop.control.performer import Performer
+from multidrop.control.rules import is_harmless, raw_count
+from multidrop.control.writer import Writer
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.drive.state import State
+from multidrop.errors import BusError, Refused
+
+
+class Broadcaster:
+    """Broadcasts on one bus."""
+
+    def __init__(self, writer: Writer, performer: Performer, latches: Latches) -> None:
+        self._writer = writer
+        self._performer = performer
+        self._latches = latches
+
+    def write(
+        self, drives: Sequence[Drive], register: Register[Any], value: Any
+    ) -> dict[str, State | BusError]:
+        """Write to all; then read each one's state, or why it says none. Raises Refused."""
+        if not _are_alike(drives):
+            raise Refused(
+                f"{register.name} cannot be broadcast: the drives on this line differ in family or settings, "
+                "and the same address means different things to them; write to one after another",
+                register=register.name,
+                rule="the drives on the line differ",
+            )
+        first = drives[0]
+        raw = raw_count(first, register, value)
+        if raw not in register.broadcast:
+            raise Refused(f"{first.title} has no harmless broadcast of {register.name} = {value}")
+        for drive in drives:
+            self._performer.check_identity(drive)
+        if is_harmless(register, raw):
+            self._latches.rise(drives)
+        try:
+            self._writer.broadcast(first, register, raw)
+        finally:
+            self._writer.records.catch_up()
+        return {drive.name: self._state(drive) for drive in drives}
+
+    def _state(self, drive: Drive) -> State | BusError:
+        try:
+            return cast(State, self._performer.perform(drive.state.script(), self._performer.call(drive)))
+        except BusError as failure:
+            return failure
+
+    def stop(self, drives: Sequence[Drive]) -> bool:
+        """Broadcast a stop where all drives are known and have one; True where it was sent."""
+        known = all(self._writer.identity_check.is_known(drive) for drive in drives)
+        control = drives[0].registers.get("control") if drives else None
+        if len(drives) < 2 or not _are_alike(drives) or not known:
+            return False
+        if control is None or not control.broadcast:
+            return False
+        with suppress(Exception):
+            self._writer.broadcast(drives[0], control, control.broadcast[0])
+            return True
+        return False
+
+
+def _are_alike(drives: Sequence[Drive]) -> bool:
+    return len({(type(drive), drive.settings, drive.framing) for drive in drives}) == 1

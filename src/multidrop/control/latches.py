@@ -1,0 +1,88 @@
+"""Latches: end what may move a motor once its stop was called, and hold others back while stops run."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+from multidrop.core import Latch
+from multidrop.drive.family import Drive
+from multidrop.errors import NotAttached
+from multidrop.transport.exchange import Exchanges
+
+STOPPED = "a stop was called"
+REMOVED = "the drive was taken off the bus"
+LEFT = "the bus was left"
+
+
+class Latches:
+    """A latch for each drive of a bus, and the number of stops under way."""
+
+    def __init__(self, exchanges: Exchanges) -> None:
+        self._exchanges = exchanges
+        self._latches: dict[Drive, Latch] = {}
+        self._is_shut = False
+        self._make_condition()
+
+    def _make_condition(self) -> None:
+        self._stops = 0  # under way
+        self._over = threading.Condition()  # one of them is
+
+    def forked(self) -> None:
+        """Send nothing in the child, where nothing is under way."""
+        self._make_condition()
+        self.shut()
+
+    def add(self, drive: Drive) -> None:
+        latch = self._latches[drive] = Latch()
+        if self._is_shut:  # looked at afterwards: a thread that shuts them later sees this latch
+            latch.shut(LEFT)
+
+    def remove(self, drive: Drive) -> None:
+        """End what moves this drive, and wait for the stops that are under way."""
+        self.latch(drive).shut(REMOVED)
+        self.await_stops()
+        self._latches.pop(drive, None)
+
+    def shut(self) -> None:
+        """Send nothing any more that moves a motor. Takes no lock: a signal handler may call it."""
+        self._is_shut = True
+        for latch in list(self._latches.values()):
+            latch.shut(LEFT)
+
+    def await_stops(self) -> None:
+        """Wait until no stop is under way."""
+        with self._over:
+            self._over.wait_for(lambda: not self._stops)
+
+    def latch(self, drive: Drive) -> Latch:
+        """Return a drive's latch; NotAttached for one that is not on this bus."""
+        self._exchanges.peer(drive)  # raises it too
+        latch = self._latches.get(drive)
+        if latch is None:  # it leaves just now
+            raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
+        return latch
+
+    def rise(self, drives: Sequence[Drive]) -> None:
+        """End all that moves these drives: a stop is about to be written."""
+        for drive in drives:
+            self.latch(drive).rise(STOPPED)
+
+    @contextmanager
+    def stopping(self, drives: Sequence[Drive]) -> Iterator[None]:
+        """Let nothing that moves these drives begin or go on meanwhile, and none of them leave."""
+        with self._over:
+            self._stops += 1
+        try:
+            latches = [latch for drive in drives if (latch := self._latches.get(drive))]
+            for latch in latches:  # all of them before anything else
+                latch.rise(STOPPED)
+            with ExitStack() as stack:
+                for latch in latches:
+                    stack.enter_context(latch.held(STOPPED))
+                yield
+        finally:
+            with self._over:
+                self._stops -= 1
+                self._over.notify_all()

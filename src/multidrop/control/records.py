@@ -1,0 +1,111 @@
+"""WriteRecords: the audit log and the EEPROM ledger of one line's writes.
+
+A write is counted before it is sent. A stop is sent first, and recorded afterwards: a disk may hang.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+from multidrop.control.audit_log import AuditLog
+from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
+from multidrop.control.outcome import Effect
+from multidrop.control.rules import refused
+from multidrop.core import Message, build_request
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Kept, Register
+from multidrop.errors import Advice
+from multidrop.transport import clock
+from multidrop.transport.line import Line
+
+_log = logging.getLogger("multidrop.control")
+
+
+class WriteRecords:
+    """Records of one line's writes; stops are queued until `catch_up`."""
+
+    def __init__(self, line: Line, ledger: Ledger, audit: AuditLog | None) -> None:
+        self.audit = audit
+        self._line = line
+        self._ledger = ledger
+        self._uncounted: deque[LedgerCell] = deque()
+        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # each with its time, UTC in ns
+
+    def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
+        """Count a write in the ledger before it is sent; Refused when it must not be."""
+        least = LEAST_INTERVAL if kept is Kept.EEPROM else 0.0
+        ledger = self._ledger.at(self._line.identity)
+        why = ledger.enter(self._cell(drive, register), clock.utc_ns() / 1e9, least)
+        if why:
+            way, advice = "write it less often, or take a setpoint that is kept in RAM", None
+            if kept is Kept.UNKNOWN:
+                advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
+                way = f"if you know that this drive keeps it in RAM, {advice.program}"
+            raise refused(drive, register, f"{why}; {way}", advice)
+
+    def count_later(self, drive: Drive, register: Register[Any]) -> None:
+        self._uncounted.append(self._cell(drive, register))
+
+    def log(
+        self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
+    ) -> None:
+        """Note a write in the audit log; failing to is a warning."""
+        self.log_later(drive, request, what, effect, why, held)
+        self.catch_up()
+
+    def log_later(
+        self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
+    ) -> None:
+        """Queue the note, also for the logger, whose handler may write to the same disk."""
+        frame = build_request(drive.framing, request)
+        record = {
+            "port": self._line.port,
+            "drive": drive.name if request.address else "all",
+            "model": drive.model,
+            "address": request.address,
+            "write": what,
+            "sent": frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper(),
+            "outcome": effect.value,
+        }
+        more = {"held": None if held is None else float(held), "why": why}
+        record |= {key: text for key, text in more.items() if text not in (None, "")}
+        self._unlogged.append((clock.utc_ns(), record))
+
+    def catch_up(self) -> None:
+        """Log and count what was queued; failing to is a warning."""
+        with suppress(IndexError):  # another thread may be at it
+            while True:
+                self._append(*self._unlogged.popleft())
+        with suppress(IndexError):
+            while True:
+                self._note(self._uncounted.popleft())
+
+    def _append(self, at_ns: int, record: dict[str, Any]) -> None:
+        why = f": {record['why']}" if "why" in record else ""
+        _log.info("%s: %s: %s%s", record["drive"], record["write"], record["outcome"], why)
+        audit = self.audit
+        if audit is None:
+            return
+        try:
+            audit.add(at_ns, record)
+        except (OSError, ValueError) as failure:  # it may be closed meanwhile
+            _log.warning("the audit log cannot be written: %s", failure)
+
+    def _note(self, cell: LedgerCell) -> None:
+        try:
+            self._ledger.at(cell.port).note(cell, clock.utc_ns() / 1e9)
+        except OSError as failure:
+            _log.warning("a stop was not counted: %s", failure)
+
+    def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
+        model = drive.model or type(drive).__name__
+        return LedgerCell(self._line.identity, drive.address, model, register.name, self._line.port)
+
+    def close(self) -> None:
+        self.catch_up()
+        if self.audit is not None:
+            self.audit.close()
+            self.audit = None

@@ -1,0 +1,189 @@
+"""StopAttempt: one drive's stop, repeated until it is confirmed and the motor is seen to stand."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.control.outcome import Seen, Stopped
+from multidrop.drive.family import Drive
+from multidrop.drive.script import Pulse, Script, Step, Wait, Write
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    CheckAgain,
+    DriveRefused,
+    LineError,
+    NoReply,
+    NotDone,
+    PortLost,
+    Refused,
+    Unconfirmed,
+    Unsupported,
+)
+
+LEAST_S = 30.0  # for which a stop is repeated where its caller gives no time
+PAUSE_S = 0.2  # before it is repeated
+MOST_STEPS = 8  # that are sent once more after an interruption
+
+_log = logging.getLogger("multidrop.control")
+
+Do = Callable[["StopAttempt", Step], Any]
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a stop is repeated, and after which failures.
+
+    Without `seconds` it is for LEAST_S at least, and an attempt that has begun by then may take its time,
+    which is the ramp's.
+    """
+
+    seconds: float | None = None
+    worth_repeating: tuple[type[Exception], ...] = (
+        Unconfirmed,
+        NotDone,
+        NoReply,
+        BadReply,
+        DriveRefused,
+        PortLost,
+    )
+
+
+class StopAttempt:
+    """One drive's stop under way; its `failure`, None while all is well."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        script: Callable[[], Script[Any]],
+        begun: float,
+        patience: Patience,
+    ) -> None:
+        self.drive = drive
+        self.due = begun
+        self.failure: Exception | None = None
+        self.is_sent = False  # a stop has left for it
+        self._begun = begun
+        self._patience = patience
+        self._make = script
+        self._sent = 0
+        self._is_confirmed = False
+        self._pulses: set[tuple[str, Any]] = set()
+        self._has_warned = False
+        self._begin()
+
+    def _begin(self) -> None:
+        script = self._script = self._make()
+        self._resume: Callable[[], Step] = lambda: next(script)
+
+    def advance(self, do: Do, now: Callable[[], float]) -> bool:
+        """Carry out one step; True when the stop is over."""
+        limit = self._patience.seconds
+        if limit is not None and self.is_sent and now() >= self._begun + limit:
+            reason = f"after {limit:g} s, all that it was given, it is not seen to have stopped"
+            self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
+            return True
+        try:
+            step = self._resume()
+            if isinstance(step, Wait):
+                self._wait(step.seconds, now())
+            else:
+                self._carry_out(step, do)
+        except StopIteration:
+            self.failure = None
+            return True
+        except Exception as failure:  # the script's: it may be a user's own, and raise anything
+            self.failure = failure
+            return not self._goes_on(failure, now())
+        return False
+
+    def _wait(self, seconds: float, now: float) -> None:
+        self.due = now + seconds
+        if self._patience.seconds is not None:
+            self.due = min(self.due, max(now, self._begun + self._patience.seconds))
+        script = self._script
+        self._resume = lambda: script.send(None)
+
+    def _carry_out(self, step: Step, do: Do) -> None:
+        script = self._script
+        if isinstance(step, Pulse) and (step.register.name, step.value) in self._pulses:
+            reason = "it is a pulse, and was sent once already"
+            again = Unconfirmed(self.drive.name, step.register.name, reason)
+            self._resume = lambda: script.throw(again)
+            return
+        try:
+            result = do(self, step)
+        except CheckAgain:
+            self._resume = lambda: step
+        except (BusError, ValueError) as failure:
+            error = failure  # outlives the except clause
+            self._note(step, error)
+            self._resume = lambda: script.throw(error)
+        else:
+            self._note(step, None)
+            self._resume = lambda: script.send(result)
+
+    def _note(self, step: Step, failure: Exception | None) -> None:
+        if not isinstance(step, Write):
+            return
+        if not isinstance(failure, (Refused, LineError, ValueError)):
+            self._sent += 1
+            if isinstance(step, Pulse):
+                self._pulses.add((step.register.name, step.value))
+        self.is_sent |= not isinstance(failure, (Refused, LineError, DriveRefused, ValueError))
+        self._is_confirmed |= failure is None
+
+    def _goes_on(self, failure: Exception, now: float) -> bool:
+        limit = LEAST_S if self._patience.seconds is None else self._patience.seconds
+        if not isinstance(failure, self._patience.worth_repeating) or now >= self._begun + limit:
+            return False
+        if not self._has_warned:
+            self._has_warned = True
+            _log.warning("the stop is repeated for %g s at least: %s", limit, failure)
+        self._begin()
+        self.due = now + PAUSE_S
+        return True
+
+    def once_more(self, do: Do) -> None:
+        """Send the stop again without looking at anything: its caller was interrupted."""
+        self._begin()
+        with suppress(Exception):  # its end, too
+            for _ in range(MOST_STEPS):
+                step = self._resume()
+                if not isinstance(step, Write):
+                    return
+                self._carry_out(step, do)
+
+    @property
+    def known(self) -> Exception | None:
+        """The failure of the whole stop; None where the motor is seen to stand."""
+        failure = self.failure
+        if failure is None or isinstance(failure, (Unsupported, Refused)):
+            return failure
+        if self._is_confirmed and not isinstance(failure, Unconfirmed):
+            reason = f"it was confirmed, but its effect could not be seen: {failure}"
+        elif self.is_sent and not self._is_confirmed:
+            reason = f"sent {self._sent} times, it was never confirmed: {failure}"
+        else:
+            return failure
+        unknown = Unconfirmed(self.drive.name, "the stop", reason)
+        unknown.__cause__ = failure
+        return unknown
+
+    def result(self, now: float) -> Stopped:
+        """Return what is known of it at its end."""
+        known, seconds = self.known, now - self._begun
+        if known is None:
+            return Stopped(self.drive.name, Seen.STOPPED, seconds)
+        seen = Seen.SENT if self.is_sent and not isinstance(known, Unsupported) else Seen.FAILED
+        why = str(known) if isinstance(known, (BusError, ValueError)) else f"{type(known).__name__}: {known}"
+        return Stopped(self.drive.name, seen, seconds, why)
+
+    def interrupted(self) -> str:
+        """Return what is known of it when its caller no longer waits."""
+        times = f"the stop was sent {self._sent} times" if self._sent else "no stop was sent"
+        return f"{self.drive.name}: {times}; the motor is not seen to stand"

@@ -1,0 +1,114 @@
+"""Jobs: a drive's polls as blocks, each with the exchange that reads it and the layout of its rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from multidrop.bus import Bus
+from multidrop.control.rules import check_own
+from multidrop.core import Exchange, Field, Names, RowLayout
+from multidrop.drive.family import Drive
+from multidrop.planning.blocks import Block, Plan, plan
+from multidrop.planning.bus_time import kind, sending, silence
+from multidrop.planning.schedule import Job
+from multidrop.plant.model import PolledDrive
+from multidrop.transport.exchange import make_read
+
+
+class RowNames:
+    """Names of drives and registers, of which rows hold the numbers."""
+
+    def __init__(self) -> None:
+        self.drives = Names()
+        self.registers = Names()
+
+    def layout(self, drive: Drive, block: Block) -> RowLayout:
+        """Return the rows that a reply with this block becomes."""
+        return RowLayout(
+            self.drives.number(drive.name),
+            [
+                Field(
+                    block.offset(register),
+                    register.number_format,
+                    self.registers.number(register.name),
+                    register.scale.numerator,
+                    register.scale.denominator,
+                )
+                for register in block.registers
+            ],
+        )
+
+
+@dataclass(eq=False, kw_only=True)
+class PolledJob(Job):
+    """A job of the schedule, with the exchange that does it and the rows that come of it."""
+
+    owner: Drive
+    block: Block
+    exchange: Exchange
+    rows: RowLayout
+    own_ns: int  # of silence and characters, to which the response delay comes
+
+    @property
+    def name(self) -> str:
+        """Drive and first register."""
+        return f"{self.owner.name}.{self.block.registers[0].name}"
+
+
+@dataclass
+class PlannedJobs:
+    """Jobs that read a drive in the least time, and the plan that they carry out."""
+
+    jobs: list[PolledJob]
+    plan: Plan
+
+
+class JobMaker:
+    """Makes the jobs of one line; the same block at the same rate is always the same job."""
+
+    def __init__(self, bus: Bus, names: RowNames) -> None:
+        self._bus = bus
+        self._names = names
+        self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
+
+    def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
+        """Plan a drive's polls for this response delay in s. Raises ValueError for another's register."""
+        drive = polled.drive
+        for poll in polled.polls:
+            check_own(drive, poll.register)
+        best = plan(drive, polled.wanted, delay)
+        jobs = [
+            self.job(drive, one.block, None if one.every is None else round(one.every * 1e9))
+            for one in best.planned
+        ]
+        return PlannedJobs(jobs, best)
+
+    def job(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
+        key = drive, block, period_ns
+        if key not in self._made:
+            self._made[key] = self.make(drive, block, period_ns)
+        return self._made[key]
+
+    def make(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
+        """Make a job of its own."""
+        rows = self._names.layout(drive, block)
+        own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
+        return PolledJob(
+            drive=drive.address,
+            kind=kind(drive),
+            period_ns=period_ns,
+            duration_ns=own_ns + round(drive.response_delay * 1e9),
+            owner=drive,
+            block=block,
+            exchange=make_read(drive, block, self._bus.peer(drive), rows, period=(period_ns or 0) / 1e9),
+            rows=rows,
+            own_ns=own_ns,
+        )
+
+    @property
+    def skipped(self) -> int:
+        """Slots that were left out because the line was busy."""
+        return sum(job.skipped for job in self._made.values())
+
+    def __len__(self) -> int:
+        return len(self._made)

@@ -1,0 +1,90 @@
+"""PortQueue: exchanges that the core has to carry out on a port, queued some way ahead or repeated.
+
+Where all drives of a line answer and are polled as fast as it allows, the core repeats the bus cycle by
+itself; else the queue is topped up, many exchanges at a time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from multidrop.core import Port
+from multidrop.planning.schedule import Schedule, Turn
+from multidrop.polling.jobs import PolledJob
+
+AHEAD_NS = 300_000_000  # so far ahead exchanges are queued
+
+Slot = tuple[PolledJob, int]  # and when it was due, ns
+
+
+class PortQueue:
+    """Jobs of a schedule on the port that is open now."""
+
+    def __init__(self, schedule: Schedule[PolledJob]) -> None:
+        self._schedule = schedule
+        self.port: Port | None = None
+        self._done = 0  # exchanges on it, when they were counted last
+        self._queued: deque[Turn[PolledJob]] = deque()  # that the core has not carried out yet
+        self._ahead_ns = 0  # that these will take
+        self._cycle: list[PolledJob] = []  # that the core repeats
+
+    @property
+    def is_repeating(self) -> bool:
+        return bool(self._cycle)
+
+    def move_to(self, port: Port) -> None:
+        """Go on on a port that was opened since; nothing is queued on it yet."""
+        self.port, self._done = port, 0
+
+    def conclude(self, port: Port) -> None:
+        """Tell the schedule which exchanges were carried out."""
+        if port is not self.port:  # it was opened since: nothing is queued on it
+            return
+        done = port.done
+        for _ in range((done - self._done) & 0xFFFF_FFFF):
+            job = self._queued.popleft().job
+            self._ahead_ns -= job.duration_ns
+            self._schedule.back_off.conclude(job.drive)
+        self._done = done
+
+    def keep_busy(self, port: Port, now_ns: int) -> None:
+        """Have the core repeat the bus cycle, or else queue what comes next."""
+        cycle = self._schedule.cycle(now_ns)
+        if cycle != self._cycle or port.repeating != bool(cycle):
+            following = port.repeat([])
+            if self._cycle:
+                self._schedule.go_on(self._cycle[following])
+            self._cycle = self._schedule.cycle(now_ns)
+            if self._cycle:
+                port.repeat([job.exchange for job in self._cycle])
+        if not self._cycle:
+            self._top_up(port, now_ns)
+
+    def _top_up(self, port: Port, now_ns: int) -> None:
+        done_ns = max(now_ns + self._ahead_ns, self._queued[-1].not_before_ns if self._queued else 0)
+        room = port.room - len(self._queued)
+        turns = self._schedule.take(now_ns, done_ns, now_ns + AHEAD_NS, room)
+        if turns:
+            port.submit([turn.job.exchange for turn in turns], [turn.not_before_ns for turn in turns])
+            self._queued += turns
+            self._ahead_ns += sum(turn.job.duration_ns for turn in turns)
+
+    def measure(self) -> None:
+        """Sum up again how long the queue takes: durations of jobs have changed."""
+        self._ahead_ns = sum(turn.job.duration_ns for turn in self._queued)
+
+    def slots(self) -> list[Slot]:
+        """Return the slots that are queued and not carried out."""
+        return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
+
+    def clear(self, now_ns: int) -> list[Slot]:
+        """Forget what is queued: the port failed. Returns the slots, those without a time as of now."""
+        slots = [
+            (turn.job, now_ns if turn.due_ns is None else min(turn.due_ns, now_ns)) for turn in self._queued
+        ]
+        for job, _ in slots:
+            self._schedule.back_off.conclude(job.drive)
+        self._queued.clear()
+        self._cycle = []
+        self._ahead_ns = 0
+        return slots

@@ -1,0 +1,78 @@
+"""Finding and opening a port by its name: a device or any pyserial URL, its identity, and why it fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from typing import cast
+from urllib.parse import urlsplit
+
+import serial
+
+from multidrop.errors import NoSuchPort
+from multidrop.transport import port_identity
+from multidrop.transport.rfc2217 import RFC2217Port
+
+_REASONS = {
+    errno.ENOENT: "there is no such port",
+    errno.EACCES: "no permission to open it (is the user in the group that owns it?)",
+    errno.EAGAIN: "it is in use by another program",
+    errno.EBUSY: "it is in use by another program",
+    errno.ENOTTY: "it is not a serial port",
+    errno.EISDIR: "it is a directory, not a serial port",
+    errno.ECONNREFUSED: "nothing listens there",
+}
+
+
+def reason_of(failure: BaseException) -> str:
+    """Return the cause in words: pyserial hides the system's error in its own, or behind it."""
+    for error in (failure, failure.__context__):
+        if isinstance(error, socket.gaierror):
+            return error.strerror or str(error)
+        code = error.args[0] if error and error.args else None
+        if isinstance(code, int):
+            return _REASONS.get(code) or os.strerror(code)
+    return str(failure)
+
+
+def unopened(port: str) -> serial.Serial:
+    """Return the port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
+    if not isinstance(port, str):
+        raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
+    try:
+        url = urlsplit(port)
+        needs_place = url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
+    except ValueError as mistake:
+        raise NoSuchPort(port, str(mistake)) from mistake
+    if needs_place:
+        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+    try:
+        if url.scheme == "rfc2217":
+            found = RFC2217Port()
+            found.port = port
+            return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
+        return serial.serial_for_url(port, do_not_open=True)
+    except ValueError as mistake:
+        right = "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {right}") from mistake
+
+
+def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
+    """Return the socket of a network port, None for other ports."""
+    return getattr(port, "_socket", None)
+
+
+def identity_of(port: serial.SerialBase, name: str) -> str:
+    """Return the identity of an open port, however its name is spelt (see port_identity)."""
+    if connection := connection_of(port):
+        return port_identity.of_connection(connection)
+    try:
+        return port_identity.of_device(os.ttyname(port.fileno()))
+    except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
+        return port_identity.of_name(name)
+
+
+def is_pseudo_terminal(path: str) -> bool:
+    """Return True for the device of a pty, which stays at 8 bits without parity whatever it is told."""
+    return path.startswith(("/dev/pts/", "/dev/ttys"))  # Linux, macOS
