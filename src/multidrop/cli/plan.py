@@ -39,19 +39,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _PredictedLine:
     line: PlantLine
     prediction: Prediction
     suggestions: Suggestions | None  # None: the plan fits
 
 
-def _plan(line: PlantLine) -> _Plan:
+def _plan(line: PlantLine) -> _PredictedLine:
     wanted = planned_on(line)
     prediction = predict(wanted, switching=line.switching)
-    return _Plan(line, prediction, None if prediction.fits else suggest(wanted, prediction, line.switching))
+    return _PredictedLine(
+        line, prediction, None if prediction.fits else suggest(wanted, prediction, line.switching)
+    )
 
 
-def _misfits(plan: _Plan) -> list[str]:
+def _misfits(plan: _PredictedLine) -> list[str]:
     """Return a sentence for each rate that is not kept."""
     return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
 
@@ -64,7 +66,7 @@ def _misfit(rate: Rate, every: float) -> str:
     return f"{rate.drive.name}: {shown} {verb} not fit: {reached}"
 
 
-def _warnings(plan: _Plan) -> list[str]:
+def _warnings(plan: _PredictedLine) -> list[str]:
     """Warn where all readings are polled, which is the default, and a cycle takes long."""
     whole = [
         polled.drive
@@ -86,7 +88,7 @@ def _warnings(plan: _Plan) -> list[str]:
 # ---- as text ----
 
 
-def _text(plan: _Plan) -> Iterator[str]:
+def _text(plan: _PredictedLine) -> Iterator[str]:
     prediction = plan.prediction
     yield from wrapped(
         f"{plan.line.name}: utilisation {prediction.utilisation:.1%}, "
@@ -105,7 +107,7 @@ def _text(plan: _Plan) -> Iterator[str]:
         yield from _indented(f"? {sentence}")
 
 
-def _switching(plan: _Plan) -> str:
+def _switching(plan: _PredictedLine) -> str:
     times = f"{plan.prediction.switches} times in a bus cycle the line changes its settings"
     if plan.line.switching:
         return f"{times}, {duration_text(plan.line.switching)} each"
@@ -131,7 +133,7 @@ def _indented(sentence: str) -> list[str]:
 # ---- as JSON ----
 
 
-def _as_json(plan: _Plan) -> dict[str, Any]:
+def _as_json(plan: _PredictedLine) -> dict[str, Any]:
     prediction = plan.prediction
     return {
         "fits": prediction.fits,
@@ -146,7 +148,7 @@ def _as_json(plan: _Plan) -> dict[str, Any]:
     }
 
 
-def _drive_as_json(plan: _Plan, name: str) -> list[dict[str, Any]]:
+def _drive_as_json(plan: _PredictedLine, name: str) -> list[dict[str, Any]]:
     return [
         {
             "registers": [register.name for register in rate.registers],

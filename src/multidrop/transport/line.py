@@ -112,7 +112,7 @@ class Line:
         """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
             fd = port.fileno()
-            return Port(fd, _BAUDRATE if is_pseudo_terminal(fd) else _ALL_SETTINGS)
+            return Port(fd, _BAUDRATE if is_pseudo_terminal(os.ttyname(fd)) else _ALL_SETTINGS)
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
         if self.port.startswith("socket://"):

@@ -73,6 +73,6 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
         return port_identity.of_name(name)
 
 
-def is_pseudo_terminal(fd: int) -> bool:
-    """Return True for a pty, which stays at 8 bits without parity whatever settings it is given."""
-    return os.ttyname(fd).startswith(("/dev/pts/", "/dev/ttys"))
+def is_pseudo_terminal(path: str) -> bool:
+    """Return True for the device of a pty, which stays at 8 bits without parity whatever it is told."""
+    return path.startswith(("/dev/pts/", "/dev/ttys"))  # Linux, macOS

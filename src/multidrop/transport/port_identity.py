@@ -22,11 +22,6 @@ def of_device(path: str) -> str:
     return next((str(link) for link in links if os.path.realpath(link) == device), device)
 
 
-def is_pseudo_terminal(path: str) -> bool:
-    """Tell a pseudo-terminal's device from a serial port's."""
-    return path.startswith(("/dev/pts/", "/dev/ttys"))  # Linux, macOS
-
-
 def of_connection(connection: socket.socket) -> str:
     """Return the address and port of the far end: 10.0.0.7:4001."""
     return of_address(connection.getpeername())

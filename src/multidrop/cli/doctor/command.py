@@ -33,7 +33,7 @@ from multidrop.errors import LineError
 from multidrop.planning.blocks import blocks
 from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
-from multidrop.transport.port_identity import is_pseudo_terminal
+from multidrop.transport.opening import is_pseudo_terminal
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back

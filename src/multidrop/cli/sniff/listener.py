@@ -17,8 +17,7 @@ from multidrop.core import REFUSALS, Stream, set_settings
 from multidrop.drive.timing import Settings
 from multidrop.errors import LineError
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.opening import reason_of, unopened
-from multidrop.transport.port_identity import is_pseudo_terminal
+from multidrop.transport.opening import is_pseudo_terminal, reason_of, unopened
 
 LOOK_S = 0.05  # the longest wait for bytes
 _MOST = 4096  # bytes of one read
