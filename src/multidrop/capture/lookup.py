@@ -23,12 +23,7 @@ _TABLES = {
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
 _MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # in a reply, whatever the request asks for
-_WRITES = {
-    0x05: (0x05,),
-    0x06: (0x06,),
-    0x0F: (0x05, 0x0F),
-    0x10: (0x06, 0x10),
-}  # by function
+_WRITES = {0x05: (0x05,), 0x06: (0x06,), 0x0F: (0x05, 0x0F), 0x10: (0x06, 0x10)}  # by function
 _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05, 0x06)}
 
 
@@ -78,15 +73,13 @@ class RegisterLookup:
 def _known(
     drive: Drive, request: Message, functions: tuple[int, ...], is_write: bool
 ) -> tuple[RegisterPlace, ...]:
-    found = []
-    for register in drive.registers.values():
-        if (register.table.write if is_write else register.table.read) not in functions:
-            continue
-        if not is_write and not register.readable:
-            continue
-        at = _offset(register, request)
-        if at is not None:
-            found.append(RegisterPlace(register.name, at, register.number_format, register))
+    found = [
+        RegisterPlace(register.name, at, register.number_format, register)
+        for register in drive.registers.values()
+        if (register.table.write if is_write else register.table.read) in functions
+        and (is_write or register.readable)
+        and (at := _offset(register, request)) is not None
+    ]
     return tuple(sorted(found, key=lambda place: place.at))
 
 

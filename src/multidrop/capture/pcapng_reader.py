@@ -12,12 +12,18 @@ from io import SEEK_END
 from pathlib import Path
 from typing import Self
 
-from multidrop.capture.pcapng_writer import APPLICATION
+from multidrop.capture.pcapng_writer import (
+    APPLICATION,
+    IF_NAME,
+    IF_RESOLUTION,
+    INTERFACE,
+    SECTION,
+    SHB_APPLICATION,
+)
 from multidrop.core import Stream, Unpacked, Unpacker
 
-_SECTION, _INTERFACE, _SIMPLE_PACKET, _OLD_PACKET = 0x0A0D0D0A, 1, 3, 2
-_SHB_APPLICATION = 4
-_IF_NAME, _IF_RESOLUTION, _IF_OFFSET = 2, 9, 14
+_OLD_PACKET, _SIMPLE_PACKET = 2, 3
+_IF_OFFSET = 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
 _MOST_OFFSET = 1 << 33  # s; nanoseconds since 1970 are kept in 64 bits
 _PCAP = {  # first four bytes: is it big-endian, ticks in a second
@@ -82,7 +88,7 @@ class Capture:
             self._unpacker = Unpacker(_PCAP_HEADER, is_pcapng=False, is_big_endian=is_big_endian)
             link = self._read("I", 20)
             self._add(link & 0xFFFF, self.path.stem, ticks_per_s, 0)
-        elif magic == struct.pack("<I", _SECTION):
+        elif magic == struct.pack("<I", SECTION):
             if self._size < _PCAPNG_HEADER:
                 raise CaptureError(f"{self.path} is not a capture: it ends within its header")
             self._order = self._order_at(0)
@@ -130,19 +136,19 @@ class Capture:
         """Read a block that is no enhanced packet; return False where the file is truncated."""
         at = unpacker.at
         kind = self._read("I", at)
-        if kind == _SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
+        if kind == SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
             raise CaptureError(f"{self.path}: byte {at}: sections of both byte orders cannot be read")
         size = self._read("I", at + 4)
         if size < 12 or size % 4:
             raise self._damaged(at)
         if at + size > self._size:
             return False
-        body = self._piece(at + 8, min(size - 12, _PIECE)) if kind in (_SECTION, _INTERFACE) else b""
-        if kind == _SECTION:
+        body = self._piece(at + 8, min(size - 12, _PIECE)) if kind in (SECTION, INTERFACE) else b""
+        if kind == SECTION:
             if at and self.lines:
                 raise CaptureError(f"{self.path}: byte {at}: only the first section can be read")
-            self._is_ours = dict(self._options(body[16:])).get(_SHB_APPLICATION, b"").startswith(APPLICATION)
-        elif kind == _INTERFACE:
+            self._is_ours = dict(self._options(body[16:])).get(SHB_APPLICATION, b"").startswith(APPLICATION)
+        elif kind == INTERFACE:
             self._read_interface(body, at)
         elif kind in (_SIMPLE_PACKET, _OLD_PACKET):
             raise CaptureError(
@@ -156,7 +162,7 @@ class Capture:
         if len(body) < 8:
             raise self._damaged(at)
         options = dict(self._options(body[8:]))
-        resolution = (options.get(_IF_RESOLUTION) or b"\x06")[0]
+        resolution = (options.get(IF_RESOLUTION) or b"\x06")[0]
         power = resolution & ~_BINARY
         if power > (_MOST_BITS if resolution & _BINARY else _MOST_DIGITS):
             raise CaptureError(f"{self.path}: byte {at}: its clock is finer than a nanosecond")
@@ -165,7 +171,7 @@ class Capture:
         seconds: int = struct.unpack(f"{self._order}q", offset)[0] if len(offset) == 8 else 0
         if abs(seconds) > _MOST_OFFSET:
             raise CaptureError(f"{self.path}: byte {at}: its clock is {seconds} s off")
-        name = options.get(_IF_NAME, b"").rstrip(b"\0").decode(errors="replace")
+        name = options.get(IF_NAME, b"").rstrip(b"\0").decode(errors="replace")
         link: int = struct.unpack_from(f"{self._order}H", body)[0]
         self._add(link, name or f"{self.path.stem}-{len(self.lines)}", ticks_per_s, seconds * 10**9)
 

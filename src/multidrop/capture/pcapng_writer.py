@@ -15,10 +15,10 @@ from multidrop.recording.format import RecordingError, writing
 EXPORTED_PDU = 252
 APPLICATION = b"multidrop"  # begins the application's name in captures of ours
 
-_SECTION, _INTERFACE = 0x0A0D0D0A, 1
+SECTION, INTERFACE = 0x0A0D0D0A, 1
 _END, _COMMENT = 0, 1
-_IF_NAME, _IF_RESOLUTION = 2, 9
-_SHB_APPLICATION = 4
+IF_NAME, IF_RESOLUTION = 2, 9
+SHB_APPLICATION = 4
 _EPB_FLAGS = 2
 _NANOSECONDS = b"\x09"
 
@@ -38,12 +38,12 @@ class CaptureWriter:
         self._lines: dict[str, int] = {}
         with writing(self.path):
             self._file = AppendFile(self.path)
-        options = [(_SHB_APPLICATION, APPLICATION + b" " + version("multidrop").encode())]
+        options = [(SHB_APPLICATION, APPLICATION + b" " + version("multidrop").encode())]
         if comment:
             options.insert(0, (_COMMENT, comment.encode()))
         head = struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)
         try:
-            self.append(_block(_SECTION, head + _options(*options)))
+            self.append(_block(SECTION, head + _options(*options)))
             for line in lines:
                 self._declare(line)
         except RecordingError:
@@ -66,8 +66,8 @@ class CaptureWriter:
 
     def _declare(self, line: str) -> None:
         self._lines[line] = len(self._lines)
-        options = _options((_IF_NAME, line.encode()), (_IF_RESOLUTION, _NANOSECONDS))
-        self.append(_block(_INTERFACE, struct.pack("<HHI", EXPORTED_PDU, 0, 0) + options))
+        options = _options((IF_NAME, line.encode()), (IF_RESOLUTION, _NANOSECONDS))
+        self.append(_block(INTERFACE, struct.pack("<HHI", EXPORTED_PDU, 0, 0) + options))
 
     def close(self) -> None:
         self._file.close()

@@ -12,7 +12,7 @@ from multidrop.core import Tap, utc_minus_monotonic_ns
 
 
 class Sink(Protocol):
-    """Takes the packets of tapped lines, and their anomalies."""
+    """Take the packets of tapped lines, and their anomalies."""
 
     def append(self, packets: bytes) -> None: ...
 

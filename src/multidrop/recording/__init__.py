@@ -6,9 +6,8 @@
 | `.csv`     | text; metadata in `NAME.csv.json` | every whole line is there  |
 | `.parquet` | Parquet, needs pyarrow            | nothing can be read        |
 
-A crash means that of the process: once `write` has returned, the system has the whole batch and puts
-it on the disk within seconds; only a power cut in between loses it. A file without its head, which is
-written first, is no recording.
+A crash is one of the process: once `write` has returned, the system has the whole batch, and only a
+power cut in the next seconds loses it. A file without its head, which is written first, is no recording.
 
 All three have the same columns, and one row for every sample or miss:
 

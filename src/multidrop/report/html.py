@@ -190,12 +190,7 @@ def _faults(recording: Recording) -> Iterator[str]:
     yield "<h2>Faults</h2>"
     polled = [series for series in recording.series if series.register == FAULTS]
     rows = [
-        [
-            series.drive,
-            span.what,
-            _utc(span.begin),
-            _duration((span.end - span.begin) / 1e9),
-        ]
+        [series.drive, span.what, _utc(span.begin), _duration((span.end - span.begin) / 1e9)]
         for series in polled
         for span in series.faults()
     ]

@@ -24,7 +24,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """A span of time, in ns UTC, and what it was a span of."""
+    """A span of time in ns UTC, such as that of a fault."""
 
     begin: int
     end: int
@@ -59,7 +59,6 @@ class Series:
 
     @cached_property
     def names(self) -> dict[int, str]:
-        """The names of its counts, if they have some."""
         names: Mapping[str, int] = self.metadata.get("values") or {}
         return {number: name for name, number in names.items()}
 
@@ -78,11 +77,8 @@ class Series:
         return str(self.metadata.get("unit") or "")
 
     def reasons(self) -> Counter[str]:
-        """Count misses by reason."""
         numbers, counts = np.unique(self.status[self.missed], return_counts=True)
-        return Counter(
-            {self.statuses[number]: int(count) for number, count in zip(numbers, counts, strict=True)}
-        )
+        return Counter({self.statuses[number]: int(n) for number, n in zip(numbers, counts, strict=True)})
 
     def times_of(self, reason: str) -> Array:
         """Return the times of the misses for this reason."""
@@ -156,7 +152,6 @@ class Recording:
         return (self.end - self.begin) / 1e9
 
     def about(self, drive: str) -> Mapping[str, Any]:
-        """Return the metadata of a drive."""
         found: Mapping[str, Any] = self.metadata.get("drives", {}).get(drive, {})
         return found
 

@@ -33,7 +33,7 @@ LATE = 8  # addresses back: a reply may be so many time-outs late and still be m
 
 
 class CarryOut(Protocol):
-    """Carries out exchanges on a line. Raises LineError."""
+    """Carry out exchanges on a line. Raises LineError."""
 
     def __call__(self, exchange: Exchange, /, *, not_before_ns: int = 0) -> Completion: ...
 

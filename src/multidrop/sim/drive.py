@@ -209,22 +209,21 @@ class SimulatedDrive:
     def read(self, function: int, start: int, count: int) -> list[int]:
         """Return the counts of neighbouring cells. Raises Refusal."""
         self.check_count(function, count)
-        return [self._read_one(self.memory.readable(function, start + at)) for at in range(count)]
-
-    def _read_one(self, cell: MemoryCell | None) -> int:
-        if cell is None:
-            raise Refusal(Reason.READ_ADDRESS)
-        self.refresh(cell)
-        return cell.raw
+        raws = []
+        for address in range(start, start + count):
+            cell = self.memory.readable(function, address)
+            if cell is None:
+                raise Refusal(Reason.READ_ADDRESS)
+            self.refresh(cell)
+            raws.append(cell.raw)
+        return raws
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
         """Write neighbouring cells: all, or none when one is refused. Raises Refusal."""
-        cells: list[MemoryCell] = []
-        for at in range(len(raws)):
-            cell = self.memory.writable(function, start + at)
-            if cell is None:
-                raise Refusal(Reason.WRITE_ADDRESS)
-            cells.append(cell)
+        found = [self.memory.writable(function, start + at) for at in range(len(raws))]
+        cells = [cell for cell in found if cell is not None]
+        if len(cells) < len(raws):
+            raise Refusal(Reason.WRITE_ADDRESS)
         self._accept_long(dict(zip(cells, raws, strict=True)))
         stored = [self.accept(cell, raw) for cell, raw in zip(cells, raws, strict=True)]
         for at, (cell, raw) in enumerate(zip(cells, stored, strict=True)):

@@ -103,7 +103,7 @@ class MotorDrive(SimulatedDrive):
 
     def changed(self, cell: MemoryCell) -> None:
         self.set_up()
-        command = self.obeys.get(_key(cell))
+        command = self.obeys.get((cell.table.read or cell.table.write or 0, cell.address))
         if command is not None:
             command(self, cell.raw)
 
@@ -119,7 +119,3 @@ class MotorDrive(SimulatedDrive):
             if register.unit == "%":
                 value *= 100 / RATED[register.name](self.motor.rating)
             self.memory.set(register, value)
-
-
-def _key(cell: MemoryCell) -> tuple[int, int]:
-    return cell.table.read or cell.table.write or 0, cell.address
