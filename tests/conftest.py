@@ -1,4 +1,4 @@
-"""What holds for all tests: none of them writes into the ledger of the user who runs them."""
+"""Rules for all tests: none of them writes into the ledger of the user who runs them."""
 
 import os
 import signal

@@ -41,7 +41,7 @@ def python(mark: str) -> str:
 
 
 def run(block: str, directory: Path) -> str:
-    """What a fresh interpreter prints when it runs this."""
+    """Return what a fresh interpreter prints when it runs this."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", block],
         cwd=directory,
