@@ -1,4 +1,4 @@
-"""What holds for all tests: none of them writes into the ledger of the user who runs them."""
+"""Rules for all tests: none of them writes into the ledger of the user who runs them."""
 
 import os
 import signal
@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from itertools import count, islice
 from pathlib import Path
+from subprocess import DEVNULL, Popen
 
 import pytest
 from commands import Run
@@ -15,6 +16,7 @@ from multidrop.cli import main
 from multidrop.core import Peer
 from multidrop.transport import exchange as exchanges
 
+TESTS = Path(__file__).parent
 PATIENCE = 60.0  # s
 
 # A busy machine is slow, and nothing is wrong with it.
@@ -26,8 +28,22 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Twice as many as there are processors, because half of the tests wait for a line; 2 to 8."""
-    return min(2 * len(os.sched_getaffinity(0)), 8)
+    """Three times as many as there are processors, because half of the tests wait for a line; 3 to 12."""
+    return min(3 * len(os.sched_getaffinity(0)), 12)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the tests before the workers begin: each of them would do it at the same time."""
+    is_worker = hasattr(config, "workerinput")
+    if is_worker or not config.option.numprocesses or sys.dont_write_bytecode:
+        return
+    rooms = [room for room in sorted(TESTS.iterdir()) if [*room.glob("test_*.py")]]
+    if any((room / "__pycache__").exists() for room in rooms):
+        return
+    collect = [sys.executable, "-m", "pytest", "-qq", "-n", "0", "--collect-only"]
+    halves = [Popen([*collect, *part], stdout=DEVNULL, stderr=DEVNULL) for part in (rooms[::2], rooms[1::2])]
+    for half in halves:
+        half.wait()
 
 
 @pytest.hookimpl(trylast=True)  # when what is not wanted has been left out

@@ -42,7 +42,7 @@ TEXT = [it for it in PRINTED if it.request is not None and it.framing is not Fra
 
 
 def spans(path: Path) -> dict[str, list[FrameSpan]]:
-    """What a capture holds, by line."""
+    """Return the frames of a capture, by line."""
     found: dict[str, list[FrameSpan]] = {}
     splitters: dict[str, Splitter] = {}
     with Capture(path) as capture:
@@ -145,7 +145,7 @@ def test_junk_is_read_as_junk(tmp_path: Path) -> None:
 
 
 def hexdump(packets: Iterable[bytes]) -> str:
-    """What text2pcap reads: one packet a line, each a millisecond after the other."""
+    """Return what text2pcap reads: one packet a line, each a millisecond after the other."""
     return "".join(
         f"2026-11-21T09:30:00.{number:03}Z 0000 {packet.hex(' ')}\n" for number, packet in enumerate(packets)
     )
@@ -502,7 +502,7 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 def test_more_requests_than_are_remembered_are_decoded_all_the_same(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
-    """Of 16384 places three quarters are taken; long before, two requests come to want the same."""
+    """Three quarters of 16384 places are taken; long before, two requests come to want the same."""
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(it.address, 3, it.start, 1, data) if data else None for it in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))

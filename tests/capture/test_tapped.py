@@ -83,7 +83,7 @@ def echoing_wires() -> list[Wire]:
 def captured(
     capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
 ) -> tuple[list[Row], list[Row]]:
-    """What a poll has recorded when it has so many rows of each status, and what its capture says."""
+    """Return a poll's rows when it has so many rows of each status, and what its capture says."""
     with served(make) as (path,):
         known = plant(line(path, *drives, name="hall-1"))
         poller = Poller(known)
@@ -104,7 +104,7 @@ def captured(
 
 
 def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """What is in rows but for the clock that captures do not have, by the time of the request."""
+    """Return rows without the clock that captures do not have, by the time of the request."""
     found: dict[int, list[tuple[object, ...]]] = {}
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
@@ -365,7 +365,7 @@ class Watched:
         return self.port
 
     def told(self, reply: bytes) -> list[str]:
-        """Of one exchange, after any answer that might still come late."""
+        """Return the anomalies of one exchange, after any answer that might still come late."""
         self.line.now += 1000 * MS
         self.line.begin(self._exchange)
         self.line.wait_until_write()

@@ -232,7 +232,7 @@ def test_verbs_are_carried_out(run: Run, port: str, toy: SimulatedDrive) -> None
 
 
 def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> None:
-    """What another command wrote is not known to this one."""
+    """A command does not know what another one wrote."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
         words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
         sentence = "multidrop: innovert-ibd@1 cannot say its setpoint: add --frequency HZ\n"
@@ -343,7 +343,7 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
 
 @pytest.fixture
 def che() -> Iterator[tuple[Heard, list[object]]]:
-    """What a CHE hears, and the words that name it."""
+    """Return the requests of a CHE, and the words that name it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2

@@ -269,7 +269,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
 
 
 def test_a_demo_goes_on_without_a_motor_that_does_not_answer() -> None:
-    """As on a machine that has much else to do."""
+    """A machine may have much else to do."""
     toy = Toy(1)
     with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
         _start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))

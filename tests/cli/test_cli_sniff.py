@@ -148,7 +148,7 @@ class ResponderLine:
                     self.told += more
 
     def close(self) -> bytes:
-        """What it was told in the end."""
+        """Close the connection, and return all that came on it."""
         self._thread.join(timeout=PATIENCE)
         self._server.close()
         return self.told
@@ -257,7 +257,7 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """What `decode` says of a capture of these, one in every ms, without its times of day."""
+    """Return what `decode` says of a capture of these, one in every ms, without its times of day."""
     with CaptureWriter(path) as it:
         for number, (raw, side) in enumerate(frames):
             it.write(raw, side, number * 1_000_000, "hall-1")

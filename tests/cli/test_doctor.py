@@ -47,14 +47,14 @@ REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
 def heard(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
-    """What became of the request that nobody should answer."""
+    """Return the result of the request that nobody should answer."""
     reply = Message(0xF7, 3, exception=exception)
     return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)
 
 
 @pytest.fixture
 def sysfs(tmp_path: Path) -> Path:
-    """As Linux shows an FTDI adapter: links from classes to the tree of devices."""
+    """An FTDI adapter as Linux shows it: links from classes to the tree of devices."""
     usb = tmp_path / "devices/pci0000:00/usb1/1-2"
     port = usb / "1-2:1.0/ttyUSB0"
     (port / "tty/ttyUSB0").mkdir(parents=True)
@@ -342,7 +342,7 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 def test_an_exception_to_the_look_for_an_echo_is_no_foreign_traffic(run: Run, responder: Any) -> None:
-    """As a server does that answers for every address."""
+    """A server may answer for every address."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = " ".join(run("doctor", end.path)[1].split())
     assert "answers with exception 04" in told

@@ -93,7 +93,7 @@ MASTERS = (
 
 
 def mastered(hear: Callable[[bytes], bytes] = bytes) -> tuple[list[Said], list[dict[str, Any]]]:
-    """What the masters have said and been answered, and what `sniff` tells of it."""
+    """The masters' requests with their replies, and the report of `sniff` on them."""
     chance = random.Random(1)
     said: list[Said] = []
     simulator = Simulator([Wire([EncodedDrive(drive) for drive in drives()])])
@@ -151,7 +151,7 @@ class Damage:
         return bytes(heard)
 
     def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
-        """Of each exchange whether it is whole, and its frames."""
+        """Return each exchange's frames, and True where it is whole."""
         heard = Stream()
         heard.put(bytes(self.said), 0)
         heard.end(True)

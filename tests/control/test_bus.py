@@ -67,7 +67,7 @@ def path(sim: Simulator) -> str:
 
 
 def sent(drive: SimulatedDrive) -> dict[int, int]:
-    """How many requests of each function the drive has heard."""
+    """Count the requests of each function that reached the drive."""
     return dict(drive.counters.functions)
 
 

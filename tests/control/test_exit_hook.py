@@ -156,7 +156,7 @@ with ExitStack() as stack:
 
 @contextmanager
 def lines(count: int) -> Iterator[tuple[list[list[Heard]], list[str]]]:
-    """What the four drives of each line hear, and the ports."""
+    """The requests of the four drives of each line, and the ports."""
     heard: list[list[Heard]] = []
     for _ in range(count):
         sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3, 4)]

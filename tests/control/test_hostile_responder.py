@@ -36,7 +36,7 @@ REGISTERS = 5  # of each drive
 
 
 class Hostile:
-    """What becomes of replies: one in three is mistreated, in one way."""
+    """The fate of replies: one in three is mistreated, in one way."""
 
     def __init__(self, seed: int) -> None:
         self.struck: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""What a bus does around a write: rules, identity, outcomes, EEPROM, stops; against simulated drives."""
+"""A bus around a write: rules, identity, outcomes, EEPROM, stops; against simulated drives."""
 
 from __future__ import annotations
 
@@ -387,7 +387,7 @@ def test_a_stop_whose_reply_is_always_lost_is_unconfirmed(
 def test_a_drive_that_is_heard_no_more_after_its_command(
     monkeypatch: pytest.MonkeyPatch, model: str, verb: str
 ) -> None:
-    """What is confirmed and cannot be seen is unconfirmed: NoReply would say that nothing was sent."""
+    """An effect that cannot be seen is unconfirmed: NoReply would say that nothing was sent."""
     hall, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     if verb == "stop":
@@ -895,7 +895,7 @@ def test_the_watchdog_is_read_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_coils_have_no_value_that_is_written_twice() -> None:
-    """What is a pulse is not harmless: only what stops, or takes a command back, may be repeated."""
+    """A pulse is not harmless: only what stops, or takes a command back, may be repeated."""
     for family in MODELS.values():
         for register in family.registers.values():
             if register.harmless is None:

@@ -52,7 +52,7 @@ def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]
 
 
 def requests(pair: SharedPair) -> list[Message]:
-    """What left our port: whole requests, one after another."""
+    """Return what left our port: whole requests, one after another."""
     found, sent = [], pair.sent
     while sent:
         used, message = parse_request(Framing.RTU, sent)
@@ -63,7 +63,7 @@ def requests(pair: SharedPair) -> list[Message]:
 
 
 def attempt(act: Callable[[], object]) -> BusError | None:
-    """How it failed."""
+    """Return the failure, or None."""
     try:
         act()
     except BusError as failure:
@@ -72,7 +72,7 @@ def attempt(act: Callable[[], object]) -> BusError | None:
 
 
 def set_frequency(drive: Any, hz: float) -> None:
-    """As often as it takes on a machine that has much else to do."""
+    """Set it as often as it takes on a machine that has much else to do."""
     until(lambda: attempt(lambda: drive.set_frequency(hz)) is None)
 
 

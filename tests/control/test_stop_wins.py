@@ -299,7 +299,7 @@ class Stops(RuleBasedStateMachine):
         return thread
 
     def _heard(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
-        """Where in the log there are such frames of this episode, or from `begun` on."""
+        """Return the places in the log of such frames of this episode, or from `begun` on."""
         begun = self.begun if begun is None else begun
         return [
             at

@@ -71,7 +71,7 @@ class Own(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """What the drive says of itself."""
+        """Return the state that the drive reports."""
         speed = yield from read(self.speed)
         return State(Condition.RUNNING if speed else Condition.STOPPED)
 
@@ -81,7 +81,7 @@ def writes(hall: SimulatedBus, begun: int = 0) -> list[Message]:
 
 
 def first(hall: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
-    """How many frames went before the first write of this kind."""
+    """Count the frames before the first write of this kind."""
     wanted = (at for at, (it, _) in enumerate(hall.frames[begun:]) if is_write(it) and met(it))
     return next(wanted, None)
 
@@ -348,7 +348,7 @@ def test_one_odd_answer_is_no_proof_of_another_family(monkeypatch: pytest.Monkey
 
 
 def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it says may be the answer to what it was asked before."""
+    """Its reply may be the answer to an earlier request."""
     hall, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     counters = hall.bus.peer(drive).c.counters
@@ -616,7 +616,7 @@ def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: 
 def test_a_start_that_was_held_up_in_its_looks_is_not_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
 ) -> None:
-    """As by Ctrl-Z, at each of them."""
+    """The process is stopped by a signal, as Ctrl-Z does, at each of them."""
     for frames in range(1, 100):
         hall, _, meanwhile, begun, failure = started_while(
             monkeypatch, tmp_path, model, frames, lambda hall, drive: hall.sleep(5)

@@ -72,7 +72,7 @@ def test_beyond_the_data_there_is_no_number(wire: NumberFormat) -> None:
 
 
 def completed(request: Message, received: bytes) -> Any:
-    """What becomes of an exchange that begins at 1000 ms and whose reply begins 30 ms later."""
+    """The row of an exchange that begins at 1000 ms and whose reply begins 30 ms later."""
     line = LineDriver()
     line.begin(
         Exchange(

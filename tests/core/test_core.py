@@ -85,7 +85,7 @@ def wait_until(look: Callable[[], bool]) -> None:
 
 
 class Rows:
-    """What comes of a port's exchanges, in the order in which they were carried out."""
+    """Return the results of a port's exchanges, in the order in which they were carried out."""
 
     def __init__(self, port: Port) -> None:
         self.row_queue = RowQueue()
@@ -193,7 +193,7 @@ def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
 
 
 def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) -> None:
-    """Of each exchange the last one that is due is sent, how late it may be."""
+    """The last one of each exchange that is due is sent, how late it may be."""
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
@@ -744,7 +744,7 @@ def test_ports_come_and_go(drive: Drive) -> None:
 
 @pytest.fixture
 def descriptors() -> Iterator[int]:
-    """As many as the system lets a process have."""
+    """Open as many as the system lets a process have."""
     least, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     yield most

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.filterwarnings(
 
 @contextmanager
 def child(act: Callable[[], object]) -> Iterator[Any]:
-    """What came of this in a child, which lives until the block is left."""
+    """Yield the result of this in a child, which lives until the block is left."""
     ours, theirs = multiprocessing.Pipe()
 
     def run() -> None:
@@ -112,7 +112,7 @@ def port() -> Iterator[str]:
 
 @pytest.fixture(params=["pty", "socket", "rfc2217"])
 def any_port(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Of each kind, with a simulated drive behind it."""
+    """A port of each kind, with a simulated drive behind it."""
     with Simulator([wire("pty" if request.param == "pty" else "socket://127.0.0.1:0")]) as simulator:
         if request.param != "rfc2217":
             yield simulator.wires[0].path

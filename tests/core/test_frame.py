@@ -55,7 +55,7 @@ def exchange(framing: Framing, request: Message) -> Exchange:
 
 
 def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 4096) -> Completion:
-    """What becomes of a request when these bytes are all that comes back, of an adapter without echo."""
+    """Return the result of a request when these bytes are all that comes back, of an adapter without echo."""
     line = LineDriver()
     line.echo = lib.MD_NO_ECHO
     line.begin(exchange(framing, request))

@@ -1,4 +1,4 @@
-"""What a line learns of its drives: when to look for a reply, how long to wait, what may come late."""
+"""A line learns of its drives: when to look for a reply, how long to wait, what may come late."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_drive_that_becomes_quicker_is_followed(line: LineDriver, drive: Peer)
 
 
 def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """How long after the request's last bit a silent drive is given up."""
+    """Return the time from the request's last bit until a silent drive is given up."""
     left = ask(line, drive, request)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -480,7 +480,7 @@ def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive:
 
 
 def test_what_the_reply_s_own_data_look_like_is_no_late_answer(line: LineDriver, drive: Peer) -> None:
-    """Whether it comes at once or byte by byte: the bar stays, and the reply is read."""
+    """It comes at once or byte by byte: the bar stays, and the reply is read."""
     time_out(line, drive)
     until = drive.late_until_ns
     inside = reply(1111) + b"\x00"

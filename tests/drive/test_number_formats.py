@@ -63,7 +63,7 @@ formats = pytest.mark.parametrize("register", FORMATS, ids=lambda it: it.name)
 
 
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
-    """What it can hold."""
+    """Return the numbers that it can hold."""
     if register.is_float:
         return st.floats(width=32, allow_nan=False, allow_infinity=False)
     low, high = {"H": (0, 0xFFFF), "h": (-0x8000, 0x7FFF), "I": (0, 0xFFFFFFFF), "i": (-(2**31), 2**31 - 1)}[

@@ -22,7 +22,7 @@ class Word(IntEnum):
 
 
 class Fan(Drive):
-    """As README declares it."""
+    """The drive that README declares."""
 
     speed = reading(0x10, "rpm")
     frequency = setting(0x20, "Hz", step=0.1, span=(0, 60))

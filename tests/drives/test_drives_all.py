@@ -235,7 +235,7 @@ def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any],
 
 
 def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
-    """What may be written."""
+    """Values that may be written."""
     if register.values is not None:
         members = [
             it for it in register.values if not any(it & mask == mask for mask in register.never_together)

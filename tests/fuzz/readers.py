@@ -104,7 +104,7 @@ def read_capture(path: Path) -> None:
 
 
 def _pair(capture: Capture) -> None:
-    """What is told is what the spans hold, and every byte of junk is counted."""
+    """The report is what the spans hold, and every byte of junk is counted."""
     pairings: list[Pairing] = []
     splitters: list[Splitter] = []
     junk = exchanges = 0

@@ -1,4 +1,4 @@
-"""What the fuzzers begin with: the documents' own frames, captures of them, and files that are right.
+"""Seeds of the fuzzers: the documents' own frames, captures of them, and files that are right.
 
 python tests/fuzz/seeds.py HARNESS DIRECTORY
 """

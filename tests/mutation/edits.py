@@ -142,7 +142,7 @@ def _c_conditions(bare: str) -> Iterator[Edit]:
 
 
 def _closing(bare: str, at: int) -> int:
-    """Where the parenthesis ends that was opened before `at`."""
+    """Return the end of the parenthesis that was opened before `at`."""
     depth = 1
     while depth:
         depth += {"(": 1, ")": -1}.get(bare[at], 0)
@@ -151,7 +151,7 @@ def _closing(bare: str, at: int) -> int:
 
 
 def _beginning(bare: str, at: int) -> int:
-    """Where the condition begins that ends at `at`."""
+    """Return the beginning of the condition that ends at `at`."""
     depth = 0
     while True:
         before = bare[:at]

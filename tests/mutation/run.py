@@ -31,7 +31,7 @@ def explained() -> dict[Name, str]:
 
 
 def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
-    """How each of the file's mutants ends; None: it survives."""
+    """Yield each of the file's mutants with its end; None: it survives."""
     source = (ROOT / path).read_text("utf-8")
     found = mutants(path, source)
     trees: SimpleQueue[Path] = SimpleQueue()

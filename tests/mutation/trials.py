@@ -92,7 +92,7 @@ def _end(status: int) -> str | None:
 
 
 def _status(tree: Path, *command: str) -> int:
-    """Of a command that has only so much time to compute."""
+    """Run a command that has only so much time to compute."""
     return subprocess.run(
         command,
         cwd=tree,

@@ -67,7 +67,7 @@ def test_a_shorter_silence_is_reckoned_with() -> None:
 
 
 def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
-    """Of three gaps two are the IBD's, whatever t3.5 is at the other drives' baud rate."""
+    """Two of three gaps are the IBD's, whatever t3.5 is at the other drives' baud rate."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(it, None, "output_current") for it in (che, other, ibd)]
     found = predict([it for each in exchanges for it in each])
@@ -185,7 +185,7 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
 def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | None]]) -> None:
-    """What is reached, each exchange with its own characters and delay alone, fits into a second."""
+    """All that is reached, each exchange with its own characters and delay alone, fits into a second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
         drive = MODELS[model](address)

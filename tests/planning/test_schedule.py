@@ -228,7 +228,7 @@ def test_all_silent_drives_together_cost_their_share() -> None:
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
 def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int | None) -> None:
-    """Of 31, once it is known: the others keep 97 % of the rate that they have without them."""
+    """Once it is known, the others of 31 keep 97 % of the rate that they have without them."""
     answered: list[int] = []
     for count in (31, 31 - dead):
         made = schedule(*(job(drive, period_ms, duration_ms=12) for drive in range(count)))
@@ -451,7 +451,7 @@ KINDS = st.lists(
 def test_no_drift_no_burst_whatever_stalls(
     kinds: list[tuple[int, int | None, int, int]], stalls: list[int]
 ) -> None:
-    """Of the line or of Python, for longer than is planned ahead."""
+    """The line or Python stalls for longer than is planned ahead."""
     made = schedule(*(job(*kind) for kind in kinds))
     busy_until = now = 0
     slots: dict[Job, list[int]] = {it: [] for it in made.jobs}
@@ -589,7 +589,7 @@ class Operation(RuleBasedStateMachine):
                 assert slots == len(self.slots[it]) + it.skipped + self.passed[it]
 
     def teardown(self) -> None:
-        """When all is well again, everything is asked, in its turn or at its rate."""
+        """Everything is well again, and is asked, in its turn or at its rate."""
         for drive in range(4):
             self.wake(drive)
         load = sum(it.duration_ns / it.period_ns for it in self.made.jobs if it.period_ns)

@@ -76,7 +76,7 @@ def test_pandas_takes_it() -> None:
 
 
 def test_pandas_by_pyarrow_has_the_same_times() -> None:
-    """As before pandas 3.0."""
+    """This is the way before pandas 3.0."""
     pytest.importorskip("pandas", reason="needs pandas")
     frame = pa.table(example()).to_pandas()
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"

@@ -31,7 +31,7 @@ NAMES = (Wide.near.name, Wide.far.name)
 
 
 def asked_together(rows: list[Row]) -> set[bool]:
-    """Of all exchanges, whether both registers were read by one."""
+    """Return, for each exchange, True where it read both registers."""
     assert {row.status for row in rows} == {"ok"}
     return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
 
@@ -85,7 +85,7 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
 
 
 def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where delays are those of the host alone, and never the same."""
+    """Delays may be those of the host alone, and never the same."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
     choose, chosen = JobMaker.plan, []

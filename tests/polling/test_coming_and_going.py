@@ -35,7 +35,7 @@ def port() -> Iterator[str]:
 
 
 class Seen:
-    """What a poller's rows said so far, by drive."""
+    """A poller's rows so far, by drive."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller

@@ -99,7 +99,7 @@ class Polling:
         until(lambda: self.statuses(drive)[status] >= before + count)
 
     def check_summary(self) -> None:
-        """What the summary counts is what the rows say, line by line and drive by drive."""
+        """The summary counts what the rows say, line by line and drive by drive."""
         summary = self.poller.summary()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert summary["samples"] == sum(1 for row in self.rows if row.value is not None)
@@ -548,7 +548,7 @@ def test_what_is_not_answered_by_the_end_has_a_row(
 
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
 def test_a_slot_that_is_not_over_at_the_end_was_not_missed(far_end: tuple[int, str], leaves: str) -> None:
-    """As at the end of every healthy run: the next value is due already, or about to be."""
+    """Every healthy run ends so: the next value is due already, or about to be."""
     master, path = far_end
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)

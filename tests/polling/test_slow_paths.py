@@ -132,7 +132,7 @@ def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
 
 
 class PathLine:
-    """What a bus sees of a line behind such a path; time passes only while it waits."""
+    """A bus's view of a line behind such a path; time passes only while it waits."""
 
     def __init__(self, wire: PathWire) -> None:
         self.port = self.identity = "world"

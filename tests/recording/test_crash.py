@@ -97,7 +97,7 @@ def nursery(counting: Counting, tmp_path: Path) -> Iterator[Nursery]:
 
 
 def told(directory: Path, life: str) -> list[str]:
-    """What it said; a line that was torn was not said."""
+    """Return what it said; a line that is cut off was not said."""
     path = directory / f"{life}.told"
     return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
 

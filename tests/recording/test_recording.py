@@ -250,7 +250,7 @@ def test_any_batches_converted(
 
 
 def as_text(name: str) -> str:
-    """As it stands in a cell: no spreadsheet takes it for a formula."""
+    """A cell's text: no spreadsheet takes it for a formula."""
     return f"'{name}" if name.lstrip("'")[:1] in tuple("=+-@\t\r\n") else name
 
 

@@ -457,7 +457,7 @@ def suppress_mistake_that_names(path: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("rows", [-77, -(1 << 59), 1 << 59])
 def test_a_batch_of_impossibly_many_rows(tmp_path: Path, rows: int) -> None:
-    """What is reckoned with their number, in bytes, would wrap around."""
+    """A size computed from their number, in bytes, would wrap around."""
     path = tmp_path / "run.arrows"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(77))

@@ -361,7 +361,7 @@ def states(path: Path, rows: list[Row]) -> Recording:
 
 
 def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
-    """What stands in each lane, by its label: texts with their bars, in s since the first row."""
+    """Return the content of each lane, by its label: texts with their bars, in s since the first row."""
     lanes = {text.get_text(): [] for text in axes.get_yticklabels()}
     names = list(lanes)
     bars: dict[int, list[tuple[float, float]]] = {}

@@ -24,7 +24,7 @@ ON, OFF = b"\xff\x00", b"\x00\x00"
 
 
 class Own(Drive):
-    """As a user declares it."""
+    """A drive that a user declares."""
 
     most_registers = {HOLDING: 10, INPUT: 4, COIL: 16, DISCRETE: 16}
     readable_gaps = {HOLDING: range(0x10, 0x20)}

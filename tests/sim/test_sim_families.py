@@ -36,7 +36,7 @@ class Bench:
         self.now = 100.0
 
     def hear(self, frame: bytes) -> bytes:
-        """What comes back; nothing is silence."""
+        """Return the reply; nothing is silence."""
         self.wire.receive(frame, self.now)
         self.now += 0.1
         return self.wire.advance(self.now)
@@ -891,7 +891,7 @@ def test_every_declared_register_can_be_read_or_written_as_declared(family: type
 
 @pytest.mark.parametrize("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
 def test_every_family_can_be_encoded(family: type[Drive]) -> None:
-    """What is read of a register is what `encoded` says, or its document, through whole frames."""
+    """A register reads as `encoded` says, or its document, through whole frames."""
     drive = family(5)
     known = drive.known_counts()
     wire = Wire([EncodedDrive(drive)], unpaced=True)

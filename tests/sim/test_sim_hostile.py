@@ -1,4 +1,4 @@
-"""What each fault does to the bytes of a hostile line, and how a faults' file is read."""
+"""The effect of each fault on the bytes of a hostile line, and how a faults' file is read."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WHOLE = 5.0  # s, in which all that is on its way comes
 
 
 class Heard:
-    """What a client hears of a hostile line, on a clock that moves with its requests."""
+    """A client's view of a hostile line, on a clock that moves with its requests."""
 
     def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
         self.wire = FaultyWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))

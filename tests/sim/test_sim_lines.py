@@ -99,7 +99,7 @@ def test_the_next_tcp_client_is_served_when_the_first_has_gone() -> None:
 
 
 def test_the_next_tcp_client_is_served_when_the_first_has_broken_off() -> None:
-    """As one does whose process dies: what it was sent is thrown away, and the connection reset."""
+    """A client whose process dies leaves so: what it was sent is thrown away, and the connection reset."""
     with Simulator([wire(port="socket://127.0.0.1:0")]) as sim:
         path = sim.wires[0].path
         host, _, port = path.removeprefix("socket://").partition(":")

@@ -29,7 +29,7 @@ def mbpoll(sim: SimulatedDrive, options: str, *values: int) -> subprocess.Comple
 
 
 def values(done: subprocess.CompletedProcess[str]) -> list[str]:
-    """What stands behind "[address]:" in mbpoll's output."""
+    """Return the text behind "[address]:" in mbpoll's output."""
     assert done.returncode == 0, done.stderr
     return [line.split()[1] for line in done.stdout.splitlines() if line.startswith("[")]
 

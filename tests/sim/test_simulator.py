@@ -14,7 +14,7 @@ PATIENCE = 60.0
 
 
 def test_a_signal_ends_it_though_its_handler_is_not_called() -> None:
-    """As one that comes just before it sleeps: here another thread has it, which runs no handler."""
+    """A signal may come just before it sleeps: here another thread has it, which runs no handler."""
 
     def terminate() -> None:
         time.sleep(0.2)

@@ -69,7 +69,7 @@ def spans(numbers: Iterable[int]) -> str:
 
 
 def room(name: str) -> str:
-    """What is one row: a file of the core, a directory of Python."""
+    """Return the name of a row: a file of the core, a directory of Python."""
     return name if name.endswith((".c", ".h")) else name.rpartition("/")[0] + "/"
 
 

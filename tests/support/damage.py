@@ -32,7 +32,7 @@ class Said:
 
     @property
     def body(self) -> Body:
-        """As far as it can be made out."""
+        """Return the length, as far as it can be made out."""
         if self.framing is Framing.RTU:
             return self.frame[:-2]
         digits = self.frame.partition(b":")[2].partition(b"\r")[0]
@@ -42,7 +42,7 @@ class Said:
             return b""
 
     def octet(self, at: int) -> int:
-        """Of the body; -1 where it ends before."""
+        """Return the byte of the body; -1 where it ends before."""
         return self.body[at] if at < len(self.body) else -1
 
     @property
@@ -80,7 +80,7 @@ def random_request(chance: random.Random) -> Message:
 
 
 def random_reply(chance: random.Random, request: Message) -> Message:
-    """What a drive may say to it."""
+    """Return a reply that a drive may send."""
     if chance.random() < 0.15:
         code = chance.choice((1, 2, 3, 4, 6, 0x0B, 0x12, chance.randint(1, 255)))
         return Message(request.address, request.function, exception=code)

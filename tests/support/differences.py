@@ -1,4 +1,4 @@
-"""Where our framing differs from libmodbus's and pymodbus's, and why: a table, and what keeps it true.
+"""Differences of our framing from libmodbus's and pymodbus's, with their reasons.
 
 A difference that no rule explains fails, and so does a rule that explains nothing any more.
 """
@@ -72,7 +72,7 @@ def has_other_data(said: Said) -> bool:
 
 @dataclass(frozen=True)
 class Rule:
-    """Where we refuse what others take (stricter), take what they refuse (looser), or read it otherwise."""
+    """Refuse what others take (stricter), take what they refuse (looser), or read it otherwise."""
 
     kind: str
     judges: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""What the documents' frames mean, typed by hand from the documents; tests/data/frames.csv has the bytes.
+"""The meaning of the documents' frames, typed by hand from them; tests/data/frames.csv has the bytes.
 
 Errata are named as in their notes: E1 to E14 of ERMAN ER-G-220, protocol description v1.4.
 """

@@ -1,4 +1,4 @@
-"""What libmodbus and pymodbus make of frames, in our words: a message, or why it is refused."""
+"""The verdicts of libmodbus and pymodbus on frames, in our words: a message, or why it is refused."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Libmodbus:
         return done.stdout.splitlines()
 
     def hear(self, requests: Sequence[Said]) -> list[Heard | str]:
-        """What its server does at these requests, each addressed to it."""
+        """Return what its server does at these requests, each addressed to it."""
         return [_heard(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
 
     def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
@@ -66,7 +66,7 @@ class Libmodbus:
 
 @dataclass(frozen=True)
 class Heard:
-    """What a server understood, as far as it shows: bytes used, its reply, and cells (table, address)."""
+    """A server's understanding, as far as it shows: bytes used, its reply, and cells (table, address)."""
 
     used: int
     reply: bytes
@@ -120,7 +120,7 @@ def expected(used: int, request: Message) -> Heard:
 
 
 def _cell(function: int, address: int) -> int:
-    """As the judge fills them."""
+    """Return the value with which the judge fills a table's address."""
     fill = {
         1: int(address % 3 == 0),
         2: int(address % 5 == 0),
@@ -180,7 +180,7 @@ class Pymodbus:
         return self._open(self._server, said, address=0)
 
     def ask(self, said: Said) -> Verdict:
-        """What its client makes of the reply."""
+        """Return what its client makes of the reply."""
         found = self._open(self._client, said, said.request.address)
         if isinstance(found, Message) and found.function in READS and not found.exception:
             return replace(found, start=said.request.start, count=said.request.count)
@@ -209,7 +209,7 @@ class Pymodbus:
 
 
 def _fields(message: Message) -> dict[str, Any]:
-    """As pymodbus names them."""
+    """Return the message's fields under pymodbus's names."""
     function = message.function
     if function == 0x08:
         return {"message": message.data}

@@ -28,7 +28,7 @@ class LineDriver:
 
     @property
     def listens(self) -> bool:
-        """Whether it wants no more than time or bytes."""
+        """True while it wants no more than time or bytes."""
         return self.want in ("wait", "read")
 
     @property
@@ -37,7 +37,7 @@ class LineDriver:
 
     @property
     def echo(self) -> int:
-        """What it knows of its adapter's (enum md_echo)."""
+        """The adapter's echo as far as it is known (enum md_echo)."""
         return int(self._line.echo)
 
     @echo.setter
@@ -45,7 +45,7 @@ class LineDriver:
         self._line.echo = known
 
     def tell_echo(self, known: int) -> None:
-        """As its user does."""
+        """Set the echo as its user does."""
         self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
 
     @property

@@ -49,7 +49,7 @@ class Faulty(Wire):
 
 
 class LateWire(Wire):
-    """What `distort` holds up comes later, beside all else."""
+    """Replies that `distort` holds up come later, beside all else."""
 
     def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
         super().__init__(drives, **details)
@@ -57,7 +57,7 @@ class LateWire(Wire):
         self._now = 0.0
 
     def hold_up(self, reply: bytes, seconds: float) -> bytes:
-        """What is left of it by now: nothing."""
+        """Keep the reply back, and return what is left of it by now: nothing."""
         heapq.heappush(self._late, (self._now + seconds, reply))
         return b""
 

@@ -44,7 +44,7 @@ def quick(kind: str) -> type[Drive]:
 
 
 class Heard:
-    """What a simulated drive hears; `loses(request)` says whether its reply is lost."""
+    """The requests that reach a simulated drive; `loses(request)` says whether its reply is lost."""
 
     def __init__(self, sim: MotorDrive) -> None:
         self.sim = sim

@@ -66,7 +66,7 @@ SCHEMA = pa.schema(
 
 
 def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
-    """What pyarrow sees, with the time as a number."""
+    """Return the rows as pyarrow sees them, with the time as a number."""
     numbers = table.set_column(0, "time", table.column("time").cast(pa.int64()))
     return [Row(**row) for row in numbers.to_pylist()]
 

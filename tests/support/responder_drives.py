@@ -154,7 +154,7 @@ class ResponderDrive:
         return self.runs or time.monotonic() < self._stands_at
 
     def switch_on(self) -> None:
-        """As after its power was off: the motor stands, and all is as from the factory."""
+        """Lose power and get it back: the motor stands, and all is as from the factory."""
         self.runs = False
         self._memory = dict(self.kind.memory)
         if self.kind.own_address is not None:
@@ -162,7 +162,7 @@ class ResponderDrive:
         self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's
 
     def turn(self) -> None:
-        """As if somebody had started it by hand."""
+        """Start as if somebody had done it by hand."""
         self.runs = True
         self._coils[0] = COIL_ON
 
@@ -176,7 +176,7 @@ class ResponderDrive:
         return self._memory.get(address, 0) if turning is None else turning
 
     def state(self) -> int:
-        """What function 03 of Delixi's own protocol says."""
+        """Return the state that function 03 of Delixi's own protocol reads."""
         return 2 if self.turns else 1
 
     def write(self, asked: Asked) -> None:

@@ -26,7 +26,7 @@ def interleaved(chance: random.Random, said: Sequence[bytes]) -> bytes:
 
 
 def overlaid(chance: random.Random, said: Sequence[bytes]) -> bytes:
-    """Where both drive the pair, 0 wins: it begins a character, and the bias is weak."""
+    """A 0 wins when both drive the pair: it begins a character, and the bias is weak."""
     shorter, longer = sorted(said, key=len)
     at = chance.randint(0, len(longer) - len(shorter))
     middle = bytes(one & other for one, other in zip(shorter, longer[at:], strict=False))

@@ -65,7 +65,7 @@ class Toy(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """What the drive says of itself."""
+        """Return the state that the drive reports."""
         status = yield from read(Toy.status)
         return State(Condition.RUNNING if status & Status.RUNNING else Condition.STOPPED)
 

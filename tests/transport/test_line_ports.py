@@ -100,7 +100,7 @@ def test_a_pty_at_settings_that_it_cannot_have() -> None:
 
 
 def test_a_port_is_told_to_hold_no_bytes_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As USB adapters do for 16 ms."""
+    """USB adapters do it for 16 ms."""
     told: list[bool] = []
     monkeypatch.setattr(Serial, "set_low_latency_mode", lambda port, wanted: told.append(wanted))
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path) as bus:

@@ -44,7 +44,7 @@ def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
 
 
 def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
-    """What a stream says, its data in one piece where nothing comes between."""
+    """Return a stream's commands, its data in one piece where nothing comes between."""
     telnet, found = Telnet(), list[tuple[bytes, bytes]]()
     for chunk in chunks:
         for kind, content in telnet.split(chunk):
@@ -306,7 +306,7 @@ class FarNetwork:
         return False
 
     def all_heard(self) -> str:
-        """What the server heard on its serial line, once the network is joined again."""
+        """Return what the server received on its serial line, once the network is joined again."""
         self.join()
         until(lambda: not connections(self.port))  # the kernel repeats nothing any more
         until(self._ends)

@@ -19,7 +19,7 @@ WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
 
 class Counted:
-    """How often blocks were chosen, and how many exchanges were made."""
+    """Count the choices of blocks, and the exchanges."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0

@@ -38,7 +38,7 @@ def with_crc(body: bytes) -> bytes:
 
 
 def answer(request: bytes) -> bytes:
-    """What one drive says to a whole request."""
+    """Return one drive's reply to a whole request."""
     if len(request) == 8 and request[1] in (3, 4):
         return with_crc(request[:2] + bytes([2 * request[5]]) + bytes(2 * request[5]))
     return request

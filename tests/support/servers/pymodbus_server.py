@@ -14,7 +14,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 
 async def silent(*_: object) -> None:
-    """What pymodbus needs to leave requests to other addresses unanswered."""
+    """Make pymodbus leave requests to other addresses unanswered."""
     raise NoSuchIdException("not here")
 
 
