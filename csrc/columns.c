@@ -1,4 +1,4 @@
-/* Completions become columns of numbers in engineering units. */
+/* Make columns of completions: numbers in engineering units. */
 #include "internal.h"
 
 #include <math.h>
@@ -9,11 +9,6 @@ static const uint8_t wire_bytes[] = {
     [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_U32_SWAPPED] = 4,
     [MD_I32_SWAPPED] = 4, [MD_U32_EITHER] = 4, [MD_F32] = 4, [MD_F32_SWAPPED] = 4,
 };
-
-static uint32_t word(const uint8_t *at)
-{
-    return (uint32_t)at[0] << 8 | at[1];
-}
 
 static double as_float(uint32_t bits)
 {
@@ -36,7 +31,7 @@ double md_value(const uint8_t *data, size_t len, size_t at, int wire)
     if (wire == MD_BIT) /* the first coil is the least significant bit of the first byte */
         return (data[at / 8] >> (at % 8)) & 1;
     const uint8_t *first = data + 2 * at;
-    uint32_t one = word(first), two = wire_bytes[wire] == 4 ? word(first + 2) : 0;
+    uint32_t one = md_get16(first), two = wire_bytes[wire] == 4 ? md_get16(first + 2) : 0;
     switch (wire) {
     case MD_I16: return (int16_t)one;
     case MD_U32: return one << 16 | two;
@@ -94,8 +89,8 @@ static uint16_t status_of(const struct md_completion *completion, const struct m
     return is_inside(reply->data_len, field->at, field->wire) ? MD_OK : -MD_BAD_LENGTH;
 }
 
-int md_columns_add(struct md_columns *columns, const struct md_block *block,
-                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns)
+int md_columns_add(struct md_columns *columns, const struct md_block *block, const struct md_completion *completion,
+                   int64_t utc_minus_monotonic_ns)
 {
     if (columns->room - columns->rows < (size_t)block->count)
         return 0;
@@ -105,21 +100,21 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
         const struct md_field *field = &block->fields[i];
         size_t row = columns->rows++;
         uint16_t status = status_of(completion, field);
-        double value = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->wire);
         columns->time[row] = sent_ns + utc_minus_monotonic_ns;
         columns->sent[row] = sent_ns;
         columns->uncertainty[row] = status ? 0 : completion->first_ns - sent_ns;
         columns->drive[row] = block->drive;
         columns->reg[row] = field->reg;
         columns->status[row] = status;
-        columns->value[row] = status ? 0 : value * field->multiplier / field->divisor;
+        columns->value[row] = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->wire) *
+                                               field->multiplier / field->divisor;
         set_bit(columns->valid, row, status == 0);
     }
     return block->count;
 }
 
-int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets,
-                 size_t names, int32_t *out_offsets, uint8_t *out, size_t room)
+int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
+                 int32_t *out_offsets, uint8_t *out, size_t room)
 {
     size_t used = 0;
     out_offsets[0] = 0;

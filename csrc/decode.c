@@ -1,19 +1,23 @@
-/* What was sniffed becomes columns, as fast as a disk delivers it. */
+/* Make rows of sniffed bytes, as fast as a disk delivers them. */
 #include "internal.h"
 
 #include <string.h>
 
-/* Requests with one key have replies that hold the same. A Delixi run command stands where other
+static int is_run_command(int framing, const struct md_message *request)
+{
+    return framing == MD_DELIXI && request->function == MD_DELIXI_RUN;
+}
+
+/* Requests with one key have replies with the same fields. A Delixi run command stands where other
  * requests have their address. */
 static uint64_t key_of(int framing, const struct md_message *request)
 {
-    int is_run_command = framing == MD_DELIXI && request->function == 0x02;
-    uint64_t start = is_run_command ? 0 : request->start;
+    uint64_t start = is_run_command(framing, request) ? 0 : request->start;
     return 1 | (uint64_t)framing << 1 | (uint64_t)request->address << 8 | (uint64_t)request->function << 16 |
            start << 24 | (uint64_t)request->count << 40;
 }
 
-/* Where the key is, or where it would be. */
+/* Find the place of the key, or the empty one for it. */
 static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
 {
     size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);
@@ -22,8 +26,7 @@ static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
     return &decoder->known[place];
 }
 
-int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
-            const struct md_block *block)
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request, const struct md_block *block)
 {
     if (4 * decoder->taken >= 3 * decoder->places)
         return 0;
@@ -33,19 +36,18 @@ int md_know(struct md_decoder *decoder, int framing, const struct md_message *re
     return 1;
 }
 
-/* What a reply says of what was written is in its request, where the reply does not repeat it. */
+/* Take the written data from the request, where the reply does not repeat it. */
 static void put_written(struct md_message *reply, int framing, const struct md_message *request)
 {
     if (reply->exception)
         return;
-    if (framing == MD_DELIXI && request->function == 0x02) {
-        reply->data[2] = (uint8_t)(request->start >> 8);
-        reply->data[3] = (uint8_t)request->start;
-    } else if (framing != MD_DELIXI && request->function >= 0x0F)
+    if (is_run_command(framing, request))
+        md_put16(reply->data + 2, request->start);
+    else if (framing != MD_DELIXI && request->function >= 0x0F)
         md_copy_message(reply, request);
 }
 
-/* Rows of the last request: what its reply says, or why there is none. 0 when there is no room. */
+/* Add the rows of the last request: what its reply says, or why there is none. Return 0 when there is no room. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;
@@ -64,7 +66,7 @@ static int add_rows(struct md_decoder *decoder, int result, struct md_columns *c
     return 1;
 }
 
-/* A request: what became of the one before it, then what its own reply will hold. */
+/* Add the rows of the request before this one, then look up the fields of its own reply. */
 static int take_request(struct md_decoder *decoder, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
@@ -80,7 +82,7 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* What came, but is not the reply, tells why there is none. */
+/* Learn why there is no reply from what came in its place. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -96,18 +98,24 @@ static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 static int take(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)
 {
     const struct md_span *span = &decoder->span;
-    int is_request = span->kind == MD_REQUEST || span->kind == MD_EITHER;
-    if (span->kind == MD_REPLY && !add_rows(decoder, (int)span->len, columns))
-        return MD_NO_ROOM;
-    if (is_request && !decoder->is_sure)
-        decoder->block = NULL; /* it may have been a confirmation: nobody failed to answer it */
-    int undone = is_request ? take_request(decoder, columns) : MD_ALL_DECODED;
-    if (undone)
-        return undone;
-    if (is_request)
+    switch (span->kind) {
+    case MD_REQUEST:
+    case MD_EITHER:
+        if (!decoder->is_sure)
+            decoder->block = NULL; /* it may have been a confirmation: nobody failed to answer it */
+        int undone = take_request(decoder, columns);
+        if (undone)
+            return undone;
         decoder->is_sure = span->kind == MD_REQUEST;
-    if (decoder->block && (span->kind == MD_STRAY || span->kind == MD_JUNK))
-        explain(decoder, stream);
+        break;
+    case MD_REPLY:
+        if (!add_rows(decoder, (int)span->len, columns))
+            return MD_NO_ROOM;
+        break;
+    default:
+        if (decoder->block)
+            explain(decoder, stream);
+    }
     decoder->frames += span->kind != MD_JUNK;
     decoder->exchanges += span->kind == MD_REPLY;
     decoder->strays += span->kind == MD_STRAY;
@@ -118,11 +126,10 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)
 {
     while (decoder->is_due || md_split(&decoder->splitter, stream, &decoder->span)) {
-        decoder->is_due = 1;
         int undone = take(decoder, stream, columns);
+        decoder->is_due = undone != MD_ALL_DECODED;
         if (undone)
             return undone;
-        decoder->is_due = 0;
     }
     return MD_ALL_DECODED;
 }

@@ -6,38 +6,49 @@
 
 #include <string.h>
 
-/* What follows address and function code. */
-enum shape {
-    NONE,         /* no such function */
-    RANGE,        /* start, count */
-    DATA,         /* byte count, data */
-    ECHO,         /* start, two bytes */
-    RANGE_DATA,   /* start, count, byte count, data */
-    LONG          /* start, four bytes: all of Delixi's */
+/* The fields behind address and function code. */
+enum layout {
+    NONE,       /* no such function */
+    RANGE,      /* start, count */
+    DATA,       /* byte count, data */
+    ECHO,       /* start, two bytes */
+    RANGE_DATA, /* start, count, byte count, data */
+    LONG        /* start, four bytes: all of Delixi's */
+};
+
+static const struct fields {
+    uint8_t start, count, byte_count; /* 1: there is one */
+    uint8_t data_len;                 /* without a byte count */
+} fields_of[] = {
+    [RANGE] = {.start = 1, .count = 1},
+    [DATA] = {.byte_count = 1},
+    [ECHO] = {.start = 1, .data_len = 2},
+    [RANGE_DATA] = {.start = 1, .count = 1, .byte_count = 1},
+    [LONG] = {.start = 1, .data_len = 4},
 };
 
 enum { BIT = 1, WORD = 16 };
 
-enum { COIL = 0x05, LOOPBACK = 0x08 };
-
 static const struct function {
-    uint8_t request, reply; /* enum shape */
-    uint8_t unit_bits;      /* BIT or WORD: what count counts, where there is one */
+    uint8_t request, reply; /* enum layout */
+    uint8_t unit_bits;      /* BIT or WORD: the unit of count */
     uint16_t most;          /* the largest count */
 } functions[] = {
     [0x01] = {RANGE, DATA, BIT, 2000},
     [0x02] = {RANGE, DATA, BIT, 2000},
     [0x03] = {RANGE, DATA, WORD, 125},
     [0x04] = {RANGE, DATA, WORD, 125},
-    [0x05] = {.request = ECHO, .reply = ECHO},
-    [0x06] = {.request = ECHO, .reply = ECHO},
-    [0x08] = {.request = ECHO, .reply = ECHO},
+    [MD_WRITE_COIL] = {.request = ECHO, .reply = ECHO},
+    [MD_WRITE_ONE] = {.request = ECHO, .reply = ECHO},
+    [MD_LOOPBACK] = {.request = ECHO, .reply = ECHO},
     [0x0F] = {RANGE_DATA, RANGE, BIT, 1968},
     [0x10] = {RANGE_DATA, RANGE, WORD, 123},
 };
 
+/* Delixi's K stands for all of them. */
+static const struct function delixi = {.request = LONG, .reply = LONG};
+
 enum {
-    MOST_ADDRESS = 247,
     MOST_BODY = 253, /* 125 registers read; the standard has room for 254 */
     EXCEPTION_BODY = 3,
     EXCEPTION_BIT = 0x80,
@@ -45,23 +56,20 @@ enum {
     DELIXI_FRAME = 21
 };
 
-/* Delixi's K (part 3): the master sends 02 to 07, the drive alone F0 and FC to FF. */
-enum { RUN_COMMAND = 2, STATE_QUERY = 3, PARAMETER_QUERY = 7, CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
+/* Delixi's K of a drive alone (part 3). */
+enum { CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
-static const struct function *find_function(uint8_t code)
+static const struct function *find_function(int framing, uint8_t code)
 {
     static const struct function none = {.request = NONE, .reply = NONE};
+    if (framing == MD_DELIXI)
+        return &delixi;
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
 }
 
-static int request_shape(int framing, uint8_t code)
+static int is_delixi_command(uint8_t code)
 {
-    return framing == MD_DELIXI ? LONG : find_function(code)->request;
-}
-
-static int reply_shape(int framing, uint8_t code)
-{
-    return framing == MD_DELIXI ? LONG : find_function(code)->reply;
+    return code >= MD_DELIXI_RUN && code <= MD_DELIXI_PARAMETER_QUERY;
 }
 
 static int is_delixi_refusal(uint8_t code)
@@ -74,56 +82,39 @@ static size_t data_bytes(const struct function *function, unsigned count)
     return (count * function->unit_bits + 7) / 8;
 }
 
-static void put16(uint8_t *at, unsigned value)
-{
-    at[0] = (uint8_t)(value >> 8);
-    at[1] = (uint8_t)value;
-}
-
-static uint16_t get16(const uint8_t *at)
-{
-    return (uint16_t)(at[0] << 8 | at[1]);
-}
-
 /* ---- bodies ---- */
 
-static size_t put_body(int shape, const struct md_message *message, uint8_t *body)
+static size_t put_body(int layout, const struct md_message *message, uint8_t *body)
 {
-    size_t data_at = 2;
-    if (shape != DATA) {
-        put16(body + 2, message->start);
-        data_at = 4;
-    }
-    if (shape == RANGE || shape == RANGE_DATA) {
-        put16(body + 4, message->count);
-        data_at = 6;
-    }
-    if (shape == DATA || shape == RANGE_DATA)
-        body[data_at++] = (uint8_t)message->data_len;
-    memcpy(body + data_at, message->data, message->data_len);
-    return data_at + message->data_len;
+    const struct fields *fields = &fields_of[layout];
+    uint8_t *at = body + 2;
+    if (fields->start)
+        at = md_put16(at, message->start);
+    if (fields->count)
+        at = md_put16(at, message->count);
+    if (fields->byte_count)
+        *at++ = (uint8_t)message->data_len;
+    memcpy(at, message->data, message->data_len);
+    return (size_t)(at - body) + message->data_len;
 }
 
-static void get_body(int shape, const uint8_t *body, struct md_message *message)
+/* Of the data only as much is written as there is: clearing the rest costs more than to parse. */
+static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
-    size_t data_at = 2, data_len = 0;
-    if (shape != DATA) {
-        message->start = get16(body + 2);
-        data_at = 4;
+    const struct fields *fields = &fields_of[layout];
+    const uint8_t *at = body + 2;
+    if (fields->start) {
+        message->start = md_get16(at);
+        at += 2;
     }
-    if (shape == RANGE || shape == RANGE_DATA) {
-        message->count = get16(body + 4);
-        data_at = 6;
+    if (fields->count) {
+        message->count = md_get16(at);
+        at += 2;
     }
-    if (shape == DATA || shape == RANGE_DATA)
-        data_len = body[data_at++];
-    if (shape == ECHO || shape == LONG)
-        data_len = shape == ECHO ? 2 : 4;
-    message->data_len = (uint16_t)data_len;
-    memcpy(message->data, body + data_at, data_len);
+    message->data_len = fields->byte_count ? *at++ : fields->data_len;
+    memcpy(message->data, at, message->data_len);
 }
 
-/* All but the data, which costs more to clear than to parse. */
 static void begin_message(struct md_message *message, uint8_t address, uint8_t function)
 {
     memset(message, 0, offsetof(struct md_message, data));
@@ -131,7 +122,7 @@ static void begin_message(struct md_message *message, uint8_t address, uint8_t f
     message->function = function;
 }
 
-/* Length of a request's body from its first bytes; MD_INCOMPLETE when they do not tell yet. A
+/* Return the length of a request's body by its first bytes; MD_INCOMPLETE where they do not tell yet. A
  * count that cannot be answered is still a request, where the length does not depend on it: the
  * drive's side answers it with an exception. */
 static int request_length(int framing, const uint8_t *body, size_t have)
@@ -140,40 +131,34 @@ static int request_length(int framing, const uint8_t *body, size_t have)
         return have >= 2 && body[1] >= CANNOT_EXECUTE ? MD_BAD_FUNCTION : DELIXI_BODY;
     if (have < 2)
         return MD_INCOMPLETE;
-    const struct function *function = find_function(body[1]);
+    const struct function *function = find_function(framing, body[1]);
     if (function->request == NONE)
         return MD_BAD_FUNCTION;
     if (function->request != RANGE_DATA)
         return 6;
     if (have < 7)
         return MD_INCOMPLETE;
-    unsigned count = get16(body + 4);
+    unsigned count = md_get16(body + 4);
     if (count > function->most || body[6] != data_bytes(function, count))
         return MD_BAD_LENGTH;
     return 7 + body[6];
 }
 
-/* The same of the reply to `request`, which is refused as soon as its first bytes differ. */
+/* Do the same for the reply to `request`, which is refused as soon as its first bytes differ. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     if (have >= 1 && (request->address == 0 || body[0] != request->address))
         return MD_BAD_ADDRESS;
     if (request->function & EXCEPTION_BIT) /* no request has it */
         return MD_BAD_FUNCTION;
-    if (framing == MD_DELIXI) {
-        if (have >= 2 && body[1] != request->function && !is_delixi_refusal(body[1]))
-            return MD_BAD_FUNCTION;
-        return DELIXI_BODY;
-    }
+    if (framing == MD_DELIXI)
+        return have >= 2 && body[1] != request->function && !is_delixi_refusal(body[1]) ? MD_BAD_FUNCTION : DELIXI_BODY;
     if (have < 2)
         return MD_INCOMPLETE;
-    const struct function *function = find_function(request->function);
+    const struct function *function = find_function(framing, request->function);
     /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
-    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == LOOPBACK && body[1] == 0x89)) {
-        if (have >= EXCEPTION_BODY && body[2] == 0)
-            return MD_BAD_FUNCTION;
-        return EXCEPTION_BODY;
-    }
+    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == MD_LOOPBACK && body[1] == 0x89))
+        return have >= EXCEPTION_BODY && body[2] == 0 ? MD_BAD_FUNCTION : EXCEPTION_BODY;
     if (body[1] != request->function || function->reply == NONE)
         return MD_BAD_FUNCTION;
     if (function->reply != DATA)
@@ -212,25 +197,20 @@ static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
     return framing == MD_ASCII ? md_lrc(body, len) : md_sum(body, len);
 }
 
+/* Open what is written in hex digits: unhex its body, and return the frame's length. */
 static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request, uint8_t *body)
 {
     if (len > 0 && text[0] != ':')
         return MD_NO_START;
     size_t have = 0;
-    int stopped = MD_INCOMPLETE; /* why no more digits can be read */
-    while (have <= MOST_BODY && 2 * have + 2 < len) {
-        int byte = md_hex_byte(text + 2 * have + 1);
-        if (byte < 0) {
-            stopped = MD_BAD_CHARACTER;
-            break;
-        }
-        body[have++] = (uint8_t)byte;
-    }
+    int byte = 0;
+    for (; have <= MOST_BODY && 2 * have + 2 < len && (byte = md_hex_byte(text + 2 * have + 1)) >= 0; have++)
+        body[have] = (uint8_t)byte;
     int length = body_length(framing, body, have, request);
     if (length < 0)
         return length;
     if (length == 0 || have <= (size_t)length) /* the checksum's byte follows the body */
-        return stopped;
+        return byte < 0 ? MD_BAD_CHARACTER : MD_INCOMPLETE;
     size_t end = 2 * (size_t)length + 3;
     if ((len > end && text[end] != '\r') || (len > end + 1 && text[end + 1] != '\n'))
         return MD_BAD_CHARACTER;
@@ -255,7 +235,7 @@ static int open_rtu(const uint8_t *bytes, size_t len, const struct md_message *r
     return length + 2;
 }
 
-/* Find the body of the frame that begins at `bytes`: in place, or unhexed into `text`. */
+/* Find the body of the frame at the beginning of `bytes`: in place, or unhexed into `text`. */
 static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                       uint8_t text[MOST_BODY + 1], const uint8_t **body)
 {
@@ -306,21 +286,21 @@ static int is_coil(const uint8_t *data)
 /* Nobody answers a broadcast, so that it cannot ask for anything. */
 static int is_request(int framing, const struct md_message *message)
 {
-    const struct function *function = find_function(message->function);
+    const struct function *function = find_function(framing, message->function);
     int is_broadcast = message->address == 0;
-    if (message->address > MOST_ADDRESS)
+    if (message->address > MD_MOST_ADDRESS)
         return 0;
-    switch (request_shape(framing, message->function)) {
+    switch (function->request) {
     case RANGE:
         return !is_broadcast && is_range(function, message) && message->data_len == 0;
     case RANGE_DATA:
         return is_range(function, message) && message->data_len == data_bytes(function, message->count);
     case ECHO:
-        return message->data_len == 2 && (message->function != COIL || is_coil(message->data)) &&
-               (message->function != LOOPBACK || !is_broadcast);
+        return message->data_len == 2 && (message->function != MD_WRITE_COIL || is_coil(message->data)) &&
+               (message->function != MD_LOOPBACK || !is_broadcast);
     case LONG: /* part 3: only a run command may be broadcast */
-        return message->data_len == 4 && message->function >= RUN_COMMAND && message->function <= PARAMETER_QUERY &&
-               (message->function == RUN_COMMAND || !is_broadcast);
+        return message->data_len == 4 && is_delixi_command(message->function) &&
+               (message->function == MD_DELIXI_RUN || !is_broadcast);
     default:
         return 0;
     }
@@ -328,12 +308,12 @@ static int is_request(int framing, const struct md_message *message)
 
 static int is_reply(int framing, const struct md_message *message)
 {
-    const struct function *function = find_function(message->function);
-    if (message->address == 0 || message->address > MOST_ADDRESS)
+    const struct function *function = find_function(framing, message->function);
+    if (message->address == 0 || message->address > MD_MOST_ADDRESS)
         return 0;
     if (message->exception)
         return framing != MD_DELIXI || is_delixi_refusal(message->exception);
-    switch (reply_shape(framing, message->function)) {
+    switch (function->reply) {
     case RANGE:
         return is_range(function, message) && message->data_len == 0;
     case DATA:
@@ -342,25 +322,26 @@ static int is_reply(int framing, const struct md_message *message)
     case ECHO:
         return message->data_len == 2;
     case LONG:
-        return message->data_len == 4 && message->function >= RUN_COMMAND && message->function <= PARAMETER_QUERY;
+        return message->data_len == 4 && is_delixi_command(message->function);
     default:
         return 0;
     }
 }
 
-/* Does the reply say what the request asked for? A write is confirmed by its own address and value,
+/* Check that the reply says what the request asked for. A write is confirmed by its own address and value,
  * or address and count. Of Delixi's (part 3, note 1) a query is answered in P1P0 or in D3..D0, and
  * everything else with a copy. */
 static int confirms(int framing, const uint8_t *body, const struct md_message *request)
 {
-    switch (reply_shape(framing, request->function)) {
+    uint16_t start = md_get16(body + 2);
+    switch (find_function(framing, request->function)->reply) {
     case RANGE:
-        return get16(body + 2) == request->start && get16(body + 4) == request->count;
+        return start == request->start && md_get16(body + 4) == request->count;
     case ECHO:
-        return get16(body + 2) == request->start && memcmp(body + 4, request->data, 2) == 0;
+        return start == request->start && memcmp(body + 4, request->data, 2) == 0;
     case LONG: /* there is no state 0: that is the query itself */
-        return (request->function == STATE_QUERY ? get16(body + 2) != 0 : get16(body + 2) == request->start) &&
-               (request->function == PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
+        return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
+               (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     default:
         return 1;
     }
@@ -373,7 +354,8 @@ int md_build_request(int framing, const struct md_message *message, uint8_t *out
     if (!is_request(framing, message))
         return MD_BAD_REQUEST;
     uint8_t body[MOST_BODY + 1] = {message->address, message->function};
-    return close_frame(framing, body, put_body(request_shape(framing, message->function), message, body), out, room);
+    size_t len = put_body(find_function(framing, message->function)->request, message, body);
+    return close_frame(framing, body, len, out, room);
 }
 
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room)
@@ -381,15 +363,17 @@ int md_build_reply(int framing, const struct md_message *message, uint8_t *out, 
     if (!is_reply(framing, message))
         return MD_BAD_REQUEST;
     uint8_t body[MOST_BODY + 1] = {message->address, message->function};
-    if (!message->exception)
-        return close_frame(framing, body, put_body(reply_shape(framing, message->function), message, body), out, room);
-    if (framing == MD_DELIXI) { /* the rest is 0: "no meaning" */
+    size_t len = EXCEPTION_BODY;
+    if (!message->exception) {
+        len = put_body(find_function(framing, message->function)->reply, message, body);
+    } else if (framing == MD_DELIXI) { /* the rest is 0: "no meaning" */
         body[1] = message->exception;
-        return close_frame(framing, body, DELIXI_BODY, out, room);
+        len = DELIXI_BODY;
+    } else {
+        body[1] |= EXCEPTION_BIT;
+        body[2] = message->exception;
     }
-    body[1] |= EXCEPTION_BIT;
-    body[2] = message->exception;
-    return close_frame(framing, body, EXCEPTION_BODY, out, room);
+    return close_frame(framing, body, len, out, room);
 }
 
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
@@ -400,12 +384,12 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
     if (used <= 0)
         return used;
     begin_message(message, body[0], body[1]);
-    get_body(request_shape(framing, body[1]), body, message);
+    get_body(find_function(framing, body[1])->request, body, message);
     return used;
 }
 
-int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
-                   const struct md_message *request, struct md_message *reply)
+int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
+                   struct md_message *reply)
 {
     uint8_t text[MOST_BODY + 1];
     const uint8_t *body;
@@ -420,14 +404,14 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len,
         reply->exception = framing == MD_DELIXI ? body[1] : body[2];
         return used;
     }
-    int shape = reply_shape(framing, body[1]);
-    get_body(shape, body, reply);
-    if (shape == DATA) {
+    int layout = find_function(framing, body[1])->reply;
+    get_body(layout, body, reply);
+    if (layout == DATA) {
         reply->start = request->start;
         reply->count = request->count;
     }
-    if (framing == MD_DELIXI && body[1] == STATE_QUERY) /* show the answer where all others have theirs */
-        put16(reply->data + 2, reply->start);
+    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* show the answer where all others have theirs */
+        md_put16(reply->data + 2, reply->start);
     return used;
 }
 
@@ -437,7 +421,7 @@ int md_reply_length(int framing, const struct md_message *request)
         return 0;
     if (framing == MD_DELIXI)
         return DELIXI_FRAME;
-    const struct function *function = find_function(request->function);
+    const struct function *function = find_function(framing, request->function);
     int body = function->reply == DATA ? 3 + (int)data_bytes(function, request->count) : 6;
     return framing == MD_RTU ? body + 2 : 2 * body + 5;
 }

@@ -160,6 +160,26 @@ void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *blo
 
 /* ---- frame.c, reason.c ---- */
 
+enum { MD_MOST_ADDRESS = 247 };
+
+enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08 };
+
+/* Delixi's K (part 3): a master sends these, and those between them. */
+enum { MD_DELIXI_RUN = 2, MD_DELIXI_STATE_QUERY = 3, MD_DELIXI_PARAMETER_QUERY = 7 };
+
+/* Numbers in frames are big-endian. */
+static inline uint16_t md_get16(const uint8_t *at)
+{
+    return (uint16_t)(at[0] << 8 | at[1]);
+}
+
+static inline uint8_t *md_put16(uint8_t *at, unsigned value)
+{
+    at[0] = (uint8_t)(value >> 8);
+    at[1] = (uint8_t)value;
+    return at + 2;
+}
+
 /* Copy only the data that the message has: most are much shorter than the longest. */
 void md_copy_message(struct md_message *to, const struct md_message *from);
 int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1 where they are none */
@@ -243,7 +263,14 @@ int md_echo_learn_alone(struct md_line *line, int is_reply);
 /* Drop what came while the request was leaving, but the beginning of its echo. */
 void md_echo_keep(struct md_line *line);
 
-/* ---- tap.c ---- */
+/* ---- tap.c, unpack.c ---- */
+
+/* The enhanced packet block of a pcapng file (draft-ietf-opsawg-pcapng, 4.3). */
+enum {
+    MD_PACKET_BLOCK = 6,
+    MD_PACKET_HEAD = 28, /* bytes before a packet */
+    MD_PACKET_END = 4    /* and behind it */
+};
 
 void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
 

@@ -117,7 +117,7 @@ struct md_block {
     uint16_t drive;    /* code of its name */
 };
 
-/* A row's status: why it has no value. Any other is -enum md_outcome or -enum md_frame_fault. */
+/* A row's status: why it has no value. Any other is -enum md_failure or -enum md_frame_fault. */
 enum md_status {
     MD_OK = 0,
     MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
@@ -223,7 +223,7 @@ struct md_exchange {
 };
 
 /* Why an exchange has no reply. Where something came in its place, that is an enum md_frame_fault. */
-enum md_outcome {
+enum md_failure {
     MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
     MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
     MD_LINE_LOST = -11,        /* the port failed: `error` is the errno, 0 at end of file */
@@ -236,7 +236,7 @@ enum md_outcome {
 
 /* What became of an exchange. first_ns and last_ns are 0 where nothing came. */
 struct md_completion {
-    int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_outcome */
+    int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
     int64_t begun_ns;          /* its turn came: the line's silence may not have been over */
     int64_t sent_ns;           /* the request began to leave; 0: it never did */

@@ -1,4 +1,4 @@
-/* Why a request has no reply, told from what came in its place. */
+/* Find out why a request has no reply from what came in its place. */
 #include "internal.h"
 
 /* How much a reason says about what went wrong. The one that says most is reported, and of several

@@ -1,7 +1,7 @@
-/* What the thread leaves for a client: rows of what was carried out, and calls to look at a port.
+/* A queue of rows and calls from the engine's thread to a client.
  *
- * The thread never waits for a client: rows gather in chunks of bounded number. It holds the lock for
- * as long as one exchange's rows take, and a client for as long as it takes to unhook a chunk. */
+ * The thread never waits for a client: rows gather in chunks of bounded number. It holds the lock while it
+ * adds one exchange's rows, and a client while it unhooks a chunk. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -11,9 +11,9 @@
 #include <string.h>
 #include <time.h>
 
-static const int64_t CLOCK_HOLDS_NS = 50000000; /* until it is asked again how far UTC is ahead */
+static const int64_t CLOCK_HOLDS_NS = 50000000; /* until the difference to UTC is read again */
 
-enum { MOST_SPARE = 64 }; /* chunks that were given back */
+enum { MOST_SPARE = 64, WORDS = MD_MOST_NUMBERS / 64 };
 
 struct md_row_queue {
     pthread_mutex_t mutex; /* guards all below */
@@ -21,17 +21,17 @@ struct md_row_queue {
     size_t chunk_rows, most_chunks;
     struct md_columns **chunks; /* a ring */
     size_t first, count;        /* of the chunks that hold rows */
-    struct md_columns *spare[MOST_SPARE];
+    struct md_columns *spare[MOST_SPARE]; /* chunks that were given back */
     size_t spares;
     size_t lent;                /* chunks that were taken and not given back yet */
-    int is_done;                /* its client needs it no more */
+    int is_done;                /* its client has freed it */
     uint64_t dropped;
-    int64_t utc_minus_monotonic_ns, asked_ns;
-    uint64_t called[MD_MOST_NUMBERS / 64]; /* a bit for each number */
-    uint32_t least, most;                  /* of those that are called */
+    int64_t utc_minus_monotonic_ns, read_ns;
+    uint64_t called[WORDS];     /* a bit for each number */
+    uint32_t calls;             /* bits that are set */
 };
 
-/* Whose time-outs no change of the time of day can touch. */
+/* Make a condition with time-outs by CLOCK_MONOTONIC. */
 static void init_condition(pthread_cond_t *condition)
 {
 #ifdef __APPLE__
@@ -59,177 +59,169 @@ static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_t
 
 struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks)
 {
-    struct md_row_queue *row_queue = calloc(1, sizeof *row_queue);
+    struct md_row_queue *queue = calloc(1, sizeof *queue);
     struct md_columns **chunks = calloc(most_chunks, sizeof *chunks);
-    if (!row_queue || !chunks) {
-        free(row_queue);
+    if (!queue || !chunks) {
+        free(queue);
         free(chunks);
         return NULL;
     }
-    row_queue->chunks = chunks;
-    row_queue->chunk_rows = chunk_rows;
-    row_queue->most_chunks = most_chunks;
-    row_queue->least = MD_MOST_NUMBERS;
-    pthread_mutex_init(&row_queue->mutex, NULL);
-    init_condition(&row_queue->called_up);
-    return row_queue;
+    queue->chunks = chunks;
+    queue->chunk_rows = chunk_rows;
+    queue->most_chunks = most_chunks;
+    pthread_mutex_init(&queue->mutex, NULL);
+    init_condition(&queue->called_up);
+    return queue;
 }
 
-static void destroy(struct md_row_queue *row_queue)
+static void destroy(struct md_row_queue *queue)
 {
-    for (size_t i = 0; i < row_queue->count; i++)
-        md_columns_free(row_queue->chunks[(row_queue->first + i) % row_queue->most_chunks]);
-    while (row_queue->spares)
-        md_columns_free(row_queue->spare[--row_queue->spares]);
-    pthread_cond_destroy(&row_queue->called_up);
-    pthread_mutex_destroy(&row_queue->mutex);
-    free(row_queue->chunks);
-    free(row_queue);
+    for (size_t i = 0; i < queue->count; i++)
+        md_columns_free(queue->chunks[(queue->first + i) % queue->most_chunks]);
+    while (queue->spares)
+        md_columns_free(queue->spare[--queue->spares]);
+    pthread_cond_destroy(&queue->called_up);
+    pthread_mutex_destroy(&queue->mutex);
+    free(queue->chunks);
+    free(queue);
 }
 
-/* A chunk may be looked at for longer than its row_queue: a collector of garbage ends them in any order. */
-void md_row_queue_free(struct md_row_queue *row_queue)
+/* A chunk may outlive its queue: a garbage collector frees them in any order. */
+void md_row_queue_free(struct md_row_queue *queue)
 {
-    pthread_mutex_lock(&row_queue->mutex);
-    row_queue->is_done = 1;
-    int is_last = row_queue->lent == 0;
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_lock(&queue->mutex);
+    queue->is_done = 1;
+    int is_last = queue->lent == 0;
+    pthread_mutex_unlock(&queue->mutex);
     if (is_last)
-        destroy(row_queue);
+        destroy(queue);
 }
 
 /* ---- rows ---- */
 
-static void ask_clock(struct md_row_queue *row_queue, int64_t now_ns)
+static void read_utc(struct md_row_queue *queue, int64_t now_ns)
 {
-    if (row_queue->asked_ns && now_ns - row_queue->asked_ns < CLOCK_HOLDS_NS)
+    if (queue->read_ns && now_ns - queue->read_ns < CLOCK_HOLDS_NS)
         return;
-    row_queue->asked_ns = now_ns;
-    row_queue->utc_minus_monotonic_ns = md_utc_minus_monotonic_ns();
+    queue->read_ns = now_ns;
+    queue->utc_minus_monotonic_ns = md_utc_minus_monotonic_ns();
 }
 
-static struct md_columns *newest(struct md_row_queue *row_queue)
+static struct md_columns *newest(struct md_row_queue *queue)
 {
-    return row_queue->count ? row_queue->chunks[(row_queue->first + row_queue->count - 1) % row_queue->most_chunks] : NULL;
+    return queue->count ? queue->chunks[(queue->first + queue->count - 1) % queue->most_chunks] : NULL;
 }
 
-/* A chunk with no rows yet: a new one, or else the newest, whose rows are dropped. */
-static struct md_columns *begin_chunk(struct md_row_queue *row_queue)
+/* Return a chunk without rows: a new one, or else the newest, whose rows are dropped. */
+static struct md_columns *begin_chunk(struct md_row_queue *queue)
 {
     struct md_columns *chunk = NULL;
-    if (row_queue->count < row_queue->most_chunks)
-        chunk = row_queue->spares ? row_queue->spare[--row_queue->spares] : md_columns_new(row_queue->chunk_rows);
+    if (queue->count < queue->most_chunks)
+        chunk = queue->spares ? queue->spare[--queue->spares] : md_columns_new(queue->chunk_rows);
     if (chunk) {
-        row_queue->chunks[(row_queue->first + row_queue->count++) % row_queue->most_chunks] = chunk;
-    } else if ((chunk = newest(row_queue)) != NULL) {
-        row_queue->dropped += chunk->rows;
+        queue->chunks[(queue->first + queue->count++) % queue->most_chunks] = chunk;
+    } else if ((chunk = newest(queue)) != NULL) {
+        queue->dropped += chunk->rows;
         chunk->rows = 0;
     }
     return chunk;
 }
 
-void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block, const struct md_completion *completion)
+void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block, const struct md_completion *completion)
 {
     if (!block || block->count == 0)
         return;
-    pthread_mutex_lock(&row_queue->mutex);
-    ask_clock(row_queue, completion->begun_ns);
-    struct md_columns *chunk = newest(row_queue);
-    if (!chunk || !md_columns_add(chunk, block, completion, row_queue->utc_minus_monotonic_ns)) {
-        chunk = begin_chunk(row_queue);
-        if (!chunk || !md_columns_add(chunk, block, completion, row_queue->utc_minus_monotonic_ns))
-            row_queue->dropped += (uint64_t)block->count;
+    pthread_mutex_lock(&queue->mutex);
+    read_utc(queue, completion->begun_ns);
+    struct md_columns *chunk = newest(queue);
+    if (!chunk || !md_columns_add(chunk, block, completion, queue->utc_minus_monotonic_ns)) {
+        chunk = begin_chunk(queue);
+        if (!chunk || !md_columns_add(chunk, block, completion, queue->utc_minus_monotonic_ns))
+            queue->dropped += (uint64_t)block->count;
     }
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_unlock(&queue->mutex);
 }
 
-void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status, int64_t due_ns)
+void md_row_queue_miss(struct md_row_queue *queue, const struct md_block *block, int status, int64_t due_ns)
 {
-    md_row_queue_add(row_queue, block, &(struct md_completion){.result = -status, .begun_ns = due_ns});
+    md_row_queue_add(queue, block, &(struct md_completion){.result = -status, .begun_ns = due_ns});
 }
 
-struct md_columns *md_row_queue_take(struct md_row_queue *row_queue)
+struct md_columns *md_row_queue_take(struct md_row_queue *queue)
 {
     struct md_columns *chunk = NULL;
-    pthread_mutex_lock(&row_queue->mutex);
-    if (row_queue->count) {
-        chunk = row_queue->chunks[row_queue->first];
-        row_queue->first = (row_queue->first + 1) % row_queue->most_chunks;
-        row_queue->count--;
-        row_queue->lent++;
+    pthread_mutex_lock(&queue->mutex);
+    if (queue->count) {
+        chunk = queue->chunks[queue->first];
+        queue->first = (queue->first + 1) % queue->most_chunks;
+        queue->count--;
+        queue->lent++;
     }
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_unlock(&queue->mutex);
     return chunk;
 }
 
-void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns)
+void md_row_queue_give_back(struct md_row_queue *queue, struct md_columns *columns)
 {
     columns->rows = 0;
-    pthread_mutex_lock(&row_queue->mutex);
-    int is_kept = row_queue->spares < MOST_SPARE;
+    pthread_mutex_lock(&queue->mutex);
+    int is_kept = queue->spares < MOST_SPARE;
     if (is_kept)
-        row_queue->spare[row_queue->spares++] = columns;
-    int is_last = --row_queue->lent == 0 && row_queue->is_done;
-    pthread_mutex_unlock(&row_queue->mutex);
+        queue->spare[queue->spares++] = columns;
+    int is_last = --queue->lent == 0 && queue->is_done;
+    pthread_mutex_unlock(&queue->mutex);
     if (!is_kept)
         md_columns_free(columns);
     if (is_last)
-        destroy(row_queue);
+        destroy(queue);
 }
 
-size_t md_row_queue_chunks(struct md_row_queue *row_queue)
+size_t md_row_queue_chunks(struct md_row_queue *queue)
 {
-    pthread_mutex_lock(&row_queue->mutex);
-    size_t count = row_queue->count;
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_lock(&queue->mutex);
+    size_t count = queue->count;
+    pthread_mutex_unlock(&queue->mutex);
     return count;
 }
 
-uint64_t md_row_queue_dropped(struct md_row_queue *row_queue)
+uint64_t md_row_queue_dropped(struct md_row_queue *queue)
 {
-    pthread_mutex_lock(&row_queue->mutex);
-    uint64_t dropped = row_queue->dropped;
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_lock(&queue->mutex);
+    uint64_t dropped = queue->dropped;
+    pthread_mutex_unlock(&queue->mutex);
     return dropped;
 }
 
 /* ---- calls ---- */
 
-void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number)
+void md_row_queue_call(struct md_row_queue *queue, uint32_t number)
 {
-    pthread_mutex_lock(&row_queue->mutex);
-    row_queue->called[number / 64] |= UINT64_C(1) << number % 64;
-    row_queue->least = number < row_queue->least ? number : row_queue->least;
-    row_queue->most = number > row_queue->most ? number : row_queue->most;
-    pthread_cond_signal(&row_queue->called_up);
-    pthread_mutex_unlock(&row_queue->mutex);
+    pthread_mutex_lock(&queue->mutex);
+    uint64_t *word = &queue->called[number / 64], bit = UINT64_C(1) << number % 64;
+    queue->calls += !(*word & bit);
+    *word |= bit;
+    pthread_cond_signal(&queue->called_up);
+    pthread_mutex_unlock(&queue->mutex);
 }
 
-static int take_calls(struct md_row_queue *row_queue, uint32_t *numbers, int room)
+static int take_calls(struct md_row_queue *queue, uint32_t *numbers, int room)
 {
     int n = 0;
-    uint32_t number = row_queue->least;
-    for (; number <= row_queue->most && n < room; number++) {
-        uint64_t bit = UINT64_C(1) << number % 64;
-        if (row_queue->called[number / 64] & bit)
-            numbers[n++] = number;
-        row_queue->called[number / 64] &= ~bit;
-    }
-    row_queue->least = number;
-    if (number > row_queue->most) {
-        row_queue->least = MD_MOST_NUMBERS;
-        row_queue->most = 0;
-    }
+    for (uint32_t word = 0; queue->calls && n < room; word++)
+        for (; queue->called[word] && n < room; queue->calls--) {
+            numbers[n++] = 64 * word + (uint32_t)__builtin_ctzll(queue->called[word]);
+            queue->called[word] &= queue->called[word] - 1;
+        }
     return n;
 }
 
-int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room)
+int md_row_queue_await(struct md_row_queue *queue, int64_t timeout_ns, uint32_t *numbers, int room)
 {
     int64_t until_ns = md_now_ns() + timeout_ns;
-    pthread_mutex_lock(&row_queue->mutex);
-    while (row_queue->least > row_queue->most && wait_until(&row_queue->called_up, &row_queue->mutex, until_ns) == 0)
+    pthread_mutex_lock(&queue->mutex);
+    while (!queue->calls && wait_until(&queue->called_up, &queue->mutex, until_ns) == 0)
         ;
-    int n = take_calls(row_queue, numbers, room);
-    pthread_mutex_unlock(&row_queue->mutex);
+    int n = take_calls(queue, numbers, room);
+    pthread_mutex_unlock(&queue->mutex);
     return n;
 }

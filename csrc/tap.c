@@ -1,16 +1,10 @@
-/* What goes over a line, kept until somebody takes it as packets of a pcapng file.
+/* A ring of all that goes over a line, taken as packets of a pcapng file.
  *
- * The line's thread puts, one other takes, and neither waits for the other: what finds no room is
+ * The line's thread writes, one other reads, and neither waits for the other: bytes without room are
  * counted. */
 #include "internal.h"
 
 #include <string.h>
-
-enum {
-    ENHANCED_PACKET = 6,
-    PACKET_HEAD = 28,
-    BLOCK_END = 4
-};
 
 /* Stands in the ring before the bytes. */
 struct mark {
@@ -28,24 +22,27 @@ static void set(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_RELEASE);
 }
 
-/* How much of it lies before the ring's end. */
-static size_t unbroken(const struct md_tap *tap, uint32_t at, size_t len)
+/* Find a place in the ring, and how much of `len` bytes lies before the ring's end. */
+static uint8_t *place(const struct md_tap *tap, uint32_t at, size_t len, size_t *first)
 {
-    size_t left = tap->room - (at & (tap->room - 1));
-    return len < left ? len : left;
+    uint32_t offset = at & (tap->room - 1);
+    *first = len < tap->room - offset ? len : tap->room - offset;
+    return tap->ring + offset;
 }
 
 static void copy_in(const struct md_tap *tap, uint32_t at, const void *from, size_t len)
 {
-    size_t first = unbroken(tap, at, len);
-    memcpy(tap->ring + (at & (tap->room - 1)), from, first);
+    size_t first;
+    uint8_t *to = place(tap, at, len, &first);
+    memcpy(to, from, first);
     memcpy(tap->ring, (const uint8_t *)from + first, len - first);
 }
 
 static void copy_out(const struct md_tap *tap, uint32_t at, void *to, size_t len)
 {
-    size_t first = unbroken(tap, at, len);
-    memcpy(to, tap->ring + (at & (tap->room - 1)), first);
+    size_t first;
+    const uint8_t *from = place(tap, at, len, &first);
+    memcpy(to, from, first);
     memcpy((uint8_t *)to + first, tap->ring, len - first);
 }
 
@@ -71,12 +68,13 @@ static uint8_t *put32(uint8_t *at, uint32_t value)
     return at;
 }
 
-/* Write all of a packet but its bytes, for which room is left; where they belong. */
+/* Write all of a packet but its bytes; return where those belong. */
 static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len, uint8_t *out)
 {
     uint32_t packet = wrapping->head_len + len, padding = -packet & 3;
-    uint32_t size = PACKET_HEAD + packet + padding + wrapping->tail_len + BLOCK_END;
-    const uint32_t head[] = {ENHANCED_PACKET, size, interface, (uint32_t)((uint64_t)time_ns >> 32), (uint32_t)time_ns, packet, packet};
+    uint32_t size = MD_PACKET_HEAD + packet + padding + wrapping->tail_len + MD_PACKET_END;
+    uint64_t time = (uint64_t)time_ns;
+    const uint32_t head[] = {MD_PACKET_BLOCK, size, interface, (uint32_t)(time >> 32), (uint32_t)time, packet, packet};
     for (size_t i = 0; i < sizeof head / sizeof *head; i++)
         out = put32(out, head[i]);
     memcpy(out, wrapping->head, wrapping->head_len);
@@ -95,7 +93,7 @@ static const struct md_wrapping *wrapping_of(const struct md_wrapping *wrappings
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len)
 {
     const struct md_wrapping *wrapping = wrapping_of(wrappings, (uint32_t)side, first);
-    return PACKET_HEAD + ((wrapping->head_len + len + 3) & ~(size_t)3) + wrapping->tail_len + BLOCK_END;
+    return MD_PACKET_HEAD + ((wrapping->head_len + len + 3) & ~(size_t)3) + wrapping->tail_len + MD_PACKET_END;
 }
 
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,

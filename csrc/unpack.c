@@ -1,10 +1,11 @@
-/* Packets out of capture files: pcap and pcapng, as others and we write them.
+/* Take packets out of capture files: pcap and pcapng, as others and we write them.
  *
  * The blocks that describe a pcapng file's interfaces are rare, and the caller's to read. */
 #include "internal.h"
 
 enum {
-    ENHANCED_PACKET = 6,
+    RECORD_HEAD = 16, /* of pcap */
+    LEAST_BLOCK = 12, /* of pcapng */
     MOST_PACKET = 1 << 16,
     RTAC_HEADER = 12,
     TAG_PORT_OF_SENDER = 25
@@ -15,19 +16,12 @@ static const struct { uint32_t port; uint8_t side; } senders[] = {
     {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
 
-static uint32_t number(const struct md_capture *capture, const uint8_t *at, int bytes)
+/* Read 32 bits in the file's own order. */
+static uint32_t number(const struct md_capture *capture, const uint8_t *at)
 {
     uint32_t value = 0;
-    for (int i = 0; i < bytes; i++)
-        value = value << 8 | at[capture->is_big_endian ? i : bytes - 1 - i];
-    return value;
-}
-
-static uint32_t big_endian(const uint8_t *at, int bytes)
-{
-    uint32_t value = 0;
-    for (int i = 0; i < bytes; i++)
-        value = value << 8 | at[i];
+    for (int i = 0; i < 4; i++)
+        value = value << 8 | at[capture->is_big_endian ? i : 3 - i];
     return value;
 }
 
@@ -42,19 +36,19 @@ static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint
     if (link != MD_LINK_EXPORTED)
         return 0;
     for (size_t at = 0; at + 4 <= len;) {
-        uint32_t tag = big_endian(packet + at, 2), size = big_endian(packet + at + 2, 2);
+        unsigned tag = md_get16(packet + at), size = md_get16(packet + at + 2);
         at += 4;
         if (tag == 0)
             return at;
         for (size_t i = 0; tag == TAG_PORT_OF_SENDER && size == 4 && at + 4 <= len && i < 4; i++)
-            if (big_endian(packet + at, 4) == senders[i].port)
+            if (((uint32_t)md_get16(packet + at) << 16 | md_get16(packet + at + 2)) == senders[i].port)
                 *side = senders[i].side;
         at += size;
     }
     return len;
 }
 
-/* A packet of this channel: 0 when there is no room for it. */
+/* Append a packet to its channel; 0 when there is no room for it. */
 static int put(struct md_channel *channel, const uint8_t *packet, size_t len, uint64_t ticks)
 {
     struct md_piece piece = {.is_after_pause = 1};
@@ -75,17 +69,17 @@ static int unpack_pcap(struct md_capture *capture)
     while (capture->at < capture->len) {
         const uint8_t *record = capture->bytes + capture->at;
         size_t left = capture->len - capture->at;
-        if (left < 16)
+        if (left < RECORD_HEAD)
             return MD_CUT;
-        uint32_t len = number(capture, record + 8, 4);
+        uint32_t len = number(capture, record + 8);
         if (len > MOST_PACKET)
             return MD_NONSENSE;
-        if (left < 16 + len)
+        if (left < RECORD_HEAD + len)
             return MD_CUT;
-        uint64_t ticks = number(capture, record, 4) * channel->ticks_per_s + number(capture, record + 4, 4);
-        if (!put(channel, record + 16, len, ticks))
+        uint64_t ticks = number(capture, record) * channel->ticks_per_s + number(capture, record + 4);
+        if (!put(channel, record + RECORD_HEAD, len, ticks))
             return MD_CHANNEL_FULL;
-        capture->at += 16 + len;
+        capture->at += RECORD_HEAD + len;
     }
     return MD_UNPACKED;
 }
@@ -95,21 +89,21 @@ static int unpack_pcapng(struct md_capture *capture)
     while (capture->at < capture->len) {
         const uint8_t *block = capture->bytes + capture->at;
         size_t left = capture->len - capture->at;
-        if (left < 12)
+        if (left < LEAST_BLOCK)
             return MD_CUT;
-        if (number(capture, block, 4) != ENHANCED_PACKET)
+        if (number(capture, block) != MD_PACKET_BLOCK)
             return MD_OTHER_BLOCK;
-        uint32_t size = number(capture, block + 4, 4);
-        if (size % 4 || size < 32 || size > 2 * MOST_PACKET)
+        uint32_t size = number(capture, block + 4);
+        if (size % 4 || size < MD_PACKET_HEAD + MD_PACKET_END || size > 2 * MOST_PACKET)
             return MD_NONSENSE;
         if (left < size)
             return MD_CUT;
-        uint32_t interface = number(capture, block + 8, 4), len = number(capture, block + 20, 4);
-        if (interface >= capture->count || len > size - 32 || len > MOST_PACKET ||
-            number(capture, block + size - 4, 4) != size)
+        uint32_t interface = number(capture, block + 8), len = number(capture, block + 20);
+        if (interface >= capture->count || len > size - MD_PACKET_HEAD - MD_PACKET_END || len > MOST_PACKET ||
+            number(capture, block + size - MD_PACKET_END) != size)
             return MD_NONSENSE;
-        uint64_t ticks = (uint64_t)number(capture, block + 12, 4) << 32 | number(capture, block + 16, 4);
-        if (!put(&capture->channels[interface], block + 28, len, ticks))
+        uint64_t ticks = (uint64_t)number(capture, block + 12) << 32 | number(capture, block + 16);
+        if (!put(&capture->channels[interface], block + MD_PACKET_HEAD, len, ticks))
             return MD_CHANNEL_FULL;
         capture->at += size;
     }

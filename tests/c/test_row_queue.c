@@ -1,5 +1,5 @@
 /* How far UTC is ahead is asked for again and again, on clocks that are the test's own. */
-#include "multidrop.h"
+#include "internal.h"
 
 #include <assert.h>
 #include <stddef.h>

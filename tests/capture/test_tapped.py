@@ -24,7 +24,7 @@ from multidrop.capture import flight_recorder as flight
 from multidrop.capture.anomalies import Watch
 from multidrop.capture.pcapng_writer import WRAPPINGS
 from multidrop.cli.poll.tapping import tapping_text
-from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Result, Splitter, Tap
+from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
 from multidrop.drives import InnovertIBD
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
@@ -35,7 +35,7 @@ from multidrop.sim import EncodedDrive, Simulator, Wire
 __all__ = ["run"]  # a fixture
 
 FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 5, "reply cut short": 5})
-NEVER_ON_THE_LINE = {str(it) for it in (Result.NOT_ASKED, Result.LATE_ANSWER_DUE, Result.EXPIRED)}
+NEVER_ON_THE_LINE = {str(it) for it in (Status.NOT_ASKED, Status.LATE_ANSWER_DUE, Status.EXPIRED)}
 
 
 class RoughWire(LateWire):

@@ -22,7 +22,7 @@ from toy import Toy
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
 from multidrop.cli.demo import DRIVES, _start_motors
-from multidrop.core import Result
+from multidrop.core import Status
 from multidrop.errors import NoReply
 from multidrop.polling.batch import Row
 from multidrop.recording import open_reader, open_writer
@@ -112,7 +112,7 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
             bus.read(bus.attach(Toy, 1), Toy.output_current)
 
 
-LATE_OR_SILENT = {str(it) for it in (Result.NO_REPLY, Result.LATE_ANSWER_DUE, Result.NOT_ASKED)}
+LATE_OR_SILENT = {str(it) for it in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
 
 
 def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
-from multidrop.core import Completion, Framing, Message, Result, build_reply
+from multidrop.core import Completion, Failure, Framing, Message, build_reply
 from multidrop.drive.timing import Settings
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -48,7 +48,7 @@ SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
 REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
-def heard(raw: bytes, result: int = Result.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
+def heard(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
     """What became of the request that nobody should answer."""
     reply = Message(0xF7, 3, exception=exception)
     return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)

@@ -23,7 +23,7 @@ from multidrop.cli.monitor.keys import DOWN, ENTER, KEYS, PAGE_DOWN, PAGE_UP, UP
 from multidrop.cli.monitor.screen import BLOCKS, PLAIN_BLOCKS, Position, overview, page, sparkline
 from multidrop.cli.monitor.watched import WatchedPlant
 from multidrop.control.stop_all import Seen, Stopped
-from multidrop.core import Counters, Result
+from multidrop.core import Counters, Status
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row
@@ -36,7 +36,7 @@ __all__ = ["plant", "run"]  # fixtures
 SECOND = 1_000_000_000
 NOW = 1_795_253_400 * SECOND
 CHE = ("output_frequency", "output_current", "status", "fault")
-MISSES = Counter({Result.NO_REPLY: 3, Result.BAD_CHECKSUM: 9})
+MISSES = Counter({Status.NO_REPLY: 3, Status.BAD_CHECKSUM: 9})
 
 
 def a_plant(tmp_path: Path, drives: int = 3) -> Plant:

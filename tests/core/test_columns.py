@@ -8,11 +8,13 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+from completions import add_miss, add_rows
 from frames import words
 from line_driver import MS, LineDriver
 
 from multidrop.core import (
     EXCEPTION_STATUS,
+    STATUSES,
     Columns,
     Exchange,
     Field,
@@ -21,13 +23,12 @@ from multidrop.core import (
     Names,
     NumberFormat,
     Peer,
-    Result,
     RowLayout,
     RowQueue,
+    Status,
     build_reply,
     raw_value,
     spell,
-    status_text,
 )
 
 UTC = 1_700_000_000_000_000_000  # what monotonic time lies behind
@@ -106,7 +107,7 @@ def test_rows_of_a_block() -> None:
         ],
     )
     columns = Columns(8)
-    assert columns.add(block, reply(3, 0xFFFF, 0xFF9C), UTC)
+    assert add_rows(columns, block, reply(3, 0xFFFF, 0xFF9C), UTC)
     assert len(columns) == 3
     sent = 1000 * MS
     assert list(columns.array("time")) == [UTC + sent] * 3
@@ -123,7 +124,7 @@ def test_rows_of_a_block() -> None:
 def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
     """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
     columns = Columns(1)
-    assert columns.add(RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)
+    assert add_rows(columns, RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)
     assert columns.array("value")[0] == raw / divisor
 
 
@@ -133,9 +134,9 @@ ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
 @pytest.mark.parametrize(
     ("received", "status", "text"),
     [
-        (b"", -Result.NO_REPLY, "no reply"),
-        (b"\x01\x03", -Result.CUT_SHORT, "reply cut short"),
-        (b"\x01\x03\x02\x00\x00\x00\x00", -Result.BAD_CHECKSUM, "bad checksum"),
+        (b"", Status.NO_REPLY, "no reply"),
+        (b"\x01\x03", Status.CUT_SHORT, "reply cut short"),
+        (b"\x01\x03\x02\x00\x00\x00\x00", Status.BAD_CHECKSUM, "bad checksum"),
         (
             build_reply(Framing.RTU, Message(1, 0x03, exception=0x12)),
             EXCEPTION_STATUS + 0x12,
@@ -145,17 +146,17 @@ ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
 )
 def test_missing_value_has_a_row_that_says_why(received: bytes, status: int, text: str) -> None:
     columns = Columns(1)
-    assert columns.add(ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
+    assert add_rows(columns, ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
     assert list(columns.array("status")) == [status]
-    assert status_text(columns.array("status")[0]) == text
+    assert STATUSES[columns.array("status")[0]] == text
     assert (columns.array("valid")[0] & 1, columns.array("value")[0]) == (0, 0.0)
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
 def test_value_that_was_due_but_never_asked_for() -> None:
     columns = Columns(2)
-    assert columns.add_miss(ONE, Result.NOT_ASKED, 77 * MS, UTC)
-    assert (columns.array("status")[0], columns.array("sent")[0]) == (-Result.NOT_ASKED, 77 * MS)
+    assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
+    assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
     assert columns.array("valid")[0] & 1 == 0
 
 
@@ -175,15 +176,15 @@ def test_request_that_never_left_has_the_time_at_which_it_was_taken_up() -> None
     )
     line.lose(5)
     columns = Columns(1)
-    assert columns.add(ONE, line.found, UTC)
-    assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, -Result.LINE_LOST)
+    assert add_rows(columns, ONE, line.found, UTC)
+    assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, Status.LINE_LOST)
 
 
 def test_field_beyond_the_reply_is_a_miss() -> None:
     columns = Columns(2)
     block = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
-    assert columns.add(block, reply(9), 0)
-    assert list(columns.array("status")) == [0, -Result.BAD_LENGTH]
+    assert add_rows(columns, block, reply(9), 0)
+    assert list(columns.array("status")) == [0, Status.BAD_LENGTH]
     assert list(columns.array("value")) == [9, 0]
 
 
@@ -192,7 +193,7 @@ def test_bitmap_of_values_and_misses() -> None:
     good, bad = reply(1), completed(Message(1, 0x03, 0, 1), b"")
     pattern = [1, 0, 0, 1, 1, 1, 0, 1, 0, 0, 1, 1, 0, 1, 0, 1, 1, 0, 0, 1]
     for bit in pattern:
-        assert columns.add(ONE, good if bit else bad, 0)
+        assert add_rows(columns, ONE, good if bit else bad, 0)
     valid = columns.array("valid")
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
@@ -201,11 +202,11 @@ def test_block_without_room_is_left_out_whole() -> None:
     columns = Columns(3)
     two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     answer = reply(1, 2)
-    assert columns.add(two, answer, 0)
-    assert not columns.add(two, answer, 0)
+    assert add_rows(columns, two, answer, 0)
+    assert not add_rows(columns, two, answer, 0)
     assert len(columns) == 2
-    assert columns.add(ONE, answer, 0)
-    assert not columns.add(ONE, answer, 0)
+    assert add_rows(columns, ONE, answer, 0)
+    assert not add_rows(columns, ONE, answer, 0)
     assert list(columns.array("value")) == [1, 2, 1]
 
 
@@ -236,13 +237,13 @@ BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for registe
 
 def test_a_block_without_fields_leaves_nothing() -> None:
     row_queue = RowQueue()
-    row_queue.add_miss(RowLayout(0, []), Result.NOT_ASKED, 5)
+    row_queue.add_miss(RowLayout(0, []), Status.NOT_ASKED, 5)
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
 
 
 def test_a_block_that_no_chunk_can_hold_is_counted() -> None:
     row_queue = RowQueue(chunk_rows=2)
-    row_queue.add_miss(BLOCK, Result.NOT_ASKED, 5)
+    row_queue.add_miss(BLOCK, Status.NOT_ASKED, 5)
     assert row_queue.dropped == 3
 
 
@@ -251,7 +252,7 @@ def test_chunks_that_were_taken_can_all_be_given_back() -> None:
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
         for due in range(100):
-            row_queue.add_miss(BLOCK, Result.NOT_ASKED, due * turn)
+            row_queue.add_miss(BLOCK, Status.NOT_ASKED, due * turn)
         taken = [row_queue.take() for _ in range(100)]
         assert [[*it.array("sent")] for it in taken if it] == [[due * turn] * 3 for due in range(100)]
         del taken

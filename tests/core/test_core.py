@@ -15,6 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from completions import pending, status_of
 from frames import words
 from lines import until
 from multidrop._core import ffi
@@ -22,10 +23,12 @@ from multidrop._core import ffi
 from multidrop.core import (
     EXCEPTION_STATUS,
     REFUSALS,
+    STATUSES,
     Columns,
     Completion,
     Echo,
     Exchange,
+    Failure,
     Field,
     Framing,
     Latch,
@@ -34,13 +37,12 @@ from multidrop.core import (
     Peer,
     Permit,
     Port,
-    Result,
     RowLayout,
     RowQueue,
+    Status,
     build_reply,
     now_ns,
     parse_request,
-    status_text,
 )
 
 PARITY = next(bit for bit, name in REFUSALS.items() if name == "parity")
@@ -177,7 +179,7 @@ def test_a_queue_takes_no_more_than_it_has_room_for(drive: Drive) -> None:
         queued = [read(start) for start in range(6)]
         assert port.submit(queued, later) == 4
         assert port.submit(queued, later) == 0
-        assert port.pending == 4
+        assert pending(port) == 4
 
 
 def test_nothing_is_sent_before_its_time(drive: Drive) -> None:
@@ -198,10 +200,10 @@ def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) 
         rows, now = Rows(port), now_ns()
         queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
         port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
-        said = [status_text(it) for it in rows.of("status", len(queued))]
+        said = [STATUSES[it] for it in rows.of("status", len(queued))]
     over = "not sent: expired"
     assert said == [over, "ok", over, "ok", "ok", "ok"]
-    assert fast.peer.counters().missed == {Result.EXPIRED: 2}
+    assert fast.peer.counters().missed == {Status.EXPIRED: 2}
 
 
 def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None:
@@ -223,7 +225,7 @@ def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
         assert rows.of("value", so_far + 10)[-1] == 7
         port.repeat([])
         assert not port.repeating
-        assert port.carry_out(read(9)).status == 0
+        assert status_of(port.carry_out(read(9))) == 0
 
 
 def test_how_far_the_repetition_was_is_told(drive: Drive) -> None:
@@ -242,7 +244,7 @@ def test_what_is_queued_goes_between_what_is_repeated(drive: Drive) -> None:
         port.repeat([read(0)])
         queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
         port.submit(queued, [due_ns, due_ns])
-        wait_until(lambda: port.pending == 0)
+        wait_until(lambda: not pending(port))
         port.stop()
         values, sent = rows.of("value", 3), rows.of("sent", 3)
     assert values[0] == 0  # nobody waited for what was not due
@@ -257,7 +259,7 @@ def test_what_cannot_be_sent_is_not_tried_again_and_again(drive: Drive) -> None:
         rows = Rows(port)
         port.repeat([read(1, peer=slow), read(2, peer=slow)])
         wait_until(lambda: not port.repeating)
-        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+        assert rows.of("status", 2) == [Status.NO_REPLY, Status.LATE_ANSWER_DUE]
 
 
 def test_the_client_is_called_when_a_drive_fails_and_when_it_is_back(drive: Drive) -> None:
@@ -302,7 +304,7 @@ def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
         port.report_to(row_queue, 0)
         queued = [read(start) for start in range(35)]
         port.submit(queued, [0] * 35)
-        wait_until(lambda: port.pending == 0)
+        wait_until(lambda: not pending(port))
         assert (row_queue.chunks, row_queue.dropped) == (2, 20)
         kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
         assert [it for columns in kept for it in columns.array("value")] == [*range(10), *range(30, 35)]
@@ -314,7 +316,7 @@ def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
         port.report_to(row_queue, 0)
         queued = [read(start) for start in range(100)]
         port.submit(queued, [0] * 100)
-        wait_until(lambda: port.pending == 0)
+        wait_until(lambda: not pending(port))
         columns = row_queue.take()
         assert columns is not None
         values = columns.array("value")
@@ -329,7 +331,7 @@ def test_rows_outlive_what_they_were_taken_from(drive: Drive) -> None:
         port.report_to(row_queue, 0)
         queued = [read(7)]
         port.submit(queued, [0])
-        wait_until(lambda: port.pending == 0)
+        wait_until(lambda: not pending(port))
         columns = row_queue.take()
     assert columns is not None
     ffi.release(row_queue.c)  # as a collector of garbage does that finds both at once
@@ -380,7 +382,7 @@ def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None
         asked = read(7, peer=nobody, echo_probe=read(99, peer=nobody))
         asked.c.insists = asked.echo_probe.c.insists = 1
         for _ in range(2):
-            assert port.carry_out(asked).result == Result.NO_REPLY
+            assert port.carry_out(asked).result == Failure.NO_REPLY
         until(lambda: heard == [99, 7, 99, 7])  # which the far end may do later
 
 
@@ -404,7 +406,7 @@ def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
         port.submit(waiting, [now_ns() + 60_000_000_000])
         found = port.carry_out(read(7))
         assert (found.result, found.reply.data) == (7, words(7))
-        assert port.pending == 1
+        assert pending(port) == 1
 
 
 def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
@@ -416,7 +418,7 @@ def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
         found = port.carry_out(read(3), expires_ns=now_ns() - 1)
-        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+        assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
         assert port.carry_out(read(4)).result == 7
     assert heard == [4]
 
@@ -448,7 +450,7 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
         found = port.carry_out(read(3), expires_ns=now_ns() + 50_000_000)
-        assert (found.result, found.sent_ns) == (Result.EXPIRED, 0)
+        assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
 
 
 def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_its_drive(drive: Drive) -> None:
@@ -485,7 +487,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
         for thread in threads:
             thread.join(30)
     assert heard == [0, 98, 99, 1, 51, 52]
-    assert (found[50].result, found[50].sent_ns) == (Result.EXPIRED, 0)
+    assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
 def test_a_permit_is_good_until_its_latch_rises_and_never_while_that_is_held() -> None:
@@ -527,7 +529,7 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     for thread in threads:
         thread.join(30)
     port.close()
-    assert [it.result for it in found] == [Result.LINE_LOST] * 2
+    assert [it.result for it in found] == [Failure.LINE_LOST] * 2
     assert sorted(it.sent_ns > 0 for it in found) == [False, True]
 
 
@@ -576,7 +578,7 @@ def test_a_port_is_woken_in_time_after_another_was_closed(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         first.close()
         port.submit([read(1)], [now_ns() + 20_000_000])
-        until(lambda: not port.pending)
+        until(lambda: not pending(port))
 
 
 def test_what_is_queued_lives_until_it_was_carried_out(drive: Drive) -> None:
@@ -590,7 +592,7 @@ def test_what_is_queued_lives_until_it_was_carried_out(drive: Drive) -> None:
 def test_exception_is_a_completion_like_any_other(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
     with closing(Port(fd, NO_SETTINGS)) as port:
-        assert port.carry_out(read(0)).status == EXCEPTION_STATUS + 2
+        assert status_of(port.carry_out(read(0))) == EXCEPTION_STATUS + 2
 
 
 def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
@@ -599,7 +601,7 @@ def test_silent_drive_does_not_end_the_run(drive: Drive) -> None:
         rows = Rows(port)
         queued = [read(0), read(1, timeout=0.02), read(2)]
         port.submit(queued, [0] * 3)
-        assert rows.of("status", 3) == [0, -Result.NO_REPLY, 0]
+        assert rows.of("status", 3) == [0, Status.NO_REPLY, 0]
 
 
 def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> None:
@@ -609,7 +611,7 @@ def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> 
         rows = Rows(port)
         queued = [read(1, peer=slow), read(2, peer=slow)]
         port.submit(queued, [0] * 2)
-        assert rows.of("status", 2) == [-Result.NO_REPLY, -Result.LATE_ANSWER_DUE]
+        assert rows.of("status", 2) == [Status.NO_REPLY, Status.LATE_ANSWER_DUE]
         assert slow.failures == 1
         wait_until(lambda: now_ns() > slow.late_until_ns)
         assert port.carry_out(queued[1]).result == 7
@@ -634,7 +636,7 @@ def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
     )
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
         sent, read_back = port.carry_out(stop), port.carry_out(read(7))
-    assert (sent.status, read_back.status) == (0, 0)
+    assert (status_of(sent), status_of(read_back)) == (0, 0)
     assert heard == [0, 1]
     assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
@@ -647,9 +649,9 @@ def test_all_that_is_queued_on_a_lost_port_says_so() -> None:
         far.close()
         queued = [read(0), read(1), read(2)]
         port.submit(queued, [0] * 3)
-        assert rows.of("status", 3) == [-Result.LINE_LOST] * 3
+        assert rows.of("status", 3) == [Status.LINE_LOST] * 3
         assert port.lost
-        assert port.carry_out(read(0)).result == Result.LINE_LOST
+        assert port.carry_out(read(0)).result == Failure.LINE_LOST
     near.close()
 
 
@@ -660,8 +662,8 @@ def test_pty_whose_far_end_hangs_up() -> None:
         os.close(master)
         found = port.carry_out(read(0))
         assert (found.result, found.error) in (
-            (Result.LINE_LOST, errno.EIO),
-            (Result.LINE_LOST, 0),  # the end of the file
+            (Failure.LINE_LOST, errno.EIO),
+            (Failure.LINE_LOST, 0),  # the end of the file
         )
     os.close(slave)
 
@@ -673,11 +675,11 @@ def test_refused_settings_that_must_be_taken() -> None:
     os.set_blocking(master, False)
     with closing(Port(slave, PARITY)) as port:
         found = port.carry_out(read(0, format="8E1"))
-        assert (found.result, found.error, found.sent_ns) == (Result.SETTINGS_REFUSED, PARITY, 0)
+        assert (found.result, found.error, found.sent_ns) == (Failure.SETTINGS_REFUSED, PARITY, 0)
     with pytest.raises(BlockingIOError):
         os.read(master, 1)
     with closing(Port(slave, ANY_SETTINGS)) as port:
-        assert port.carry_out(read(0, format="8E1", timeout=0.001)).result == Result.NO_REPLY
+        assert port.carry_out(read(0, format="8E1", timeout=0.001)).result == Failure.NO_REPLY
     os.close(slave)
     os.close(master)
 
@@ -698,7 +700,7 @@ def test_what_a_change_of_settings_takes_is_measured() -> None:
 def test_port_that_should_have_settings_and_has_none(drive: Drive) -> None:
     with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
         found = port.carry_out(read(0))
-        assert (found.result, found.error) == (Result.LINE_LOST, errno.ENOTTY)
+        assert (found.result, found.error) == (Failure.LINE_LOST, errno.ENOTTY)
 
 
 def test_a_descriptor_that_is_none_is_refused() -> None:
@@ -720,7 +722,7 @@ def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Dr
     heard.wait()
     port.close()
     waiting.join()
-    assert found == [Result.LINE_LOST]
+    assert found == [Failure.LINE_LOST]
 
 
 def test_ports_come_and_go(drive: Drive) -> None:
@@ -795,7 +797,7 @@ def test_memory_is_flat_over_many_exchanges(drive: Drive, exchanges: int) -> Non
         assert resident_after(exchanges) - before < 1_000_000  # that is 20 bytes each, or 100
 
 
-@pytest.mark.parametrize("result", list(Result))
-def test_every_result_has_its_words(result: Result) -> None:
-    assert status_text(-result)
-    assert status_text(-result) == str(result)
+@pytest.mark.parametrize("status", list(Status))
+def test_every_status_has_its_words(status: Status) -> None:
+    assert str(status)
+    assert STATUSES[status] == str(status)

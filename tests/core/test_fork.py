@@ -19,7 +19,7 @@ from test_line_ports import SerialServer
 from toy import Toy
 
 from multidrop.bus import Bus
-from multidrop.core import Field, NumberFormat, Result, RowLayout, RowQueue
+from multidrop.core import Field, NumberFormat, RowLayout, RowQueue, Status
 from multidrop.core.fork import only_here
 from multidrop.drives import InvtCHE
 from multidrop.errors import LineError, NoReply
@@ -254,7 +254,7 @@ def test_memory_that_a_thread_may_hold_is_not_given_back_in_a_child() -> None:
 
 def test_rows_that_wait_are_the_parent_s_to_take() -> None:
     row_queue, block = RowQueue(), RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
-    row_queue.add_miss(block, Result.NO_REPLY, 0)
+    row_queue.add_miss(block, Status.NO_REPLY, 0)
     assert in_child(row_queue.take) is None
     found = row_queue.take()
     assert found is not None

@@ -14,10 +14,10 @@ from multidrop._core import lib
 from multidrop.core import (
     Completion,
     Exchange,
+    FrameFault,
     Framing,
     Message,
     Peer,
-    Result,
     build_reply,
     build_request,
     crc16,
@@ -30,7 +30,7 @@ RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 
 GOOD_REQUESTS = [it for it in PRINTED if it.direction == "request" and it.verdict != "bad checksum"]
 GOOD_REPLIES = [it for it in PRINTED if it.direction == "reply" and isinstance(it.says, Message)]
-REFUSED = [it for it in PRINTED if isinstance(it.says, Result)]
+REFUSED = [it for it in PRINTED if isinstance(it.says, FrameFault)]
 MISPRINTED = "01 89 01 86 50"  # E13: what a drive may say, but our simulators never do
 
 
@@ -98,7 +98,7 @@ def test_89h_is_accepted_for_88h_but_never_said() -> None:
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
     assert build_reply(RTU, refusal) == bytes.fromhex("01 88 01 87 C0")
     # it is an exception to 08 and to nothing else
-    assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == Result.BAD_FUNCTION
+    assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
 @pytest.mark.parametrize("printed", REFUSED, ids=str)
@@ -109,7 +109,7 @@ def test_misprinted_frame_is_refused(printed: Printed) -> None:
 @pytest.mark.parametrize("printed", GOOD_REQUESTS + GOOD_REPLIES, ids=str)
 def test_part_of_a_frame_is_incomplete(printed: Printed) -> None:
     for length in range(len(printed.frame)):
-        assert parse(printed, printed.frame[:length]) == (Result.INCOMPLETE, None)
+        assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
 
 
 @pytest.mark.parametrize("after", [b"\x00", b":", b"\x01\x03\x02", b"\xff" * 300])
@@ -147,7 +147,7 @@ def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], byt
     frame = finish(f"0103FA{data.hex().upper()}")
     used, reply = parse_reply(framing, frame, Message(1, 0x03, 0, 125))
     assert (used, reply and reply.data) == (len(frame), data)
-    assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (Result.INCOMPLETE, None)
+    assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (FrameFault.INCOMPLETE, None)
 
 
 # ---- never wrong data: what others were seen to take for an answer ----
@@ -176,57 +176,63 @@ WRONG = [
         RTU,
         READ_TWO,
         rtu("01 04 04 11 11 22 22"),
-        Result.BAD_FUNCTION,
+        FrameFault.BAD_FUNCTION,
     ),
-    ("one input register for two holding ones", RTU, READ_TWO, rtu("01 04 02 11 11"), Result.BAD_FUNCTION),
-    ("coils for registers", RTU, READ_TWO, rtu("01 01 04 11 11 22 22"), Result.BAD_FUNCTION),
-    ("exception to another function", RTU, READ_TWO, rtu("01 84 02"), Result.BAD_FUNCTION),
-    ("exception without a code", RTU, READ_TWO, rtu("01 83 00"), Result.BAD_FUNCTION),
+    (
+        "one input register for two holding ones",
+        RTU,
+        READ_TWO,
+        rtu("01 04 02 11 11"),
+        FrameFault.BAD_FUNCTION,
+    ),
+    ("coils for registers", RTU, READ_TWO, rtu("01 01 04 11 11 22 22"), FrameFault.BAD_FUNCTION),
+    ("exception to another function", RTU, READ_TWO, rtu("01 84 02"), FrameFault.BAD_FUNCTION),
+    ("exception without a code", RTU, READ_TWO, rtu("01 83 00"), FrameFault.BAD_FUNCTION),
     # pymodbus takes another number of registers
-    ("one register for two", RTU, READ_TWO, rtu("01 03 02 11 11"), Result.BAD_LENGTH),
-    ("three registers for two", RTU, READ_TWO, rtu("01 03 06 11 11 22 22 33 33"), Result.BAD_LENGTH),
-    ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), Result.BAD_LENGTH),
-    ("no register", RTU, READ_TWO, rtu("01 03 00"), Result.BAD_LENGTH),
-    ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), Result.BAD_LENGTH),
+    ("one register for two", RTU, READ_TWO, rtu("01 03 02 11 11"), FrameFault.BAD_LENGTH),
+    ("three registers for two", RTU, READ_TWO, rtu("01 03 06 11 11 22 22 33 33"), FrameFault.BAD_LENGTH),
+    ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), FrameFault.BAD_LENGTH),
+    ("no register", RTU, READ_TWO, rtu("01 03 00"), FrameFault.BAD_LENGTH),
+    ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), FrameFault.BAD_LENGTH),
     # pymodbus takes another value, libmodbus another address or value of 05, 06 and 10H
-    ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), Result.BAD_ECHO),
-    ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), Result.BAD_ECHO),
-    ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), Result.BAD_ECHO),
-    ("another register confirmed", RTU, WRITE_ONE, rtu("01 06 00 11 12 34"), Result.BAD_ECHO),
-    ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), Result.BAD_ECHO),
-    ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), Result.BAD_ECHO),
-    ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), Result.BAD_ECHO),
+    ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), FrameFault.BAD_ECHO),
+    ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), FrameFault.BAD_ECHO),
+    ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), FrameFault.BAD_ECHO),
+    ("another register confirmed", RTU, WRITE_ONE, rtu("01 06 00 11 12 34"), FrameFault.BAD_ECHO),
+    ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), FrameFault.BAD_ECHO),
+    ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), FrameFault.BAD_ECHO),
+    ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), FrameFault.BAD_ECHO),
     # everybody takes a late reply, if only it has the right shape; what can be told apart is
     (
         "late reply to a longer read",
         RTU,
         READ_TWO,
         rtu("01 03 08 00 00 00 00 00 00 00 00"),
-        Result.BAD_LENGTH,
+        FrameFault.BAD_LENGTH,
     ),
-    ("late reply to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), Result.BAD_FUNCTION),
-    ("late reply of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), Result.BAD_ADDRESS),
-    ("broadcast as a reply", RTU, READ_TWO, rtu("00 03 04 11 11 22 22"), Result.BAD_ADDRESS),
+    ("late reply to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), FrameFault.BAD_FUNCTION),
+    ("late reply of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
+    ("broadcast as a reply", RTU, READ_TWO, rtu("00 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
     (
         "checksum's bytes swapped",
         RTU,
         READ_TWO,
         bytes.fromhex("01 03 04 11 11 22 22 00 00"),
-        Result.BAD_CHECKSUM,
+        FrameFault.BAD_CHECKSUM,
     ),
     # the text framings
-    ("another value as text", ASCII, WRITE_ONE, b":010600101235A2\r\n", Result.BAD_ECHO),
-    ("wrong checksum as text", ASCII, WRITE_ONE, b":010600101234A4\r\n", Result.BAD_CHECKSUM),
-    ("Delixi's sum for the checksum", ASCII, WRITE_ONE, b":0106001012345D\r\n", Result.BAD_CHECKSUM),
-    ("lower case", ASCII, WRITE_ONE, b":010600101234a3\r\n", Result.BAD_CHARACTER),
-    ("no line end", ASCII, WRITE_ONE, b":010600101234A3\n\r", Result.BAD_CHARACTER),
+    ("another value as text", ASCII, WRITE_ONE, b":010600101235A2\r\n", FrameFault.BAD_ECHO),
+    ("wrong checksum as text", ASCII, WRITE_ONE, b":010600101234A4\r\n", FrameFault.BAD_CHECKSUM),
+    ("Delixi's sum for the checksum", ASCII, WRITE_ONE, b":0106001012345D\r\n", FrameFault.BAD_CHECKSUM),
+    ("lower case", ASCII, WRITE_ONE, b":010600101234a3\r\n", FrameFault.BAD_CHARACTER),
+    ("no line end", ASCII, WRITE_ONE, b":010600101234A3\n\r", FrameFault.BAD_CHARACTER),
     # Delixi's own protocol
-    ("run command confirmed as stop", DELIXI, RUN_FORWARD, b":010200010000000004\r\n", Result.BAD_ECHO),
-    ("another value stored", DELIXI, STORE_50_HZ, b":0106000200001389A5\r\n", Result.BAD_ECHO),
-    ("another parameter's value", DELIXI, ASK_FREQUENCY, b":010701F50000138899\r\n", Result.BAD_ECHO),
-    ("setting for query", DELIXI, ASK_FREQUENCY, b":010601F40000138897\r\n", Result.BAD_FUNCTION),
-    ("a state with a value", DELIXI, ASK_STATE, b":010300020000000107\r\n", Result.BAD_ECHO),
-    ("a refusal that is none", DELIXI, RUN_FORWARD, b":01F1000000000000F2\r\n", Result.BAD_FUNCTION),
+    ("run command confirmed as stop", DELIXI, RUN_FORWARD, b":010200010000000004\r\n", FrameFault.BAD_ECHO),
+    ("another value stored", DELIXI, STORE_50_HZ, b":0106000200001389A5\r\n", FrameFault.BAD_ECHO),
+    ("another parameter's value", DELIXI, ASK_FREQUENCY, b":010701F50000138899\r\n", FrameFault.BAD_ECHO),
+    ("setting for query", DELIXI, ASK_FREQUENCY, b":010601F40000138897\r\n", FrameFault.BAD_FUNCTION),
+    ("a state with a value", DELIXI, ASK_STATE, b":010300020000000107\r\n", FrameFault.BAD_ECHO),
+    ("a refusal that is none", DELIXI, RUN_FORWARD, b":01F1000000000000F2\r\n", FrameFault.BAD_FUNCTION),
 ]
 
 
@@ -234,7 +240,7 @@ WRONG = [
     ("framing", "request_", "received", "reason"), [it[1:] for it in WRONG], ids=[it[0] for it in WRONG]
 )
 def test_wrong_reply_is_never_data(
-    framing: Framing, request_: Message, received: bytes, reason: Result
+    framing: Framing, request_: Message, received: bytes, reason: FrameFault
 ) -> None:
     assert parse_reply(framing, received, request_) == (reason, None)
     for piece in (4096, 1):
@@ -258,7 +264,7 @@ def test_stray_zero_before_every_reply_loses_nothing() -> None:
 def test_delixi_s_refusals(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
-    assert parse_request(DELIXI, frame) == (Result.BAD_FUNCTION, None)  # note 2: the master never says so
+    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: the master never says so
 
 
 def test_delixi_s_state_is_the_reply_s_parameter_number() -> None:
@@ -315,7 +321,7 @@ def test_impossible_count_may_be_refused_but_never_answered(count: int) -> None:
     """An sniffed master may ask for anything; exceptions are replies to that too."""
     request = Message(1, 0x03, 0, count)
     data_len = 2 * count & 0xFF
-    assert parse_reply(RTU, bytes([1, 3, data_len]) + bytes(300), request) == (Result.BAD_LENGTH, None)
+    assert parse_reply(RTU, bytes([1, 3, data_len]) + bytes(300), request) == (FrameFault.BAD_LENGTH, None)
     assert parse_reply(RTU, rtu("01 83 03"), request) == (5, Message(1, 3, exception=3))
 
 
@@ -332,7 +338,10 @@ def test_nothing_answers_what_is_no_function(framing: Framing, function: int) ->
         RTU: rtu(body.hex()),
         ASCII: f":{(body + bytes([-sum(body) & 0xFF])).hex().upper()}\r\n".encode(),
     }
-    assert parse_reply(framing, frames[framing], Message(1, function, 0, 1)) == (Result.BAD_FUNCTION, None)
+    assert parse_reply(framing, frames[framing], Message(1, function, 0, 1)) == (
+        FrameFault.BAD_FUNCTION,
+        None,
+    )
 
 
 @pytest.mark.parametrize("odd", [{"start": 10**400}, {"start": -1}, {"count": 1 << 16}, {"function": 300}])

@@ -11,13 +11,15 @@ from multidrop._core import ffi, lib
 
 from multidrop.core import (
     Exchange,
+    Failure,
     Field,
+    FrameFault,
     Framing,
     Message,
     NumberFormat,
     Peer,
-    Result,
     RowLayout,
+    Status,
     build_reply,
     build_request,
 )
@@ -143,7 +145,7 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
     """How long after the request's last bit a silent drive is given up."""
     left = ask(line, drive, request)
     line.wait_until_done()
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
     return line.now - left
 
 
@@ -264,7 +266,7 @@ def test_an_answer_that_was_not_waited_for_is_late(line: LineDriver, drive: Peer
     answer(line, drive, 2 * MS)
     given_up(line, drive)
     line.begin(exchange(OTHER, drive))
-    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
     line.receive(reply(1111))
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
 
@@ -276,7 +278,7 @@ def test_what_a_late_answer_could_be_taken_for_is_not_sent(line: LineDriver, dri
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
-    assert (line.completion.result, line.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    assert (line.completion.result, line.completion.sent_ns) == (Failure.LATE_ANSWER_DUE, 0)
     assert drive.failures == 1  # nothing was asked, so nothing failed
 
 
@@ -286,7 +288,7 @@ def test_an_answer_may_still_come_when_the_port_that_was_lost_is_back(line: Line
     again = LineDriver()
     again.now = line.now
     again.begin(exchange(OTHER, drive))
-    assert (again.completion.result, again.completion.sent_ns) == (Result.LATE_ANSWER_DUE, 0)
+    assert (again.completion.result, again.completion.sent_ns) == (Failure.LATE_ANSWER_DUE, 0)
     again.now = drive.late_until_ns
     ask(again, drive, OTHER)
 
@@ -314,7 +316,7 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
         assert (found.result, found.sent_ns, found.reply.data) == (7, first_ns, words(1234))
         assert found.first_ns == line.now
     else:
-        assert (found.result, found.reply.data) == (Result.LATE_ANSWER_DUE, b"")
+        assert (found.result, found.reply.data) == (Failure.LATE_ANSWER_DUE, b"")
     assert drive.counters().late == 1
 
 
@@ -330,7 +332,7 @@ def test_nothing_but_a_read_is_sent_again(drive: Peer, asked: Message, times: in
     while lib.md_turn_want(turn, wake, wake[0]) != lib.MD_WRITE:
         pass
     lib.md_line_sent(line, line.tx_len, wake[0], wake[0])
-    lib.md_line_abandon(line, Result.LATE_ANSWER_DUE, 0)
+    lib.md_line_abandon(line, Failure.LATE_ANSWER_DUE, 0)
     lib.md_turn_want(turn, wake, wake[0])
     assert urgent.is_done
     assert drive.exchanges == times
@@ -351,7 +353,7 @@ def test_what_no_late_answer_could_be_taken_for_is_sent(line: LineDriver, drive:
 def test_a_refusal_does_not_say_of_which_read_it_is(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(LONGER, drive))
-    assert line.completion.result == Result.LATE_ANSWER_DUE
+    assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
 def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Peer) -> None:
@@ -360,18 +362,18 @@ def test_answers_to_several_requests_may_be_late(line: LineDriver, drive: Peer) 
     time_out(line, drive, WRITE)  # no answer to the first could be taken for its reply
     assert drive.late_until_ns > first_until
     line.begin(exchange(OTHER, drive))
-    assert (line.want, line.completion.result) == ("done", Result.LATE_ANSWER_DUE)
+    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
     line.receive(build_request(Framing.RTU, WRITE))  # as its confirmation is
     assert drive.counters().late == 1
     line.begin(exchange(OTHER, drive))  # the answer to the first is still to come
-    assert line.completion.result == Result.LATE_ANSWER_DUE
+    assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
 def test_a_refusal_does_not_say_of_which_write_it_is(line: LineDriver, drive: Peer) -> None:
     """Told that it was refused one would take a motor for standing that the second write has started."""
     time_out(line, drive, WRITE)
     line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
-    assert line.completion.result == Result.LATE_ANSWER_DUE
+    assert line.completion.result == Failure.LATE_ANSWER_DUE
     ask(line, drive, READ)  # no refusal of a write is one of a read
 
 
@@ -397,9 +399,9 @@ def test_what_a_late_answer_of_delixi_s_own_protocol_could_be_taken_for(
     line.begin(exchange(first, drive, Framing.DELIXI))
     line.wait_until_write()
     line.wait_until_done()
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
     line.begin(exchange(second, drive, Framing.DELIXI))
-    assert line.completion.result == Result.LATE_ANSWER_DUE
+    assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
 def test_a_stop_waits_for_no_late_answer(line: LineDriver, drive: Peer) -> None:
@@ -432,9 +434,9 @@ def test_what_looks_like_a_damaged_reply_inside_another_frame_is_none(line: Line
     inside = bytes([1, 3, 2, 0, 0, 0, 0])  # a reply with a wrong checksum
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
     line.wait_until_done()
-    assert line.completion.result == Result.BAD_CHECKSUM
+    assert line.completion.result == FrameFault.BAD_CHECKSUM
     line.begin(exchange(OTHER, drive))
-    assert line.completion.result == Result.LATE_ANSWER_DUE
+    assert line.completion.result == Failure.LATE_ANSWER_DUE
 
 
 def test_other_drives_are_not_concerned(line: LineDriver, drive: Peer) -> None:
@@ -518,7 +520,7 @@ def test_a_late_answer_is_no_reply_from_another_address(line: LineDriver, drive:
     ask(line, other := peer(), Message(2, 3, 0, 1))
     line.receive(reply(1111))
     line.wait_until_done()
-    assert (line.completion.result, line.completion.skipped) == (Result.NO_REPLY, 7)
+    assert (line.completion.result, line.completion.skipped) == (Failure.NO_REPLY, 7)
     assert other.late_until_ns > line.now
 
 
@@ -539,7 +541,7 @@ def test_a_frame_of_a_drive_that_owes_nothing_any_more_is_a_stray_one(line: Line
     ask(line, peer(), Message(2, 3, 0, 1))
     line.receive(reply(1111))
     line.wait_until_done()
-    assert (line.completion.result, drive.counters().late) == (Result.BAD_ADDRESS, 0)
+    assert (line.completion.result, drive.counters().late) == (FrameFault.BAD_ADDRESS, 0)
 
 
 def test_damage_is_not_silence(line: LineDriver, drive: Peer) -> None:
@@ -547,7 +549,7 @@ def test_damage_is_not_silence(line: LineDriver, drive: Peer) -> None:
         ask(line, drive)
         line.receive(reply(1)[:-1] + b"\x00")
         line.wait_until_done()
-        assert line.completion.result == Result.BAD_CHECKSUM
+        assert line.completion.result == FrameFault.BAD_CHECKSUM
     assert drive.failures == 0
 
 
@@ -560,5 +562,5 @@ def test_everything_is_counted(line: LineDriver, drive: Peer) -> None:
     line.receive(b"\xff" + build_reply(Framing.RTU, Message(1, 3, exception=2)))
     counters = drive.counters()
     assert (counters.exchanges, counters.answered, counters.values, counters.exceptions) == (4, 2, 1, 1)
-    assert counters.missed == {Result.NO_REPLY: 1, Result.LATE_ANSWER_DUE: 1}
+    assert counters.missed == {Status.NO_REPLY: 1, Status.LATE_ANSWER_DUE: 1}
     assert (counters.stray_bytes, counters.late) == (1, 0)

@@ -11,7 +11,17 @@ from frames import words
 from line_driver import MS, LineDriver
 from multidrop._core import lib
 
-from multidrop.core import Exchange, Framing, Message, Peer, Result, build_reply, build_request, crc16
+from multidrop.core import (
+    Exchange,
+    Failure,
+    FrameFault,
+    Framing,
+    Message,
+    Peer,
+    build_reply,
+    build_request,
+    crc16,
+)
 
 CHARACTER = 1 * MS  # a round number: requests of 8 characters take 8 ms
 SILENCE = 4 * MS
@@ -208,7 +218,7 @@ def test_port_that_takes_nothing_is_lost(line: LineDriver) -> None:
     line.now += 1
     assert line.want == "done"
     found = line.completion
-    assert (found.result, found.error, found.sent_ns) == (Result.LINE_LOST, errno.ETIMEDOUT, 0)
+    assert (found.result, found.error, found.sent_ns) == (Failure.LINE_LOST, errno.ETIMEDOUT, 0)
 
 
 def test_noise_while_the_port_takes_nothing_renews_the_silence(line: LineDriver) -> None:
@@ -244,7 +254,7 @@ def test_port_that_fails(line: LineDriver, step: str) -> None:
     line.lose(errno.EIO)
     assert line.want == "done"
     found = line.completion
-    assert (found.result, found.error) == (Result.LINE_LOST, errno.EIO)
+    assert (found.result, found.error) == (Failure.LINE_LOST, errno.EIO)
     assert found.raw == (b"\x01\x03" if step == "listening" else b"")
     line.lose(errno.ENODEV)  # nothing is under way: nothing to end
     assert line.completion.error == errno.EIO
@@ -288,7 +298,7 @@ def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_repl
     line.now = line.wake
     assert [line.want, line.want] == ["read", "done"]  # a last look: the host may be late, not the drive
     found = line.completion
-    assert (found.result, found.raw, found.first_ns, found.last_ns) == (Result.NO_REPLY, b"", 0, 0)
+    assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 
 
 def test_reply_found_in_the_last_look_counts(line: LineDriver) -> None:
@@ -308,7 +318,7 @@ def test_last_look_is_the_last_whatever_it_finds(line: LineDriver) -> None:
     assert line.listens
     line.receive(b"\xff" * 1024)
     assert line.want == "done"
-    assert line.completion.result == Result.BAD_ADDRESS
+    assert line.completion.result == FrameFault.BAD_ADDRESS
 
 
 def test_frame_from_another_address_does_not_end_the_exchange(line: LineDriver) -> None:
@@ -329,25 +339,23 @@ def test_damaged_reply_and_then_the_right_one(line: LineDriver) -> None:
 
 
 REASONS = [
-    ("nothing", b"", Result.NO_REPLY),
-    ("only the adapter's echo", rtu("01 03 00 00 00 02"), Result.NO_REPLY),
-    ("cut off", b"\x01\x03\x04\x11", Result.CUT_SHORT),
-    ("cut off behind junk", b"\x00\xff\x01\x03\x04\x11", Result.CUT_SHORT),
-    ("damaged", b"\x01\x03\x04\x11\x11\x22\x22\x00\x00", Result.BAD_CHECKSUM),
-    ("damaged, behind junk", b"\x00\x01\x03\x04\x11\x11\x22\x22\x00\x00", Result.BAD_CHECKSUM),
-    ("damaged, with an address in it", b"\x01\x03\x04\x11\x11\x22\x01\x00\x00", Result.BAD_CHECKSUM),
-    ("another address, with ours in it", rtu("02 03 04 00 01 00 05"), Result.BAD_ADDRESS),
-    ("another function", rtu("01 04 04 11 11 22 22"), Result.BAD_FUNCTION),
-    ("another length", rtu("01 03 02 11 11"), Result.BAD_LENGTH),
-    ("junk", b"\xff\xfe\xfd", Result.BAD_ADDRESS),
+    ("nothing", b"", Failure.NO_REPLY),
+    ("only the adapter's echo", rtu("01 03 00 00 00 02"), Failure.NO_REPLY),
+    ("cut off", b"\x01\x03\x04\x11", Failure.CUT_SHORT),
+    ("cut off behind junk", b"\x00\xff\x01\x03\x04\x11", Failure.CUT_SHORT),
+    ("damaged", b"\x01\x03\x04\x11\x11\x22\x22\x00\x00", FrameFault.BAD_CHECKSUM),
+    ("damaged, behind junk", b"\x00\x01\x03\x04\x11\x11\x22\x22\x00\x00", FrameFault.BAD_CHECKSUM),
+    ("damaged, with an address in it", b"\x01\x03\x04\x11\x11\x22\x01\x00\x00", FrameFault.BAD_CHECKSUM),
+    ("another address, with ours in it", rtu("02 03 04 00 01 00 05"), FrameFault.BAD_ADDRESS),
+    ("another function", rtu("01 04 04 11 11 22 22"), FrameFault.BAD_FUNCTION),
+    ("another length", rtu("01 03 02 11 11"), FrameFault.BAD_LENGTH),
+    ("junk", b"\xff\xfe\xfd", FrameFault.BAD_ADDRESS),
 ]
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize(("received", "reason"), [it[1:] for it in REASONS], ids=[it[0] for it in REASONS])
-def test_time_out_tells_what_went_wrong(
-    line: LineDriver, received: bytes, reason: Result, piece: int
-) -> None:
+def test_time_out_tells_what_went_wrong(line: LineDriver, received: bytes, reason: int, piece: int) -> None:
     ask(line, READ_TWO)
     sent = line.now
     answer(line, received, piece)
@@ -363,7 +371,7 @@ def test_time_out_tells_what_went_wrong(
 def test_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None:
     ask(line)
     line.wait_until_done()
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
     line.begin(exchange(READ))
     line.now += SILENCE // 2
     assert line.listens
@@ -479,7 +487,7 @@ def test_dead_drive_behind_an_echo_confirms_nothing(line: LineDriver) -> None:
     teach_echo(line)
     ask(line, WRITE)
     answer(line, confirmation())
-    assert (line.completion.result, line.completion.reply) == (Result.NO_REPLY, Message(0, 0))
+    assert (line.completion.result, line.completion.reply) == (Failure.NO_REPLY, Message(0, 0))
 
 
 def test_refusal_behind_the_echo_of_a_write(line: LineDriver) -> None:
@@ -543,7 +551,7 @@ def test_a_reply_behind_a_damaged_echo_is_read(line: LineDriver, cut: tuple[int,
     assert (line.completion.reply.data, line.completion.skipped) == (words(2), len(echo))
     ask(line, WRITE)
     answer(line, confirmation())  # the line is still known to echo
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
 
 
 def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
@@ -553,7 +561,7 @@ def test_line_that_no_longer_echoes_is_believed_again(line: LineDriver) -> None:
     answer(line, reply_of(1))
     ask(line, WRITE)
     answer(line, confirmation())
-    assert line.completion.result == Result.MAYBE_ECHO
+    assert line.completion.result == Failure.MAYBE_ECHO
     line.now += 10 * TIMEOUT
     ask(line)
     answer(line, reply_of(1))
@@ -583,7 +591,7 @@ def test_where_no_adapter_echoes_the_first_confirmation_is_believed_until_an_ech
     teach_echo(line)  # who said that there is none was mistaken
     ask(line, WRITE)
     answer(line, confirmation())
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
 
 
 def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -> None:
@@ -594,7 +602,7 @@ def test_an_adapter_that_is_told_to_echo_stays_one_that_does(line: LineDriver) -
         assert line.completion.result == 7
     ask(line, WRITE)
     answer(line, confirmation())
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
 
 
 def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line: LineDriver) -> None:
@@ -610,13 +618,13 @@ def test_the_first_echo_of_a_delixi_query_is_no_value_of_0_where_it_is_told(line
 def test_what_may_be_the_echo_of_an_unknown_adapter_is_not_believed(line: LineDriver) -> None:
     ask(line, WRITE)
     answer(line, confirmation())
-    assert (line.completion.result, line.completion.raw) == (Result.MAYBE_ECHO, confirmation())
+    assert (line.completion.result, line.completion.raw) == (Failure.MAYBE_ECHO, confirmation())
     ask(line, WRITE)
     answer(line, confirmation() + confirmation())  # it was
     assert (line.completion.result, line.completion.skipped) == (8, 8)
     ask(line, WRITE)
     answer(line, confirmation())
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
 
 
 def test_a_reply_without_an_echo_before_it_tells_that_there_is_none(line: LineDriver) -> None:
@@ -644,7 +652,7 @@ def test_an_echo_alone_tells_of_itself(line: LineDriver) -> None:
     answer(line, rtu("01 03 00 00 00 01"))
     ask(line, WRITE)
     answer(line, confirmation())
-    assert line.completion.result == Result.NO_REPLY
+    assert line.completion.result == Failure.NO_REPLY
 
 
 def test_delixi_s_query_of_a_zero_behind_its_echo(line: LineDriver) -> None:

@@ -11,9 +11,9 @@ from differences import LIBMODBUS, PYMODBUS_ASCII, PYMODBUS_RTU, REPLIES, REQUES
 from judges import UNKNOWN_CODE, Heard, Libmodbus, Pymodbus, Verdict, expected
 
 from multidrop.core import (
+    FrameFault,
     Framing,
     Message,
-    Result,
     build_reply,
     build_request,
     parse_reply,
@@ -29,12 +29,12 @@ framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 
 def heard(said: Said) -> tuple[int, Verdict]:
     used, message = parse_request(said.framing, said.frame)
-    return used, Result(used).name if message is None else trimmed(message)
+    return used, FrameFault(used).name if message is None else trimmed(message)
 
 
 def answered(said: Said) -> Verdict:
     used, message = parse_reply(said.framing, said.frame, said.request)
-    return Result(used).name if message is None else trimmed(message)
+    return FrameFault(used).name if message is None else trimmed(message)
 
 
 def trimmed(message: Message) -> Message:

@@ -9,8 +9,9 @@ import nanoarrow
 import pyarrow as pa
 import pytest
 from batches import EXAMPLE, SECOND, UTC_0, block, completion, counting, example
+from completions import add_miss, add_rows
 
-from multidrop.core import Columns, Names, Result
+from multidrop.core import Columns, Names, Status
 from multidrop.polling.batch import Batch, Row
 
 SCHEMA = pa.schema(
@@ -67,7 +68,7 @@ def test_capsules_stay_valid_when_the_batch_is_gone() -> None:
 
 def test_numbers_are_not_copied() -> None:
     columns = Columns(1)
-    assert columns.add(block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
+    assert add_rows(columns, block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
     taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
     columns.c.value[0] = 7.5
     assert taken.column("value")[0].as_py() == 7.5
@@ -132,14 +133,14 @@ def test_numpy_takes_it_with_nan_for_misses() -> None:
 
 def test_every_status_can_be_spelt() -> None:
     columns = Columns(300)
-    for reason in Result:
-        if reason is not Result.INCOMPLETE:
-            assert columns.add_miss(block(0, 0), reason, SECOND, UTC_0)
+    for reason in Status:
+        if reason is not Status.OK:
+            assert add_miss(columns, block(0, 0), reason, SECOND, UTC_0)
     for code in range(1, 256):
-        assert columns.add(block(0, 0), completion(SECOND, exception=code), UTC_0)
+        assert add_rows(columns, block(0, 0), completion(SECOND, exception=code), UTC_0)
     batch = Batch(columns, Names("a"), Names("b"))
     statuses = pa.record_batch(batch).column("status").to_pylist()
-    reasons = [str(reason) for reason in Result if reason is not Result.INCOMPLETE]
+    reasons = [str(reason) for reason in Status if reason is not Status.OK]
     assert statuses == reasons + [f"exception {code:02X}" for code in range(1, 256)]
     assert [row.status for row in batch] == statuses
     assert all(statuses)

@@ -173,7 +173,8 @@ def test_many_threads_do_all_of_it_at_once() -> None:
     """The program that does so with 64 lines for ten minutes, for a short while."""
     program = [
         sys.executable,
-        "bench/many_at_once.py",
+        "-m",
+        "bench.questions.many_at_once",
         "--lines=6",
         "--drives=5",
         "--minutes=0.08",

@@ -22,7 +22,7 @@ from test_mixed_line import REASONS, VARIANTS
 from worlds import World, WorldWire
 
 from multidrop import poller
-from multidrop.core import Framing, Message, Result
+from multidrop.core import Framing, Message, Status
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiNative
 from multidrop.planning import schedule
@@ -67,7 +67,7 @@ NOT_TOLD = {
     "echo now and then": (Framing.DELIXI,),
 }
 
-UNASKED = {str(it) for it in (Result.NOT_ASKED, Result.LINE_LOST, Result.LATE_ANSWER_DUE)}
+UNASKED = {str(it) for it in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from lines import LateWire, line, plant, polled, proofs, rows_of, served
 
-from multidrop.core import Framing, Result
+from multidrop.core import Framing, Status
 from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.plant.model import PolledDrive
@@ -26,7 +26,7 @@ VARIANTS = (  # family, framing, baud rate of the fast line
     (DelixiNative, Framing.DELIXI, 500_000),
     (YD1000, Framing.RTU, 1_000_000),
 )
-REASONS = {str(it) for it in Result} - {str(Result.INCOMPLETE)}
+REASONS = {str(it) for it in Status} - {str(Status.OK)}
 
 REAL_SECONDS = 6.0
 EVERY = 1.0  # s, of what is polled at a rate

@@ -23,7 +23,7 @@ from toy import Toy
 from worlds import World, WorldWire
 
 from multidrop import poller as poller_module
-from multidrop.core import Result, RowQueue
+from multidrop.core import RowQueue, Status
 from multidrop.errors import LineError, Unconfirmed
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
@@ -34,12 +34,12 @@ from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire,
 HOST_LATE = {
     str(it)
     for it in (
-        Result.NO_REPLY,
-        Result.CUT_SHORT,
-        Result.LATE_ANSWER_DUE,
-        Result.NOT_ASKED,
-        Result.EXPIRED,
-        Result.POLL_ENDED,
+        Status.NO_REPLY,
+        Status.CUT_SHORT,
+        Status.LATE_ANSWER_DUE,
+        Status.NOT_ASKED,
+        Status.EXPIRED,
+        Status.POLL_ENDED,
     )
 }
 

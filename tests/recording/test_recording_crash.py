@@ -17,6 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
+from completions import add_rows
 from disks import full_at, read_only_directory
 from test_batch import rows_of
 from toy import Toy
@@ -348,7 +349,7 @@ def test_a_clock_that_is_set_back_an_hour(tmp_path: Path, suffix: str) -> None:
     with open_writer(path, METADATA) as writer:
         for at, offset in enumerate(offsets):
             columns = Columns(1)
-            assert columns.add(block(0, 0), completion(at + 1, first_ns=at + 2, words=(at,)), offset)
+            assert add_rows(columns, block(0, 0), completion(at + 1, first_ns=at + 2, words=(at,)), offset)
             writer.write(Batch(columns, DRIVES, REGISTERS))
     found = rows(open_reader(path))
     assert [row.monotonic_ns for row in found] == [1, 2]

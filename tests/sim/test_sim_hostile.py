@@ -14,7 +14,7 @@ from toy import Toy
 
 from multidrop.bus import exchange
 from multidrop.cli import main
-from multidrop.core import Message, Peer, Result
+from multidrop.core import STATUSES, Message, Peer
 from multidrop.drives import YD1000
 from multidrop.errors import LineError
 from multidrop.plant.loader import parse_duration
@@ -176,7 +176,7 @@ def read(line: Line) -> bytes:
     drive = Toy(1)
     asked = exchange(drive, Message(1, 3, 2, 1), Peer(least_timeout=5, most_timeout=5))
     found = line.carry_out(asked)
-    assert found.result > 0, Result(found.result)
+    assert found.result > 0, STATUSES[-found.result]
     return found.raw
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from multidrop.core import Columns, Field, Names, NumberFormat, Result, RowLayout, new_completion
+from completions import add_miss, add_rows, new_completion
+
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.polling.batch import Batch, Row
 
 # 2026-11-21 09:30:00.123456789 UTC lies 1 s of monotonic time before UTC_0 + 1 s
@@ -41,10 +43,10 @@ def completion(sent_ns: int, *, first_ns: int = 0, words: tuple[int, ...] = (), 
 def example() -> Batch:
     """Two samples, an exception, a drive that says nothing, and one that was not asked."""
     columns = Columns(8)
-    assert columns.add(block(0, 0, 1), completion(SECOND, first_ns=SECOND + 7, words=(4999, 30)), UTC_0)
-    assert columns.add(block(1, 0), completion(2 * SECOND, exception=0x12), UTC_0)
-    assert columns.add_miss(block(2, 1), Result.NO_REPLY, 3 * SECOND, UTC_0)
-    assert columns.add_miss(block(1, 1), Result.NOT_ASKED, 4 * SECOND, UTC_0)
+    assert add_rows(columns, block(0, 0, 1), completion(SECOND, first_ns=SECOND + 7, words=(4999, 30)), UTC_0)
+    assert add_rows(columns, block(1, 0), completion(2 * SECOND, exception=0x12), UTC_0)
+    assert add_miss(columns, block(2, 1), Status.NO_REPLY, 3 * SECOND, UTC_0)
+    assert add_miss(columns, block(1, 1), Status.NOT_ASKED, 4 * SECOND, UTC_0)
     return Batch(columns, DRIVES, REGISTERS)
 
 
@@ -79,7 +81,7 @@ def counting(rows: int, start: int = 0) -> Batch:
     for at in range(start, start + rows):
         drive = block(at % 3, at % 2, divisor=1.0)
         if at % 10 == 9:
-            assert columns.add_miss(drive, Result.NO_REPLY, at + 1, UTC_0)
+            assert add_miss(columns, drive, Status.NO_REPLY, at + 1, UTC_0)
         else:
-            assert columns.add(drive, completion(at + 1, first_ns=at + 3, words=(at,)), UTC_0)
+            assert add_rows(columns, drive, completion(at + 1, first_ns=at + 3, words=(at,)), UTC_0)
     return Batch(columns, DRIVES, REGISTERS)

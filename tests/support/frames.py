@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from multidrop.core import Framing, Message, Result
+from multidrop.core import FrameFault, Framing, Message
 
 FRAMINGS = {"rtu": Framing.RTU, "ascii": Framing.ASCII, "delixi": Framing.DELIXI}
 
@@ -27,7 +27,7 @@ def _line(text: str) -> str:
 
 
 # request as printed: what it says, and what each printed reply to it says; "same" is its copy
-MEANING: dict[str, tuple[Message, dict[str, Message | Result]]] = {
+MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     "01 01 00 00 00 0C 3C 0F": (
         Message(1, 0x01, 0, 12),
         {
@@ -45,7 +45,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | Result]]] = {
     "01 04 00 01 00 05 61 C9": (  # E1: the checksum is corrected
         Message(1, 0x04, 1, 5),
         {
-            "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": Result.BAD_LENGTH,  # E2
+            "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": FrameFault.BAD_LENGTH,  # E2
             "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B": Message(
                 1, 0x04, 1, 5, words(500, 0, 214, 0, 562)
             ),
@@ -140,7 +140,7 @@ class Printed:
     text: str
     verdict: str
     source: str
-    says: Message | Result
+    says: Message | FrameFault
     request: Message | None = None
     request_frame: bytes = b""
 
@@ -167,7 +167,7 @@ def _printed() -> list[Printed]:
             common = (framing, row["direction"], _bytes(text), text, row["verdict"])
             source = f"{row['model']}, {row['source']}"
             if row["verdict"] == "bad checksum":
-                found.append(Printed(*common, source, Result.BAD_CHECKSUM))
+                found.append(Printed(*common, source, FrameFault.BAD_CHECKSUM))
             elif row["direction"] == "request":
                 request, replies = MEANING[text]
                 found.append(Printed(*common, source, request))

@@ -14,9 +14,9 @@ from multidrop.control import writer as writing
 from multidrop.core import (
     Completion,
     Exchange,
+    Failure,
     Message,
     Peer,
-    Result,
     build_reply,
     build_request,
     parse_reply,
@@ -84,7 +84,7 @@ class Hall:
         self.seconds += self.queue_time
         is_overtaken = exchange.permit is not None and not exchange.permit.is_good
         if is_overtaken or (expires_ns and self.seconds * 1e9 > expires_ns):
-            return self._completion(int(Result.EXPIRED))
+            return self._completion(int(Failure.EXPIRED))
         frame = build_request(exchange.framing, request)
         self.frames.append((request, text(frame)))
         self.seconds += EXCHANGE_TIME
@@ -100,9 +100,9 @@ class Hall:
             return self._completion(0)
         if reply is None or self.loses(request):
             self.seconds += TIMEOUT
-            return self._completion(int(Result.NO_REPLY))
+            return self._completion(int(Failure.NO_REPLY))
         used, message = parse_reply(exchange.framing, reply, request)
-        return self._completion(used or int(Result.CUT_SHORT), message, reply)
+        return self._completion(used or int(Failure.CUT_SHORT), message, reply)
 
     def _completion(self, result: int, reply: Message | None = None, raw: bytes = b"") -> Completion:
         at = round(self.seconds * 1e9)

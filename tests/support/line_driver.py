@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from completions import new_completion
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Exchange, Result, completion, new_completion
+from multidrop.core import Completion, Exchange, Failure, completion
 
 MS = 1_000_000
 
@@ -78,9 +79,9 @@ class LineDriver:
             lib.md_line_received(self._line, data[at : at + piece], len(data[at : at + piece]), self.now)
 
     def lose(self, error: int) -> None:
-        self.abandon(Result.LINE_LOST, error)
+        self.abandon(Failure.LINE_LOST, error)
 
-    def abandon(self, result: Result, error: int = 0) -> None:
+    def abandon(self, result: Failure, error: int = 0) -> None:
         lib.md_line_abandon(self._line, result, error)
 
     def wait_until_write(self) -> bytes:

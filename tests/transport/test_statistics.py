@@ -185,11 +185,11 @@ def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> 
 
 
 def test_a_span_is_the_difference_of_two_looks() -> None:
-    one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({-10: 3})))
+    one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({10: 3})))
     two = line_of(
         12,
         8,
-        pump=Counters(sent=150, ideal_ns=5 * 10**9, missed=Counter({-10: 3, -3: 1})),
+        pump=Counters(sent=150, ideal_ns=5 * 10**9, missed=Counter({10: 3, 3: 1})),
         fan=Counters(sent=10, ideal_ns=10**9),
     )
     found = two.since(one)

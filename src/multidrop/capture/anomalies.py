@@ -9,19 +9,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from multidrop.bus import Bus
-from multidrop.core import Result
+from multidrop.core import Status
 from multidrop.drive.family import Drive
 
 SILENT = 3  # exchanges in a row without a reply
 _BAD = (
-    Result.NO_START,
-    Result.BAD_CHARACTER,
-    Result.BAD_CHECKSUM,
-    Result.BAD_ADDRESS,
-    Result.BAD_FUNCTION,
-    Result.BAD_LENGTH,
-    Result.BAD_ECHO,
-    Result.CUT_SHORT,
+    Status.NO_START,
+    Status.BAD_CHARACTER,
+    Status.BAD_CHECKSUM,
+    Status.BAD_ADDRESS,
+    Status.BAD_FUNCTION,
+    Status.BAD_LENGTH,
+    Status.BAD_ECHO,
+    Status.CUT_SHORT,
 )
 
 
@@ -51,7 +51,7 @@ class _WatchedDrive:
         self._peer = bus.peer(drive)
         self._exchanges = self._late = 0
         self._is_silent = True
-        self._bad: dict[Result, int] = {}
+        self._bad: dict[Status, int] = {}
 
     def look(self) -> Iterator[str]:
         if self._peer.exchanges == self._exchanges:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 
-from multidrop.core import Result
+from multidrop.core import Status
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
 from multidrop.drives import MODELS
@@ -142,7 +142,7 @@ class IdentityCheck:
         """Whether an answer from its address can only be the one to what is asked now."""
         peer = self._exchanges.peer(drive)
         counters = peer.counters()
-        return not (counters.late or counters.ended[Result.NO_REPLY] or peer.late_until_ns)
+        return not (counters.late or counters.ended[Status.NO_REPLY] or peer.late_until_ns)
 
     def _glimpsed_at(self, drive: Drive) -> tuple[str, bool] | None:
         """Why it is not of its family, and whether each look was answered; None where nothing says so."""

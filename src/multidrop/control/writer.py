@@ -15,7 +15,7 @@ from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
 from multidrop.control.identity import IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.rules import conditions, raw_count, refused, wears
-from multidrop.core import Completion, Message, Result, build_request, utc_minus_monotonic_ns
+from multidrop.core import Completion, Failure, Message, build_request, utc_minus_monotonic_ns
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
 from multidrop.drive.request import write_request
@@ -142,7 +142,7 @@ class Writer:
             return self._exchanges.carry_out(drive, request, insists=True, timeout=timeout)
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
-        if completion.result == Result.EXPIRED:
+        if completion.result == Failure.EXPIRED:
             call.sent, call.is_confirmed = before
             raise call.unsent(what)
         return completion

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from multidrop.core.columns import COLUMNS, Columns, Field, Names, NumberFormat, RowLayout, raw_value, spell
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import Completion, Exchange, Peer, completion, new_completion
+from multidrop.core.exchange import Completion, Exchange, Peer, completion
 from multidrop.core.frame import (
     Framing,
     Message,
@@ -20,7 +20,7 @@ from multidrop.core.frame import (
 from multidrop.core.latch import Latch, Permit
 from multidrop.core.port import Echo, Port, now_ns, utc_minus_monotonic_ns
 from multidrop.core.port_settings import REFUSALS, get_settings, set_settings
-from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Result, status_text
+from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Failure, FrameFault, Status
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.sniffer import (
     HEARD_ROOM,
@@ -51,7 +51,9 @@ __all__ = [
     "Decoder",
     "Echo",
     "Exchange",
+    "Failure",
     "Field",
+    "FrameFault",
     "FrameSpan",
     "Framing",
     "Kind",
@@ -62,11 +64,11 @@ __all__ = [
     "Peer",
     "Permit",
     "Port",
-    "Result",
     "RowLayout",
     "RowQueue",
     "Side",
     "Splitter",
+    "Status",
     "Stream",
     "Tap",
     "Unpacked",
@@ -79,7 +81,6 @@ __all__ = [
     "delay_edge",
     "get_settings",
     "lrc",
-    "new_completion",
     "now_ns",
     "parse_reply",
     "parse_request",
@@ -87,7 +88,6 @@ __all__ = [
     "reply_length",
     "set_settings",
     "spell",
-    "status_text",
     "sum8",
     "utc_minus_monotonic_ns",
 ]

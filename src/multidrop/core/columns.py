@@ -10,7 +10,6 @@ from struct import calcsize
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
-from multidrop.core.result import Result
 
 
 class NumberFormat(IntEnum):
@@ -104,14 +103,6 @@ class Columns:
     def __len__(self) -> int:
         return int(self.c.rows)
 
-    def add(self, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:
-        """Append the rows of one struct md_completion; False when there is no room for all of them."""
-        return bool(lib.md_columns_add(self.c, block.c, found, utc_minus_monotonic_ns))
-
-    def add_miss(self, block: RowLayout, result: Result, due_ns: int, utc_minus_monotonic_ns: int) -> bool:
-        """Append rows for values that were due at `due_ns` but never asked for."""
-        return bool(lib.md_columns_add(self.c, block.c, miss(result, due_ns), utc_minus_monotonic_ns))
-
     def _at(self, name: str) -> int:
         """How far behind the struct a column begins."""
         return int(ffi.cast("uint8_t *", getattr(self.c, name)) - ffi.cast("uint8_t *", self.c))
@@ -128,11 +119,6 @@ class Columns:
             return self._memory[at : at + (rows + 7) // 8]
         kind = COLUMNS[name]
         return self._memory[at : at + rows * calcsize(kind)].cast(kind)
-
-
-def miss(result: Result, due_ns: int) -> Any:
-    """What became of an exchange that was due and never asked for (struct md_completion)."""
-    return ffi.new("struct md_completion *", {"result": result, "begun_ns": due_ns})
 
 
 class Spelling(NamedTuple):

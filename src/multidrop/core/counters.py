@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
-from multidrop.core.result import Result
+from multidrop.core.result import Status
 
 
 class Counters(NamedTuple):
@@ -24,8 +24,8 @@ class Counters(NamedTuple):
     ideal_ns: int = 0
     longest_ns: int = 0  # response delay
     timeout_ns: int = 0  # at present
-    ended: Counter[Result] = Counter()  # exchanges without an answer, by reason; broadcasts by INCOMPLETE
-    missed: Counter[Result] = Counter()  # values, by reason
+    ended: Counter[Status] = Counter()  # exchanges without a reply; broadcasts are OK
+    missed: Counter[Status] = Counter()  # values
     refused: Counter[int] = Counter()  # values, by exception code
     delays: Counter[int] = Counter()  # replies, by the bucket of their response delay
 
@@ -38,7 +38,7 @@ def delay_edge(bucket: int) -> int:
     return int(lib.md_delay_edge(bucket))
 
 
-def read_counters(c: Any, timeout_ns: int, unasked: Counter[Result]) -> Counters:
+def read_counters(c: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
     """A struct md_counters, the time-out, and the values that were due and not asked for, by reason."""
     return Counters(
         c.exchanges,
@@ -53,15 +53,15 @@ def read_counters(c: Any, timeout_ns: int, unasked: Counter[Result]) -> Counters
         c.ideal_ns,
         c.longest_ns,
         timeout_ns,
-        _by_result(c.ended),
-        _by_result(c.missed) + unasked,
+        _by_status(c.ended),
+        _by_status(c.missed) + unasked,
         _by_place(c.refused, "I") if c.exceptions else Counter(),
         _by_place(c.delays, "Q"),
     )
 
 
-def _by_result(array: Any) -> Counter[Result]:
-    return Counter({Result(-code): count for code, count in _by_place(array, "Q").items()})
+def _by_status(array: Any) -> Counter[Status]:
+    return Counter({Status(code): count for code, count in _by_place(array, "Q").items()})
 
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:

@@ -13,7 +13,7 @@ from multidrop.core.counters import Counters, read_counters
 from multidrop.core.frame import Framing, Message, build_request, from_c, to_c
 from multidrop.core.latch import Permit
 from multidrop.core.port_settings import settings_to_c
-from multidrop.core.result import EXCEPTION_STATUS, Result
+from multidrop.core.result import Status
 
 MOST_PROOFS: int = lib.MD_MOST_PROOFS
 
@@ -31,7 +31,7 @@ class Peer:
             {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
         )
         self.proofs: tuple[Exchange, ...] = ()
-        self.unasked: Counter[Result] = Counter()  # values that its client did not ask for, by reason
+        self.unasked: Counter[Status] = Counter()  # values that its client did not ask for, by reason
 
     @property
     def exchanges(self) -> int:
@@ -174,18 +174,6 @@ class Completion:
     skipped: int
     reply: Message
     raw: bytes
-
-    @property
-    def status(self) -> int:
-        """As a column has it: 0, the reason's number, or EXCEPTION_STATUS + exception code."""
-        if self.result <= 0:
-            return -self.result
-        return EXCEPTION_STATUS + self.reply.exception if self.reply.exception else 0
-
-
-def new_completion() -> Any:
-    """The core's own memory for what becomes of one exchange (struct md_completion)."""
-    return ffi.new("struct md_completion *")
 
 
 def completion(found: Any) -> Completion:

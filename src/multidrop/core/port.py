@@ -148,11 +148,6 @@ class Port:
         return taken
 
     @property
-    def pending(self) -> int:
-        """How many queued exchanges are not carried out yet."""
-        return int(self._progress.submitted - self._progress.done) & 0xFFFF_FFFF
-
-    @property
     def done(self) -> int:
         """How many queued exchanges were carried out; it wraps around at 2^32."""
         return int(self._progress.done)

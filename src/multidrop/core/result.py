@@ -21,8 +21,8 @@ class FrameFault(IntEnum):
     BAD_REQUEST = lib.MD_BAD_REQUEST
 
 
-class Outcome(IntEnum):
-    """Why an exchange has no reply; a FrameFault where something came in its place (enum md_outcome)."""
+class Failure(IntEnum):
+    """Why an exchange has no reply; a FrameFault where something came in its place (enum md_failure)."""
 
     CUT_SHORT = lib.MD_CUT_SHORT
     NO_REPLY = lib.MD_NO_REPLY
@@ -46,15 +46,15 @@ class Status(IntEnum):
     BAD_LENGTH = -FrameFault.BAD_LENGTH
     BAD_ECHO = -FrameFault.BAD_ECHO
     BAD_REQUEST = -FrameFault.BAD_REQUEST
-    CUT_SHORT = -Outcome.CUT_SHORT
-    NO_REPLY = -Outcome.NO_REPLY
-    LINE_LOST = -Outcome.LINE_LOST
-    SETTINGS_REFUSED = -Outcome.SETTINGS_REFUSED
-    LATE_ANSWER_DUE = -Outcome.LATE_ANSWER_DUE
-    EXPIRED = -Outcome.EXPIRED
+    CUT_SHORT = -Failure.CUT_SHORT
+    NO_REPLY = -Failure.NO_REPLY
+    LINE_LOST = -Failure.LINE_LOST
+    SETTINGS_REFUSED = -Failure.SETTINGS_REFUSED
+    LATE_ANSWER_DUE = -Failure.LATE_ANSWER_DUE
+    EXPIRED = -Failure.EXPIRED
     NOT_ASKED = lib.MD_NOT_ASKED
-    POLL_ENDED = -Outcome.POLL_ENDED
-    MAYBE_ECHO = -Outcome.MAYBE_ECHO
+    POLL_ENDED = -Failure.POLL_ENDED
+    MAYBE_ECHO = -Failure.MAYBE_ECHO
 
     def __str__(self) -> str:
         return STATUSES[self]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 
 from multidrop._core import ffi, lib
-from multidrop.core.columns import Columns, RowLayout, miss
+from multidrop.core.columns import Columns, RowLayout
 from multidrop.core.fork import only_here, register_at_fork
-from multidrop.core.result import Result
+from multidrop.core.result import Status
 
 CHUNK_ROWS = 1 << 12  # of columns that are taken
 MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
@@ -16,7 +16,6 @@ MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counte
 class RowQueue:
     """Rows that nobody has taken yet, and the numbers of ports that need attention (struct md_row_queue)."""
 
-    MOST_NUMBERS: int = lib.MD_MOST_NUMBERS
     _MOST_AT_ONCE = 1024
 
     def __init__(self, chunk_rows: int = CHUNK_ROWS, most_chunks: int = MOST_CHUNKS) -> None:
@@ -41,9 +40,9 @@ class RowQueue:
         made = lib.md_row_queue_take(self.c)
         return None if made == ffi.NULL else Columns.lent(made, self._give_back)
 
-    def add_miss(self, block: RowLayout, result: Result, due_ns: int) -> None:
-        """Rows for values that were due at `due_ns` but never asked for."""
-        lib.md_row_queue_add(self.c, block.c, miss(result, due_ns))
+    def add_miss(self, block: RowLayout, status: Status, due_ns: int) -> None:
+        """Add rows for values that were due at `due_ns` and not asked for."""
+        lib.md_row_queue_miss(self.c, block.c, status, due_ns)
 
     @property
     def chunks(self) -> int:

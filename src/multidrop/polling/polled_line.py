@@ -25,8 +25,8 @@ from multidrop.core import (
     Names,
     Peer,
     Port,
-    Result,
     RowQueue,
+    Status,
 )
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
@@ -185,7 +185,7 @@ class PolledLine:
         with self._lock:
             now = now_ns()
             jobs = [it for it in self.schedule.jobs if it.owner is drive]
-            self._miss(over([(it, it.due_ns) for it in jobs if it.period_ns], now), Result.POLL_ENDED)
+            self._miss(over([(it, it.due_ns) for it in jobs if it.period_ns], now), Status.POLL_ENDED)
             for job in jobs:
                 self.schedule.remove(job)
             self.schedule.forget(drive.address)
@@ -266,7 +266,7 @@ class PolledLine:
         port.stop()
         self._forget_done(port)
         slots = [(it.job, now if it.due_ns is None else min(it.due_ns, now)) for it in self._queued]
-        self._miss(slots, Result.LINE_LOST)
+        self._miss(slots, Status.LINE_LOST)
         for asking in self._queued:
             self.schedule.conclude(asking.job)
         self._queued.clear()
@@ -358,7 +358,7 @@ class PolledLine:
         """Slots that passed unasked, which is planned ahead, have a row when they have come."""
         unasked = self.schedule.unasked
         if unasked:
-            self._miss([slot for slot in unasked if slot[1] <= now], Result.NOT_ASKED)
+            self._miss([slot for slot in unasked if slot[1] <= now], Status.NOT_ASKED)
             self.schedule.unasked = [slot for slot in unasked if slot[1] > now]
 
     def _top_up(self, port: Port, now: int) -> None:
@@ -369,7 +369,7 @@ class PolledLine:
             self._queued += queued
             self._ahead_ns += sum(it.job.duration_ns for it in queued)
 
-    def _miss(self, slots: list[tuple[PolledJob, int]], why: Result) -> None:
+    def _miss(self, slots: list[tuple[PolledJob, int]], why: Status) -> None:
         for job, due_ns in slots:
             job.exchange.peer.unasked[why] += job.fields.count
             self._row_queue.add_miss(job.fields, why, due_ns)
@@ -378,7 +378,7 @@ class PolledLine:
         """Until the port is back every value that is due is missed because of it."""
         if now < self._reopen_ns or (self._reopening and self._reopening.is_alive()):
             return
-        self._miss(self.schedule.pass_all(now), Result.LINE_LOST)
+        self._miss(self.schedule.pass_all(now), Status.LINE_LOST)
         self._reopen_ns = now + REOPEN_NS
         self._reopening = threading.Thread(target=self._reopen, daemon=True)
         self._reopening.start()
@@ -411,9 +411,9 @@ class PolledLine:
             self._forget_done(port)
             queued = [(it.job, it.due_ns) for it in self._queued if it.due_ns is not None]
             slots = [*queued, *self.schedule.pass_slots(ended_ns)]
-            self._miss(over(slots, ended_ns), Result.POLL_ENDED)
+            self._miss(over(slots, ended_ns), Status.POLL_ENDED)
         else:
-            self._miss(self.schedule.pass_slots(ended_ns), Result.LINE_LOST)
+            self._miss(self.schedule.pass_slots(ended_ns), Status.LINE_LOST)
         self._over_ns = now_ns()
         self.schedule = Schedule()
         self.bus.close()

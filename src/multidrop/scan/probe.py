@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from multidrop.bus import LEAST_TIMEOUT
-from multidrop.core import Completion, Message, Peer, Result
+from multidrop.core import STATUSES, Completion, Failure, Message, Peer
 from multidrop.drive.family import Drive
 from multidrop.errors import BadReply, DriveRefused, NoReply
 from multidrop.scan.identify import recognise
@@ -45,7 +45,7 @@ class Probe:
         self.followed += self._answered and completion.stale > 0
         self._answered = completion.result > 0
         self.answers += self._answered
-        self.damaged += not self._answered and completion.result != Result.NO_REPLY
+        self.damaged += not self._answered and completion.result != Failure.NO_REPLY
         return completion
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
@@ -70,10 +70,10 @@ class Probe:
             completion = self._ask(request)
             if completion.result > 0:
                 break
-        if completion.result == Result.NO_REPLY:
+        if completion.result == Failure.NO_REPLY:
             raise NoReply(drive.name)
         if completion.result <= 0:
-            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
+            raise BadReply(drive.name, STATUSES[-completion.result], completion.raw)
         code = completion.reply.exception
         if code:
             raise DriveRefused(drive.name, code, drive.exception(code))

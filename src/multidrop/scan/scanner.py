@@ -12,10 +12,10 @@ from typing import Protocol
 from multidrop.core import (
     Completion,
     Exchange,
+    Failure,
     Framing,
     Message,
     Peer,
-    Result,
     build_request,
     parse_reply,
     reply_length,
@@ -84,7 +84,7 @@ class _Scan:
                 self._refusals.append(refusal)
                 yield Untried(sweep.settings, sweep.framing, refusal.reason)
                 return
-            came = completion.result != Result.NO_REPLY
+            came = completion.result != Failure.NO_REPLY
             earlier = addresses[max(0, number - 1 - LATE) : number - 1]
             late = [it for it in earlier if it in listeners and listeners[it].late]
             for suspect in late:  # the core knew its answer as a late one
@@ -122,7 +122,7 @@ class _Scan:
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._listener(sweep))
             completion = self._once(sweep, sweep.framing, request, peer)
             if completion.raw == build_request(sweep.framing, request):
-                return replace(completion, result=Result.NO_REPLY, raw=b"")
+                return replace(completion, result=Failure.NO_REPLY, raw=b"")
         return completion
 
     def _once(self, sweep: Sweep, framing: Framing, request: Message, peer: Peer) -> Completion:
@@ -137,7 +137,7 @@ class _Scan:
             silence=sweep.silence,
         )
         completion = self._carry_out(exchange)
-        if completion.result == Result.LATE_ANSWER_DUE:
+        if completion.result == Failure.LATE_ANSWER_DUE:
             completion = self._carry_out(exchange, not_before_ns=peer.late_until_ns)
         return completion
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop import core
-from multidrop.core import Completion, Exchange, Message, Peer, Permit, Result, raw_value
+from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit, raw_value
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
@@ -239,7 +239,7 @@ class Exchanges:
             permit=permit,
         )
         completion = self._carry_out(made, expires_ns)
-        if completion.result == Result.LATE_ANSWER_DUE:
+        if completion.result == Failure.LATE_ANSWER_DUE:
             raise NoReply(drive.name)
         return completion
 
@@ -247,17 +247,17 @@ class Exchanges:
         """Wait once until no late answer comes in any order; the core then asks for the proof of it."""
         late_until_ns = made.peer.late_until_ns
         completion = self.line.carry_out(made, expires_ns=expires_ns)
-        if completion.result != Result.LATE_ANSWER_DUE:
+        if completion.result != Failure.LATE_ANSWER_DUE:
             return completion
         sleep(max(0, late_until_ns - now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
 
     def reply(self, drive: Drive, completion: Completion) -> Message:
         """The good reply; raises NoReply, BadReply or DriveRefused."""
-        if completion.result in (Result.NO_REPLY, Result.LATE_ANSWER_DUE):
+        if completion.result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
             raise NoReply(drive.name)
         if completion.result <= 0:
-            raise BadReply(drive.name, str(Result(completion.result)), completion.raw)
+            raise BadReply(drive.name, STATUSES[-completion.result], completion.raw)
         if completion.reply.exception:
             code = completion.reply.exception
             raise DriveRefused(drive.name, code, drive.exception(code))

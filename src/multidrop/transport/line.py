@@ -21,9 +21,9 @@ from multidrop.core import (
     Completion,
     Echo,
     Exchange,
+    Failure,
     Peer,
     Port,
-    Result,
     Tap,
 )
 from multidrop.core.fork import register_at_fork
@@ -270,23 +270,23 @@ class Line:
             self._waiting += 1
         try:
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            waits_in_vain = found.result == Result.LATE_ANSWER_DUE and core.lost
+            waits_in_vain = found.result == Failure.LATE_ANSWER_DUE and core.lost
         finally:
             with self._lock:
                 self._waiting -= 1
                 self._left.notify_all()
-        failure = self._failure(Result.LINE_LOST if waits_in_vain else found.result, found.error)
+        failure = self._failure(Failure.LINE_LOST if waits_in_vain else found.result, found.error)
         if failure:
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
 
     def _failure(self, result: int, error: int) -> LineError | None:
-        if result == Result.LINE_LOST and self._core is None:
+        if result == Failure.LINE_LOST and self._core is None:
             return self._closed()
-        if result == Result.LINE_LOST:
+        if result == Failure.LINE_LOST:
             return PortLost(self.port, f"the port was lost ({os.strerror(error) if error else 'hung up'})")
-        if result == Result.SETTINGS_REFUSED:
+        if result == Failure.SETTINGS_REFUSED:
             refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
             return LineError(self.port, f"the port does not take the {refused} that the drive needs")
         return None

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import add, sub
 
-from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, Counters, Result, delay_edge, status_text
+from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Status, delay_edge
 
 # Bytes came instead of the reply, and no good frame among them.
-_DAMAGED = (Result.BAD_CHECKSUM, Result.BAD_CHARACTER, Result.CUT_SHORT, Result.NO_START)
+_DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class Statistics:
     @property
     def misses(self) -> Counter[str]:
         """Values that are missing, by the reason that stands in their rows."""
-        found = Counter({status_text(-result): n for result, n in self.counters.missed.items()})
-        found.update({status_text(EXCEPTION_STATUS + code): n for code, n in self.counters.refused.items()})
+        found = Counter({STATUSES[status]: n for status, n in self.counters.missed.items()})
+        found.update({STATUSES[EXCEPTION_STATUS + code]: n for code, n in self.counters.refused.items()})
         return found
 
     @property
@@ -136,11 +136,11 @@ class Statistics:
     def diagnostics(self) -> Diagnostics:
         counters = self.counters
         return Diagnostics(
-            bus_messages=counters.answered + counters.late + counters.ended[Result.BAD_ECHO],
+            bus_messages=counters.answered + counters.late + counters.ended[Status.BAD_ECHO],
             bus_communication_errors=sum(counters.ended[why] for why in _DAMAGED),
             bus_exception_errors=counters.exceptions,
             server_messages=counters.sent,
-            server_no_responses=counters.ended[Result.INCOMPLETE] + counters.ended[Result.NO_REPLY],
+            server_no_responses=counters.ended[Status.OK] + counters.ended[Status.NO_REPLY],
             server_naks=counters.naks,
             server_busies=counters.busies,
             bus_character_overruns=self.overruns,

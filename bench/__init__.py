@@ -1,0 +1,1 @@
+"""Benchmarks: questions, players, masters and results."""

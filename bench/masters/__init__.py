@@ -1,0 +1,1 @@
+"""Masters: multidrop, its rivals, and bare programs in C."""

@@ -1,0 +1,155 @@
+"""The one place in bench/, besides players/replay.py and many_adapter.py, that knows multidrop's API."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy
+import pyarrow
+import pyarrow.compute
+from multidrop._core import ffi, lib
+
+from bench.masters.jobs import REGISTERS, Job, expected
+from bench.players.replay import Played, Unpaced
+from multidrop.bus import Bus
+from multidrop.core import Columns, Field, Names, RowLayout
+from multidrop.plant.loader import load_plant
+from multidrop.poller import Poller
+from multidrop.polling.batch import Batch, Row
+from multidrop.recording import open_writer
+
+BATCH_ROWS = 1 << 14
+
+
+def silence(baudrate: int) -> float:
+    """Seconds that multidrop keeps between two exchanges: one bit more, for a second stop bit."""
+    drive = Played(1, baudrate=baudrate)
+    return drive.needed_silence() + drive.settings.bit
+
+
+def _plant_text(job: Job) -> str:
+    family = "Played" if job.baudrate else "Unpaced"
+    model = f"{Path(__file__).parents[1] / 'players' / 'replay.py'}:{family}"
+    drives = (
+        f'[[line.drive]]\nname = "drive-{address}"\nmodel = "{model}"\naddress = {address}\n'
+        + (f"baudrate = {job.baudrate}\n" if job.baudrate else "")
+        for address in range(1, job.drives + 1)
+    )
+    return f'[[line]]\nname = "line"\nport = "{job.port}"\n' + "".join(drives)
+
+
+@contextmanager
+def polling(job: Job) -> Iterator[Poller]:
+    """All registers of all drives, as fast as the line allows."""
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / "plant.toml"
+        path.write_text(_plant_text(job))
+        plant = load_plant(path)
+    with Poller(plant) as poller:
+        yield poller
+
+
+def counts(poller: Poller) -> tuple[int, int]:
+    """Good exchanges and failures so far."""
+    summary = poller.summary()
+    return summary["samples"] // REGISTERS, summary["misses"] // REGISTERS
+
+
+def missed(batch: Batch) -> int:
+    """Return the number of rows without a value."""
+    return int(numpy.count_nonzero(batch._columns.array("status")))
+
+
+def dropped(poller: Poller) -> int:
+    """Rows so far that nobody took in time; the summary says so too, but of thousands of drives at length."""
+    return poller._row_queue.dropped
+
+
+@contextmanager
+def multidrop(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
+    """Poll as a rival does: take batches of columns ten times a second, and check the last one."""
+
+    def poll() -> tuple[int, int]:
+        for row in last(poller.batches(job.seconds)):
+            address, register = int(row.drive.partition("-")[2]), int(row.register[1:])
+            if row.value is not None and row.value != expected(address)[register]:
+                raise AssertionError(f"{row} is not what the drive holds")
+        return counts(poller)
+
+    def last(batches: Iterable[Batch]) -> Iterable[Row]:
+        return deque(batches, 1).pop()
+
+    with polling(job) as poller:
+        yield poll
+
+
+@contextmanager
+def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
+    """Return a function that reads all registers of the drive at an address."""
+    family = Played if job.baudrate else Unpaced
+    registers = family.readings()
+    with Bus(job.port, baudrate=job.port_baudrate) as bus:
+        drives = {address: bus.attach(family, address) for address in range(1, job.drives + 1)}
+        yield lambda address: bus.read_many(drives[address], registers)
+
+
+def lateness_ms(job: Job) -> tuple[int, numpy.ndarray]:
+    """Good exchanges, and for each value how long after its reply's first byte the consumer had it.
+
+    The consumer sleeps on the poller's descriptor and takes what there is as soon as it wakes.
+    """
+    _replied_ns(decoder(1)())  # what is imported at the first use would make it late
+    late = [numpy.empty(0)]
+    with polling(job) as poller:
+        end = time.monotonic() + job.seconds
+        while (left := end - time.monotonic()) > 0:
+            select.select([poller], [], [], left)
+            while batch := poller.take():
+                now = time.monotonic_ns()
+                late.append(now - _replied_ns(batch))
+        good, _ = counts(poller)
+    return good, numpy.concatenate(late) / 1e6
+
+
+def _replied_ns(batch: Batch) -> numpy.ndarray:
+    columns = pyarrow.record_batch(batch)
+    replied = pyarrow.compute.add(columns["monotonic_ns"], columns["uncertainty_ns"]).drop_null()
+    return numpy.asarray(replied)
+
+
+def decoder(drives: int) -> Callable[[], Batch]:
+    """Return a function that decodes one reply of each drive in turn until a batch is full."""
+    registers = list(Played.registers.values())
+    replies = []
+    for address in range(1, drives + 1):
+        fields = [Field(it.address, it.number_format, it.address, 1, 10) for it in registers]
+        data = b"".join(value.to_bytes(2, "big") for value in expected(address))
+        found = ffi.new("struct md_completion *")
+        found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
+        found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
+        replies.append((RowLayout(address - 1, fields), found))
+    turns = replies * (BATCH_ROWS // REGISTERS // drives + 1)
+    names = Names(f"drive-{address}" for address in range(1, drives + 1)), Names(it.name for it in registers)
+
+    def decode() -> Batch:
+        columns = Columns(BATCH_ROWS)
+        add, into = lib.md_columns_add, columns.c  # as the core's own thread does, with little of Python
+        for block, found in turns[: BATCH_ROWS // REGISTERS]:
+            add(into, block.c, found, 0)
+        return Batch(columns, *names)
+
+    return decode
+
+
+def record(path: Path, decode: Callable[[], Batch], values: int) -> int:
+    """Decode and write until so many values are in the recording; how many there are."""
+    with open_writer(path, {}) as writer:
+        while writer.rows < values:
+            writer.write(decode())
+        return writer.rows

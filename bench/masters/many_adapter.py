@@ -1,0 +1,224 @@
+"""Polls lines that no plant file describes: on open descriptors, of all families, or unreliable ones."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy
+import pyarrow
+
+from bench.players.replay import Played, Unpaced, Unreliable
+from multidrop.core import Echo, Port
+from multidrop.drive import Drive
+from multidrop.drives import MODELS
+from multidrop.planning.blocks import planned
+from multidrop.planning.prediction import predict
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Batch
+from multidrop.transport.line import Line
+
+
+class Inherited(Line):
+    """A line on a descriptor that is open already, which no URL can name."""
+
+    def _open(self) -> None:
+        os.set_blocking(int(self.port), False)
+        self._core = Port(int(self.port), must_take=-1)
+
+    def close(self) -> None:
+        if self._core:
+            self._core.close()
+            self._core = None
+
+
+def _opened(port: str, echo: Echo) -> Line:
+    return Inherited(port, echo) if port.isdigit() else Line(port, echo)
+
+
+@contextmanager
+def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
+    """All registers of the drives on each port: a path, or the number of an open descriptor."""
+    declared = tuple(
+        PlantLine(
+            port,
+            port,
+            None,
+            None,
+            tuple(
+                PolledDrive(it, tuple(Polled(register, every) for register in it.readings())) for it in drives
+            ),
+        )
+        for port, drives in lines.items()
+    )
+    with patch("multidrop.bus.Line", _opened), Poller(Plant(declared, Path())) as poller:
+        yield poller
+
+
+@contextmanager
+def polling_lines(
+    ports: Sequence[str], baudrate: int, drives: int = 16, every: float | None = None
+) -> Iterator[Poller]:
+    """Drives with the addresses from 1 on each port; baud rate 0: without waits."""
+
+    def drive(port: str, address: int) -> Drive:
+        name = _name(port, address)
+        return Played(address, name=name, baudrate=baudrate) if baudrate else Unpaced(address, name=name)
+
+    lines = {port: [drive(port, address) for address in range(1, drives + 1)] for port in ports}
+    with _polling_drives(lines, every) as poller:
+        yield poller
+
+
+def _name(port: str, address: int) -> str:
+    return f"{port}/{address}"
+
+
+def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds: float) -> list[float]:
+    """Return for each request of one drive per line how long after its slot it began to leave."""
+    with polling_lines(ports, baudrate, 1, every) as poller:
+        batches = list(poller.batches(seconds))
+        grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
+    period_ns = round(every * 1e9)
+    sent_ns = {(row.drive, row.monotonic_ns - grids[row.drive]) for batch in batches for row in batch}
+    # The first ones are due at the moment at which polling starts.
+    return [sent % period_ns / 1e3 for _, sent in sorted(sent_ns) if sent > period_ns / 2]
+
+
+# ---- all families on one line ----
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A line of all families in the arguments of mixed_line.c, and the bus cycle that it should reach."""
+
+    drives: Sequence[Drive]
+    words: Sequence[str]
+    requests: int  # in a bus cycle
+    cycle: float  # as predicted, in s
+
+
+def mixed() -> Mixed:
+    """One drive of each family and framing, as its document leaves the factory."""
+    kinds = [(family, framing) for family in MODELS.values() for framing in family.framings]
+    drives = [
+        family(at, name=f"{family.model} {framing}", framing=framing)
+        for at, (family, framing) in enumerate(kinds, 1)
+    ]
+    exchanges = [
+        it for drive in drives for it in planned(drive, ((register, None) for register in drive.readings()))
+    ]
+    words = [
+        ":".join(
+            str(it)
+            for it in (
+                drive.address,
+                int(drive.framing),
+                drive.settings.baudrate,
+                *(round(1e9 * it) for it in (drive.settings.character, drive.response_delay, demanded)),
+            )
+        )
+        for drive in drives
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # we keep more around ASCII frames
+    ]
+    return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
+
+
+def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
+    """Return the summary of the line."""
+    with _polling_drives({port: mixed().drives}, None) as poller:
+        for _ in poller.batches(seconds):
+            pass
+        line: dict[str, Any] = poller.summary()["lines"][port]
+    return line
+
+
+# ---- replies that are late, lost or doubled ----
+
+
+@dataclass
+class Judged:
+    """Poll drives whose replies are late, lost or doubled, and count what became of them."""
+
+    exchanges: int = 0  # whose requests left
+    samples: int = 0
+    wrong: int = 0  # values that are another register's
+    beyond: int = 0  # of these, whose reply came when it was not to be expected any more
+    late: int = 0  # replies that were recognised after their time-out
+    misses: Counter[str] = field(default_factory=Counter)
+    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # in vain, by drive and value
+
+
+def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
+    """Poll until so many exchanges are done, and hold each value against what its register holds."""
+    return _judged(ports, drives, lambda judged: judged.exchanges >= exchanges)
+
+
+def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
+    """The same for so many seconds."""
+    end = time.monotonic() + seconds
+    return _judged(ports, drives, lambda judged: time.monotonic() >= end)
+
+
+def _judged(ports: Sequence[str], drives: int, is_over: Callable[[Judged], bool]) -> Judged:
+    judged = Judged()
+    names = [_name(port, address) for port in ports for address in range(1, drives + 1)]
+    held = {
+        (name, register): Unreliable.held(int(name.partition("/")[2]), register)
+        for name in names
+        for register in Unreliable.registers
+    }
+    lines = {
+        port: [Unreliable(address, name=_name(port, address)) for address in range(1, drives + 1)]
+        for port in ports
+    }
+    with _polling_drives(lines, None) as poller:
+        while not is_over(judged):
+            for batch in poller.batches(1.0):
+                _judge(batch, held, judged)
+            judged.exchanges = sum(line.exchanges for line in poller.statistics().values())
+    while rest := poller.take():
+        _judge(rest, held, judged)
+    summary = poller.summary()
+    judged.late = sum(line["late_replies"] for line in summary["lines"].values())
+    if summary["dropped"] or (judged.samples, judged.misses.total()) != (
+        summary["samples"],
+        summary["misses"],
+    ):
+        raise AssertionError(f"rows are missing: {judged}, {summary}")
+    return judged
+
+
+def _judge(batch: Batch, held: Mapping[tuple[str, str], int], judged: Judged) -> None:
+    columns = pyarrow.record_batch(batch)
+    bad = columns.filter(columns["value"].is_null())
+    judged.misses.update(bad["status"].to_pylist())
+    for drive, register, sent in zip(
+        *(bad[it].to_pylist() for it in ("drive", "register", "monotonic_ns")), strict=True
+    ):
+        judged.asked_ns[drive, held[drive, register]] = sent
+    good = columns.filter(columns["value"].is_valid())
+    judged.samples += len(good)
+    drives, registers = (good[name].dictionary_encode() for name in ("drive", "register"))
+    names = drives.dictionary.to_pylist(), registers.dictionary.to_pylist()
+    truth = numpy.array([[held[drive, register] for register in names[1]] for drive in names[0]])
+    if len(good):
+        right = truth[drives.indices.to_numpy(), registers.indices.to_numpy()]
+        wrong = good.filter(pyarrow.array(good["value"].to_numpy() != right))
+        judged.wrong += len(wrong)
+        judged.beyond += sum(_is_beyond(row, judged.asked_ns) for row in wrong.to_pylist())
+
+
+def _is_beyond(row: Mapping[str, Any], asked_ns: Mapping[tuple[str, int], int]) -> bool:
+    """Return True for a value that answers a request of more than three time-outs before."""
+    question_ns = asked_ns.get((row["drive"], int(row["value"])))
+    last_ns = 3e9 * Unreliable.response_timeout
+    return question_ns is not None and row["monotonic_ns"] + row["uncertainty_ns"] - question_ns > last_ns

@@ -1,0 +1,237 @@
+"""Masters that are compared, each in a process of its own (`python -m bench.masters.rivals MASTER JOB`).
+
+A rival is used as its own documentation shows, with its own waits, and no retries.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from bench.masters.jobs import REGISTERS, TIMEOUT_S, Job, expected
+from bench.support.programs import compiled, module
+
+Read = Callable[[int], Sequence[float]]
+Poll = Callable[[], tuple[int, int]]  # good exchanges, failures
+
+
+@contextmanager
+def multidrop(job: Job) -> Iterator[Poll]:
+    from bench.masters import adapter
+
+    with adapter.multidrop(job) as poll:
+        yield poll
+
+
+# ---- masters that are called for each exchange: how to open, how to read ----
+
+
+@contextmanager
+def reading_by_hand(job: Job) -> Iterator[Read]:
+    """`bus.read_many` in a loop, in place of multidrop's poller."""
+    from bench.masters import adapter
+
+    with adapter.reading(job) as read:
+        yield lambda address: list(read(address).values())
+
+
+@contextmanager
+def pymodbus(job: Job) -> Iterator[Read]:
+    from pymodbus import FramerType
+    from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+    if job.port.startswith("socket://"):
+        host, _, tcp_port = job.port.removeprefix("socket://").partition(":")
+        client: Any = ModbusTcpClient(
+            host, port=int(tcp_port), framer=FramerType.RTU, timeout=TIMEOUT_S, retries=0
+        )
+    else:
+        client = ModbusSerialClient(job.port, baudrate=job.port_baudrate, timeout=TIMEOUT_S, retries=0)
+    client.connect()
+    yield lambda address: client.read_holding_registers(0, count=REGISTERS, device_id=address).registers
+    client.close()
+
+
+@contextmanager
+def pyserial(job: Job) -> Iterator[Any]:
+    """Return a port for the rivals that use pyserial; over TCP it is pyserial's socket:// port."""
+    import serial
+
+    with serial.serial_for_url(job.port, job.port_baudrate, timeout=TIMEOUT_S) as port:
+        yield port
+
+
+@contextmanager
+def minimalmodbus(job: Job) -> Iterator[Read]:
+    from minimalmodbus import Instrument
+
+    with pyserial(job) as port:
+        drives = {address: Instrument(port, address) for address in range(1, job.drives + 1)}
+        yield lambda address: drives[address].read_registers(0, REGISTERS)
+
+
+@contextmanager
+def modbus_tk(job: Job) -> Iterator[Read]:
+    from modbus_tk.defines import READ_HOLDING_REGISTERS
+    from modbus_tk.modbus_rtu import RtuMaster
+
+    with pyserial(job) as port:
+        master = RtuMaster(port)
+        master.set_timeout(TIMEOUT_S)
+        yield lambda address: master.execute(address, READ_HOLDING_REGISTERS, 0, REGISTERS)
+
+
+@contextmanager
+def umodbus(job: Job) -> Iterator[Read]:
+    from umodbus.client.serial import rtu
+
+    with pyserial(job) as port:
+        yield lambda address: rtu.send_message(rtu.read_holding_registers(address, 0, REGISTERS), port)
+
+
+def in_turn(
+    reader: Callable[[Job], AbstractContextManager[Read]],
+) -> Callable[[Job], AbstractContextManager[Poll]]:
+    """A rival that reads the drives in turn; an exchange is good if its values are right."""
+
+    @contextmanager
+    def rival(job: Job) -> Iterator[Poll]:
+        def poll() -> tuple[int, int]:
+            good, asked, end = 0, 0, time.monotonic() + job.seconds
+            while time.monotonic() < end:
+                address = 1 + asked % job.drives
+                asked += 1
+                with suppress(Exception):  # each has its own for a failed exchange
+                    good += list(read(address)) == expected(address)
+            return good, asked - good
+
+        with reader(job) as read:
+            yield poll
+
+    return rival
+
+
+# ---- and one that is not ----
+
+
+@contextmanager
+def pymodbus_async(job: Job) -> Iterator[Poll]:
+    from pymodbus import FramerType
+    from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
+    from pymodbus.exceptions import ModbusException
+
+    async def poll() -> tuple[int, int]:
+        if job.port.startswith("socket://"):
+            host, _, tcp_port = job.port.removeprefix("socket://").partition(":")
+            client: Any = AsyncModbusTcpClient(
+                host, port=int(tcp_port), framer=FramerType.RTU, timeout=TIMEOUT_S, retries=0
+            )
+        else:
+            client = AsyncModbusSerialClient(
+                job.port, baudrate=job.port_baudrate, timeout=TIMEOUT_S, retries=0
+            )
+        await client.connect()
+        good, asked, end = 0, 0, time.monotonic() + job.seconds
+        while time.monotonic() < end:
+            address = 1 + asked % job.drives
+            asked += 1
+            with suppress(ModbusException):
+                reply = await client.read_holding_registers(0, count=REGISTERS, device_id=address)
+                good += reply.registers == expected(address)
+        client.close()
+        return good, asked - good
+
+    yield lambda: asyncio.run(poll())
+
+
+READERS = {
+    "pymodbus": pymodbus,
+    "minimalmodbus": minimalmodbus,
+    "modbus-tk": modbus_tk,
+    "umodbus": umodbus,
+}
+IN_PYTHON = {
+    "multidrop": multidrop,
+    **{name: in_turn(reader) for name, reader in READERS.items()},
+    "pymodbus-async": pymodbus_async,
+    "bus.read_many": in_turn(reading_by_hand),
+}
+MASTERS = (*IN_PYTHON, "libmodbus")
+
+INSTALL = {
+    "bus.read_many": "multidrop",
+    "pymodbus": "pymodbus==3.16.1",
+    "pymodbus-async": "pymodbus==3.16.1",
+    "minimalmodbus": "minimalmodbus==2.1.1",
+    "modbus-tk": "modbus-tk==1.1.5",
+    "umodbus": "umodbus==1.0.4",
+}
+
+
+def _missing(wanted: Sequence[str]) -> set[str]:
+    missing = set()
+    for name in wanted:
+        package = INSTALL.get(name, name)
+        try:
+            version(package.partition("==")[0])
+        except PackageNotFoundError:
+            missing.add(package)
+    return missing
+
+
+def insist_on(masters: Sequence[str]) -> None:
+    """Leave with one sentence that says what to install, if anything is missing."""
+    missing = _missing([name for name in masters if name in IN_PYTHON])
+    if missing:
+        sys.exit(f"rivals are missing: {sys.executable} -m pip install {' '.join(sorted(missing))}")
+    if "libmodbus" in masters and subprocess.run(["pkg-config", "--exists", "libmodbus"]).returncode:
+        sys.exit("libmodbus is missing: apt-get install libmodbus-dev pkg-config")
+
+
+def measure(master: str, job: Job) -> dict[str, Any]:
+    """Exchanges, failures, CPU seconds, seconds and version of a master that does the job."""
+    if master == "libmodbus":
+        flags = subprocess.check_output(["pkg-config", "--cflags", "--libs", "libmodbus"], text=True).split()
+        program = compiled("masters/libmodbus_master.c", *flags)
+        command = [program, job.port, job.port_baudrate, job.drives, REGISTERS, job.seconds]
+    else:
+        command = [*module("bench.masters.rivals", master, json.dumps(asdict(job)))]
+    result: dict[str, Any] = json.loads(subprocess.check_output([str(word) for word in command]))
+    return result
+
+
+def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
+    """The same of bare_master.c: seconds of silence before a request, and without a look after it."""
+    command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
+    command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
+    command += ["--asleep-us", asleep * 1e6, job.port]
+    result: dict[str, Any] = json.loads(subprocess.check_output([str(word) for word in command]))
+    return result | {"version": ""}
+
+
+def _cpu_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def main(master: str, job: Job) -> None:
+    with IN_PYTHON[master](job) as poll:
+        cpu, begun = _cpu_seconds(), time.monotonic()
+        good, bad = poll()
+        cpu, seconds = _cpu_seconds() - cpu, time.monotonic() - begun
+    package = INSTALL.get(master, master).partition("==")[0]
+    result = {"exchanges": good, "failures": bad, "cpu_seconds": cpu, "seconds": seconds}
+    print(json.dumps(result | {"version": version(package)}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Job(**json.loads(sys.argv[2])))

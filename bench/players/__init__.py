@@ -1,0 +1,1 @@
+"""Players: lines, drives and clients under attack."""

@@ -1,0 +1,157 @@
+"""Simulated lines in a process of their own, of all families and hostile, and what their values prove.
+
+The demo's eight variants hold values that name drive and register (EncodedDrive). A ninth drive on
+each line has a motor, so that its starts can bring noise.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.sharedctypes import SynchronizedArray
+from pathlib import Path
+from threading import Thread
+
+from multidrop.cli.demo import DRIVES, OPTIONS
+from multidrop.drives import MODELS
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
+from multidrop.sim import EncodedDrive, Faults, HostileWire, Simulator, Wire, proof, serve, simulated
+
+MOTOR = "fan"
+EVERY = 2.0  # s, of each drive's first register; the others as fast as the line allows
+PATIENCE = 30.0  # s, until the simulator has started
+BEAT = 5e-3  # s
+LONG = 30e-3  # s, that with the latest reply and a collision are near the shortest response time-out
+
+
+def write_plant(directory: Path, lines: int) -> Path:
+    """A plant file; the last of several lines is a TCP port, which the simulator chooses."""
+    path = directory / "plant.toml"
+    tables = []
+    for number in range(1, lines + 1):
+        tcp = number == lines > 1
+        port = "socket://127.0.0.1:0" if tcp else directory / f"line-{number}"
+        tables.append(f'[[line]]\nname = "line-{number}"\nport = "{port}"\n')
+        for address, (name, model, framing) in enumerate([*DRIVES, (MOTOR, "yd1000", "rtu")], 1):
+            family = MODELS[model]
+            options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+            first, *others = (it.name for it in family.readings())
+            poll = ", ".join([f'{{ register = "{first}", every = "{EVERY:g} s" }}', *map(repr, others)])
+            tables.append(
+                f'[[line.drive]]\nname = "{name}-{number}"\nmodel = "{model}"\nframing = "{framing}"\n'
+                f"address = {address}\n{options}poll = [{poll}]\n"
+            )
+    path.write_text("\n".join(tables))
+    return path
+
+
+def proofs(plant: Plant) -> dict[tuple[str, str], float]:
+    """Return each register's value, by names of drive and register; those of motors are unknown."""
+    return {
+        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
+        for line in plant.lines
+        for it in line.drives
+        if not is_motor(it.drive.name)
+        for poll in it.polls
+    }
+
+
+def is_motor(drive: str) -> bool:
+    return drive.startswith(MOTOR)
+
+
+@dataclass
+class RunningPlant:
+    """A running simulator: where its lines are, and how it fares."""
+
+    ports: Sequence[str]
+    pid: int
+    _late: SynchronizedArray[float]
+
+    def latest(self) -> float:
+        """The longest in s that the simulator or a pty was held up since this was asked last."""
+        with self._late.get_lock():
+            late, self._late[0] = self._late[0], 0.0
+        return late
+
+    def was_held_up(self, since: float) -> bool:
+        """Return True if one was held up for so long that answers may have come after their time-out."""
+        return max(self._late[1:]) >= since
+
+
+def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
+    """The plant's lines with these faults, each drive but the motors' one of encoded values."""
+    return [
+        HostileWire(
+            [
+                simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
+                for it in line.drives
+            ],
+            faults,
+            name=line.name,
+            port=line.port,
+        )
+        for line in load_plant(plant).lines
+    ]
+
+
+@contextmanager
+def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
+    """The wires that this makes, in a process of their own, to which the function is handed over."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    late = context.Array("d", 2)  # the longest time held up; when it was so for long the last time
+    process = context.Process(target=_simulate, args=(make, arguments, theirs, late), daemon=True)
+    process.start()
+    try:
+        if not ours.poll(PATIENCE):
+            raise TimeoutError("the simulator did not start")
+        yield RunningPlant(ours.recv(), process.pid or 0, late)
+    finally:
+        process.terminate()
+        process.join()
+        process.close()
+        ours.close()
+        theirs.close()
+
+
+def _simulate(
+    make: Callable[..., Sequence[Wire]],
+    arguments: Sequence[object],
+    connection: Connection,
+    late: SynchronizedArray[float],
+) -> None:
+    with suppress(OSError):  # so that the line keeps its time on a machine that has much else to do
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    Thread(target=_watch, args=(late,), daemon=True).start()
+
+    def announce(simulator: Simulator) -> None:
+        connection.send([wire.path for wire in simulator.wires])
+
+    serve(make(*arguments), announce)
+
+
+def _watch(late: SynchronizedArray[float]) -> None:
+    """Measure for how long this process, or a pty's worker in the kernel, is held up.
+
+    A drive that hears so late answers so late.
+    """
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    while True:
+        begun = time.monotonic()
+        time.sleep(BEAT)
+        os.write(slave, b"!")
+        os.read(master, 1)
+        now = time.monotonic()
+        with late.get_lock():
+            late[0] = max(late[0], now - begun - BEAT)
+            if now - begun - BEAT >= LONG:
+                late[1] = now

@@ -1,0 +1,63 @@
+"""The drives that paced_line.c and responders.c play, declared as a user declares a family of their own."""
+
+from typing import Any
+
+from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, INPUT, reading
+from multidrop.drive.timing import Settings
+
+
+class Played(Drive):
+    """Register r of address a holds 256 * a + r."""
+
+    model = "played"
+    title = "Played by paced_line"
+    baudrates = (9600, 19200, 38400, 57600, 115200)
+    most_registers = {HOLDING: 125}
+    response_delay = 2e-3
+
+    r0, r1, r2, r3, r4, r5, r6, r7, r8, r9 = (reading(address) for address in range(10))
+
+
+class NoTime(Settings):
+    """Characters that take next to no time, so that few of them are still better than many."""
+
+    @property
+    def character(self) -> float:
+        return 1e-9
+
+    @property
+    def bit(self) -> float:
+        return 0.0
+
+
+class Unpaced(Played):
+    """The same on a line that has no waits: what is left is the host's own cost."""
+
+    response_delay = 0.0
+
+    def __init__(self, address: int, **details: Any) -> None:
+        super().__init__(address, **details)
+        self.settings = NoTime(self.settings.baudrate, self.settings.format)
+
+
+class Unreliable(Unpaced):
+    """Played by responders: four blocks of one length, whose replies only their values tell apart."""
+
+    model = "unreliable"
+    title = "Played by responders"
+    most_registers = {HOLDING: 10, INPUT: 10}
+    response_timeout = 5e-3
+
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9 = (reading(address) for address in range(20, 30))
+    t0, t1, t2, t3, t4, t5, t6, t7, t8, t9 = (reading(address) for address in range(40, 50))
+    u0, u1, u2, u3, u4, u5, u6, u7, u8, u9 = (reading(address, table=INPUT) for address in range(10))
+
+    def needed_silence(self) -> float:
+        return 3e-4  # in which a reply that comes twice is over
+
+    @classmethod
+    def held(cls, address: int, name: str) -> int:
+        """Return the value that the drive of this address holds there."""
+        register = cls.register(name)
+        return 256 * address + register.address + (128 if register.table is INPUT else 0)

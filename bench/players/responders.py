@@ -1,0 +1,28 @@
+"""Lines that responders.c answers on, as a context."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from socket import socket, socketpair
+
+from bench.support.programs import CHECKSUM, compiled, talking
+
+
+@contextmanager
+def responders(kind: str, count: int, *options: object) -> Iterator[tuple[list[str], list[int]]]:
+    """Play so many lines whose drives answer: their ports, and the descriptors to hand down."""
+    program = compiled("players/responders.c", *CHECKSUM)
+    if kind == "pty":
+        with talking([program, "--ptys", count, *options]) as talker:
+            yield talker.said.split(), []
+        return
+    pairs: list[tuple[socket, socket]] = [socketpair() for _ in range(count)]
+    try:
+        theirs = [far.fileno() for _, far in pairs]
+        ours = [near.fileno() for near, _ in pairs]
+        with talking([program, *options, *theirs], pass_fds=theirs):
+            yield [str(fd) for fd in ours], ours
+    finally:
+        for end in (end for pair in pairs for end in pair):
+            end.close()

@@ -1,0 +1,171 @@
+"""One attack's responders and client, and what its stops came to."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+
+from far_drives import KINDS, FarDrive
+from far_end import FarEnd, FarLine, Heard
+
+CLIENT = "bench.players.stop_client"
+PATIENCE = 150.0  # s, for a client to end by itself
+
+
+@dataclass
+class Counters:
+    """Stops that were asked for, one a motor, and what became of them."""
+
+    rounds: int = 0
+    asked: int = 0
+    turning: int = 0  # motors still, afterwards
+    moved: int = 0  # frames that move a motor, after one that stops it
+    unsent: int = 0  # no stop was on the wire
+    excused: int = 0  # motors that turn because the stops were cut short, which was said
+    first_ms: list[float] = field(default_factory=list)  # from the asking to the first stop frame
+    stories: list[str] = field(default_factory=list)
+
+    @property
+    def failures(self) -> int:
+        return self.turning + self.moved
+
+
+class Victim:
+    """A client process, its responders, and the time when it was asked to stop."""
+
+    def __init__(self, far: FarEnd, process: subprocess.Popen[str], errors: Path) -> None:
+        self.far = far
+        self.lines = far.lines
+        self.process = process
+        self.asked_ns = 0
+        self._errors = errors
+        self._begun: dict[FarLine, int] = {}
+
+    def ask(self, **command: Any) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+
+    def hear(self, what: str) -> dict[str, Any]:
+        """Return the client's next report; empty when it is dead."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            said: dict[str, Any] = json.loads(line)
+            if said["what"] == what:
+                return said
+        return {}
+
+    def leave(self) -> None:
+        """Have it leave its `with` block."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal; the first one asks for the stops."""
+        if not self.asked_ns:
+            self.asked_ns = time.monotonic_ns()
+        self.process.send_signal(number)
+
+    def wait(self) -> None:
+        assert self.process.stdout is not None
+        self.process.stdout.read()
+        self.process.wait(PATIENCE)
+
+    @property
+    def errors(self) -> str:
+        return self._errors.read_text()
+
+    def begin(self, *, turning: bool) -> None:
+        """A new episode; its motors are turned by hand, or left."""
+        self.asked_ns = 0
+        for line in self.lines:
+            self._begun[line] = len(line.log)
+            for drive in line.drives.values():
+                if turning:
+                    drive.turn()
+
+    def hold(self, requests: int) -> None:
+        """Answer nothing on the first line after so many requests, until `release`."""
+        self.far.do(lambda: self.lines[0].hold(requests))
+
+    def release(self) -> None:
+        self.far.release(self.lines[0])
+
+    def heard(self, line: FarLine, address: int, what: str) -> list[Heard]:
+        """In this episode."""
+        return [
+            it
+            for it in line.log[self._begun.get(line, 0) :]
+            if it.what == what and it.asked is not None and it.asked.address in (0, address)
+        ]
+
+    def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
+        """Count what became of the stops of all drives."""
+        counters.rounds += 1
+        for line in self.lines:
+            for address, drive in line.drives.items():
+                stops = self.heard(line, address, "stops")
+                counters.asked += 1
+                if stops and self.asked_ns:
+                    counters.first_ms.append((stops[0].at - self.asked_ns) / 1e6)
+                late = [it for it in self.heard(line, address, "moves") if stops and it.at > stops[0].at]
+                counters.moved += len(late)
+                counters.unsent += not stops
+                counters.turning += drive.runs and not excuse
+                counters.excused += drive.runs and excuse
+                if late or drive.runs:
+                    said = self.errors.strip().splitlines()[-1:]
+                    story = "; ".join(str(it) for it in (*stops[:3], *late))
+                    counters.stories.append(
+                        f"{what}: {drive.kind.name}@{address}: {story or 'no stop'} {said}"
+                    )
+
+
+@contextmanager
+def victim(
+    plant: Sequence[Sequence[tuple[str, int]]],
+    *,
+    on_exit: bool = False,
+    sets: bool = False,
+    polls: bool = False,
+    ramp: float = 0.0,
+    far: FarEnd | None = None,
+) -> Iterator[Victim]:
+    """A client that is ready, with a line for each list of kinds and addresses."""
+    with TemporaryDirectory(prefix="multidrop-stops-") as name:
+        directory = Path(name)
+        if far is None:
+            lines = [FarLine([FarDrive(KINDS[kind], at, ramp) for kind, at in drives]) for drives in plant]
+            far = FarEnd(lines, directory)
+        given = {"ports": far.ports, "drives": plant, "on_exit": on_exit, "sets": sets, "polls": polls}
+        errors = directory / "errors"
+        with (
+            far,
+            errors.open("w") as stderr,
+            subprocess.Popen(
+                [sys.executable, "-m", CLIENT, json.dumps(given)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                text=True,
+                env={"XDG_STATE_HOME": name, "PATH": "/usr/bin:/bin"},
+            ) as process,
+        ):
+            found = Victim(far, process, errors)
+            try:
+                if not found.hear("ready"):
+                    raise RuntimeError(f"the client did not begin: {found.errors}")
+                yield found
+            finally:
+                process.kill()

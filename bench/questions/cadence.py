@@ -1,0 +1,104 @@
+"""The rate that is kept, and how late results are, beside a Python thread that computes without pause.
+
+`python -m bench.questions.cadence MASTER JOB` is the process of one master; its results come as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy
+
+from bench.masters import rivals
+from bench.masters.jobs import TIMEOUT_S, Job
+from bench.support import tables
+from bench.support.programs import module, paced_line
+
+
+def compute_without_pause() -> None:
+    number = 0
+    while True:
+        number = (number * 1103515245 + 12345) & 0x7FFFFFFF
+
+
+def of_multidrop(job: Job) -> tuple[int, numpy.ndarray]:
+    from bench.masters import adapter
+
+    return adapter.lateness_ms(job)
+
+
+def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
+    """Good exchanges, and how much longer than on the wire each call took, in ms."""
+    wire = job.wire if job.baudrate else 0.0
+    took: list[float] = []
+    with rivals.pymodbus(job) as read:
+        end = time.monotonic() + job.seconds
+        while (begun := time.monotonic()) < end:
+            read(1 + len(took) % job.drives)
+            took.append(time.monotonic() - begun - wire)
+    good = [it for it in took if it < TIMEOUT_S]
+    return len(good), numpy.array(good) * 1e3
+
+
+MASTERS = {"multidrop": of_multidrop, "pymodbus": of_pymodbus}
+
+
+def work(master: str, job: Job) -> None:
+    """First alone, then beside the busy thread."""
+    told = {}
+    for when in ("alone", "beside"):
+        if when == "beside":
+            threading.Thread(target=compute_without_pause, daemon=True).start()
+        good, late = MASTERS[master](job)
+        p50, p99 = numpy.percentile(late, [50, 99]) if len(late) else (numpy.nan, numpy.nan)
+        told[when] = {"rate": good / job.seconds, "p50": p50, "p99": p99}
+    print(json.dumps(told))
+
+
+def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
+    with paced_line(baudrate=baudrate) as line:
+        job = json.dumps(asdict(Job(line.path, baudrate, seconds)))
+        told: dict[str, Any] = json.loads(
+            subprocess.check_output(module("bench.questions.cadence", master, job))
+        )
+    return told
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--baudrates", type=int, nargs="+", default=[38400, 115200, 0], help="0: no waits")
+    parser.add_argument("--masters", nargs="+", choices=MASTERS, default=list(MASTERS))
+    parser.add_argument("--seconds", type=float, default=10.0)
+    arguments = parser.parse_args()
+    rivals.insist_on(arguments.masters)
+    tables.heading("16 drives, 10 registers each, beside a Python thread that computes without pause.")
+
+    rows = []
+    for baudrate in arguments.baudrates:
+        for master in arguments.masters:
+            told = measured(master, baudrate, arguments.seconds)
+            alone, beside = told["alone"], told["beside"]
+            kept = beside["rate"] / alone["rate"] if alone["rate"] else 0.0
+            rates = f"{alone['rate']:.1f}", f"{beside['rate']:.1f}", f"{kept:.1%}"
+            late = [f"{when[key]:.1f}" for when in (alone, beside) for key in ("p50", "p99")]
+            rows.append((f"{baudrate or 'no waits'}", master, *rates, *late))
+    columns = ("baud", "master", "alone/s", "beside/s", "kept", "late ms p50", "p99", "beside p50", "p99")
+    tables.show(columns, rows)
+    print(
+        "\nlate: multidrop, from a reply's first byte until the consumer has the value;"
+        "\npymodbus, how much longer than its time on the wire the call takes."
+    )
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 3 and sys.argv[1] in MASTERS:
+        work(sys.argv[1], Job(**json.loads(sys.argv[2])))
+    else:
+        main()

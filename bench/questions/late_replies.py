@@ -1,0 +1,75 @@
+"""Late, doubled and lost replies: count those that were taken for another request's reply.
+
+Several drives on each line, four blocks of one length per drive; a value names its drive and its
+register. Replies are late by up to three times the time-out, lost, or doubled; then all of them come
+over a path that holds them up for longer, and keeps their order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+
+from bench.players.responders import responders
+from bench.support import tables
+
+TIMEOUT_MS = 5
+LATE_PERMILLE, LOST_PERMILLE, TWICE_PERMILLE = 100, 20, 50
+PATHS_MS = (10, 100, 1000)
+FEW = 4  # lines, and drives on each
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--exchanges", type=int, default=20_000)
+    parser.add_argument("--lines", type=int, default=16)
+    parser.add_argument("--drives", type=int, default=8, help="on each line")
+    parser.add_argument("--seconds", type=float, default=20, help="of each slow path")
+    arguments = parser.parse_args()
+    from bench.masters import many_adapter
+
+    tables.heading(
+        f"{arguments.lines} lines without waits, {arguments.drives} drives each, 4 blocks of 10 registers; "
+        f"time-out {TIMEOUT_MS} ms."
+    )
+    options: tuple[object, ...] = "--late-us", 3 * TIMEOUT_MS * 1000, "--late-permille", LATE_PERMILLE
+    options += "--lost-permille", LOST_PERMILLE, "--twice-permille", TWICE_PERMILLE
+    begun = time.monotonic()
+    with responders("socketpair", arguments.lines, *options) as (ports, _):
+        judged = many_adapter.judge(ports, arguments.exchanges, arguments.drives)
+    rows = [
+        ("seconds", f"{time.monotonic() - begun:.0f}"),
+        ("exchanges", judged.exchanges),
+        ("values", judged.samples),
+        ("values that are another register's", judged.wrong - judged.beyond),
+        ("the same, by answers later than that", judged.beyond),
+        ("late replies that were recognised", judged.late),
+        *((f"missed: {why}", count) for why, count in judged.misses.most_common()),
+    ]
+    tables.show(("what", "number"), rows)
+    print(
+        f"\nOf the replies {LATE_PERMILLE / 10:g} % come up to {3 * TIMEOUT_MS} ms late, "
+        f"{LOST_PERMILLE / 10:g} % never, {TWICE_PERMILLE / 10:g} % twice; missed: values, 10 in an exchange."
+        "\nLater than that: over three time-outs after the request, when the responders received it late."
+    )
+    print()
+    tables.show(("path", "exchanges", "values", "another register's", "late"), list(slow_paths(arguments)))
+    print("\nStalls come every five times their length. Late: replies that were recognised as such.")
+
+
+def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
+    """A row for each path, with few drives on few lines: each exchange takes as long as the path."""
+    from bench.masters import many_adapter
+
+    for path_ms in PATHS_MS:
+        constant = "--path-us", 1000 * path_ms
+        stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms
+        for name, options in ((f"{path_ms} ms", constant), (f"stalls of {path_ms} ms", stalls)):
+            with responders("socketpair", FEW, *options, "--lost-permille", LOST_PERMILLE) as (ports, _):
+                judged = many_adapter.judge_for(ports, arguments.seconds, FEW)
+            yield name, judged.exchanges, judged.samples, judged.wrong, judged.late
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,236 @@
+"""Many lines at once, and many threads that do to one poller all that may be done to it.
+
+Rows are taken and judged, motors started and stopped, drives removed and added again, and the summary
+is looked at, all at the same time; several times the poller is closed and another one opened. Ends
+with 1 when a value is another register's, when a row or a command is lost, when a thread does not end,
+or when memory, descriptors or threads grow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import gc
+import os
+import random
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from bench.players import plants
+from bench.questions.soak import MOST_GROWTH_KB, resident_kb
+from bench.support import tables
+from multidrop.drive import Drive
+from multidrop.drives import YD1000, InnovertIBD
+from multidrop.errors import BusError
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.poller import Poller
+from multidrop.sim import EncodedDrive, Wire, simulated
+
+PATIENCE = 30.0  # s, until a thread that was asked to end must have ended
+HEAD: tuple[str, ...] = (
+    "exchanges",
+    "a second",
+    "values",
+    "missed",
+    "misattributed",
+    "lost",
+    "came and went",
+    "commands",
+)
+HEAD += ("failed", "memory kB", "descriptors", "threads")
+
+
+def plant(ports: Sequence[str], drives: int) -> Plant:
+    """On each line IBDs from address 1 on, and a YD1000 whose motor is commanded."""
+    lines = []
+    for number, port in enumerate(ports, 1):
+        found = [InnovertIBD(at, name=f"ibd-{number}-{at}") for at in range(1, drives)]
+        motor = YD1000(drives, name=f"{plants.MOTOR}-{number}")
+        polled = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings())) for it in found]
+        polled.append(PolledDrive(motor, (Polled(YD1000.register("status"), 1.0),)))
+        lines.append(PlantLine(f"line-{number}", port, None, None, tuple(polled)))
+    return Plant(tuple(lines), Path("plant.toml"))
+
+
+def wires(lines: int, drives: int) -> list[Wire]:
+    """Without waits, so that there is no processor for their pace."""
+    return [
+        Wire(
+            [
+                simulated(it.drive) if plants.is_motor(it.drive.name) else EncodedDrive(it.drive)
+                for it in line.drives
+            ],
+            name=line.name,
+            unpaced=True,
+        )
+        for line in plant([""] * lines, drives).lines
+    ]
+
+
+class Round:
+    """One poller, from its opening to its end, and the threads around it."""
+
+    def __init__(self, declared: Plant, seed: int) -> None:
+        self.plant = declared
+        self.poller = Poller(declared)
+        self.truth = plants.proofs(declared)
+        self.counts: Counter[str] = Counter()
+        self.failures: list[str] = []
+        self._seed = seed
+        self._panels = {line.name: threading.Lock() for line in declared.lines}
+        self._leave = threading.Event()
+        self._lock = threading.Lock()  # of the counts
+
+    def count(self, **numbers: int) -> None:
+        with self._lock:
+            self.counts.update(numbers)
+
+    def run(self, seconds: float) -> None:
+        acts = ((self.take, 2), (self.come_and_go, 3), (self.command, 3), (self.look, 1))
+        actors = [
+            threading.Thread(target=self._act, args=(act, f"{self._seed} {at}"), name=act.__name__)
+            for act, number in acts
+            for at in range(number)
+        ]
+        begun = time.monotonic()
+        with self.poller:
+            for it in actors:
+                it.start()
+            self._leave.wait(seconds)
+            self._leave.set()
+            for it in actors:
+                it.join(PATIENCE)
+                if it.is_alive():
+                    faulthandler.dump_traceback(all_threads=True)
+                    self.failures.append(f"a thread that does {it.name!r} does not end")
+        self.take_all()
+        self.seconds = time.monotonic() - begun
+
+    def _act(self, act: Callable[[random.Random], None], seed: str) -> None:
+        chance = random.Random(f"{seed} {act.__name__}")
+        try:
+            while not self._leave.is_set():
+                act(chance)
+        except BaseException as failure:
+            self.failures.append(f"{threading.current_thread().name}: {failure!r}")
+            self._leave.set()
+            raise
+
+    # ---- what the threads do ----
+
+    def take(self, chance: random.Random) -> None:
+        self.take_all()
+        time.sleep(chance.uniform(0, 0.1))
+
+    def take_all(self) -> None:
+        while batch := self.poller.take():
+            rows = list(batch)
+            values = [row for row in rows if row.value is not None]
+            wrong = [
+                row for row in values if row.value != self.truth.get((row.drive, row.register), row.value)
+            ]
+            self.count(rows=len(rows), values=len(values), misattributed=len(wrong))
+
+    def come_and_go(self, chance: random.Random) -> None:
+        """Two threads may choose the same drive: then one of them is told so."""
+        line = chance.choice(self.plant.lines)
+        polled = chance.choice(line.drives[:-1])
+        try:
+            self.poller.remove(line.name, polled.drive.name)
+        except ValueError:
+            self.count(beaten=1)
+            return
+        time.sleep(chance.uniform(0, 0.05))
+        self.poller.add(line.name, polled)
+        self.count(moved=1)
+
+    def command(self, chance: random.Random) -> None:
+        """One thread at a motor: a stop waits until the motor stands, and somebody else might start it."""
+        line = chance.choice(self.plant.lines)
+        if self._panels[line.name].acquire(blocking=False):
+            try:
+                self.use_panel(line.drives[-1].drive, chance)
+            finally:
+                self._panels[line.name].release()
+
+    def use_panel(self, motor: Drive, chance: random.Random) -> None:
+        self.count(given=1)
+        try:
+            if chance.random() < 0.3:
+                motor.set_frequency(chance.randrange(1, 5))  # so that it soon stands
+            getattr(motor, chance.choice(["start", "stop", "state"]))()
+        except BusError:
+            self.count(failed=1)
+        self.count(ended=1)
+
+    def look(self, chance: random.Random) -> None:
+        self.poller.summary()
+        self.poller.statistics()
+        time.sleep(chance.uniform(0, 0.2))
+
+    # ---- what came of it ----
+
+    def told(self) -> tuple[int, int]:
+        """Exchanges, and values that are neither taken nor missed; all drives have come back."""
+        summary = self.poller.summary()
+        lost = summary["samples"] + summary["misses"] - self.counts["rows"]
+        return sum(line["exchanges"] for line in summary["lines"].values()), lost
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lines", type=int, default=64)
+    parser.add_argument("--drives", type=int, default=31, help="on each line")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--rounds", type=int, default=10, help="how often the poller is opened and closed")
+    arguments = parser.parse_args()
+    tables.heading(
+        f"{arguments.lines} lines of {arguments.drives} drives without waits, polled by one process, "
+        "and 9 threads around the poller."
+    )
+    failures: list[str] = []
+    seen: list[tuple[int, int, int]] = []
+    print("  ".join(HEAD), flush=True)
+    with TemporaryDirectory(prefix="multidrop-many-") as name:
+        os.environ["XDG_STATE_HOME"] = name
+        with plants.running(wires, arguments.lines, arguments.drives) as simulator:
+            for number in range(arguments.rounds):
+                it = Round(plant(simulator.ports, arguments.drives), number)
+                it.run(60 * arguments.minutes / arguments.rounds)
+                exchanges, lost = it.told()
+                descriptors = len(list(Path("/proc/self/fd").iterdir()))
+                gc.collect()  # who refers to each other in a circle waits for that
+                seen.append((resident_kb(os.getpid()), descriptors, threading.active_count()))
+                cells = (
+                    exchanges,
+                    f"{exchanges / it.seconds:.0f}",
+                    it.counts["values"],
+                    it.counts["rows"] - it.counts["values"],
+                    it.counts["misattributed"],
+                    lost,
+                    it.counts["moved"],
+                    it.counts["given"],
+                    it.counts["failed"],
+                    *seen[-1],
+                )
+                print(
+                    "  ".join(str(cell).rjust(len(head)) for cell, head in zip(cells, HEAD, strict=True)),
+                    flush=True,
+                )
+                failures += it.failures
+                if it.counts["misattributed"] or lost or it.counts["given"] != it.counts["ended"]:
+                    failures.append(f"round {number + 1}: a value is another's, or a row or command is lost")
+    half = seen[len(seen) // 2]  # by then what is used again and again has its size
+    if seen[-1][0] - half[0] > MOST_GROWTH_KB or seen[-1][1:] != seen[0][1:]:
+        failures.append(f"memory, descriptors or threads grow: half-way {half}, at last {seen[-1]}")
+    print("\n" + ("\n".join(failures) or "nothing misattributed, nothing lost, nothing grows"))
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""Utilisation of a paced wire by each master, requests that came too early, and the host's cost.
+
+A bare master in C that keeps multidrop's silence runs before every slice; differences and ratios
+are to that slice. Figures are medians over the slices, but what is counted is counted over all of
+them. A default run takes a quarter of an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+from statistics import median
+from typing import Any
+
+from bench.masters import adapter, rivals
+from bench.masters.jobs import Job
+from bench.support import tables
+from bench.support.programs import paced_line
+
+BARE = "bare C"
+ASLEEP = "bare C, asleep"  # until a character and a half before a reply's end: that is when multidrop looks
+
+COLUMNS = (
+    "baud",
+    "master",
+    "version",
+    "utilisation",
+    "- bare",
+    "requests",
+    "too early",
+    "share",
+    "late us",
+    "CPU us",
+    "/ bare",
+    "failed",
+)
+
+
+def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
+    """One slice, as the drives and as the master see it."""
+    with paced_line(baudrate=baudrate) as line:
+        job = Job(line.path, baudrate, seconds)
+        if master in (BARE, ASLEEP):
+            asleep = job.wire - 1.5 * job.character if master == ASLEEP else 0.0
+            own = rivals.measure_bare(job, adapter.silence(baudrate), asleep)
+        else:
+            own = rivals.measure(master, job)
+    report = line.report
+    asked = max(1, report["answered"] + report["unanswered"])
+    return {
+        "version": own["version"],
+        "utilisation": report["utilisation"],
+        "requests": report["answered"] + report["unanswered"],
+        "early": report["early"],
+        "late": report["excess_us"]["p50"],
+        "cpu": own["cpu_seconds"] / asked * 1e6,
+        "failed": own["failures"],
+        "pacing": report["lateness_us"],
+    }
+
+
+def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
+    def middle(key: str) -> float:
+        return float(median(it[key] for it in slices))
+
+    def total(key: str) -> int:
+        return sum(it[key] for it in slices)
+
+    pairs = list(zip(slices, bare, strict=True))
+    return [
+        str(baudrate),
+        master,
+        slices[0]["version"],
+        f"{middle('utilisation'):.4f}",
+        f"{median(it['utilisation'] - yard['utilisation'] for it, yard in pairs):+.4f}",
+        str(total("requests")),
+        str(total("early")),
+        f"{total('early') / max(1, total('requests')):.2%}",
+        f"{middle('late'):.0f}",
+        f"{middle('cpu'):.0f}",
+        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        str(total("failed")),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
+    parser.add_argument(
+        "--masters", nargs="+", choices=(*rivals.MASTERS, ASLEEP), default=(*rivals.MASTERS, ASLEEP)
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
+    parser.add_argument("--slices", type=int, default=5)
+    arguments = parser.parse_args()
+    rivals.insist_on(arguments.masters)
+
+    tables.heading(
+        "A paced line: 16 drives, 10 registers each, 8N1, response delay 2 ms, delivered byte by byte."
+    )
+    for baudrate in arguments.baudrates:
+        pacing = measured(BARE, baudrate, arguments.seconds)["pacing"]
+        late = ", ".join(f"{name} {pacing[name]:.1f}" for name in ("p50", "p99", "max"))
+        print(f"the line's own lateness per byte at {baudrate}: {late} us")
+    print(flush=True)
+
+    rows = []
+    for baudrate in arguments.baudrates:
+        yards: list[dict[str, Any]] = []
+        for master in arguments.masters:
+            bare, slices = [], []
+            for _ in range(arguments.slices):
+                bare.append(measured(BARE, baudrate, arguments.seconds))
+                slices.append(measured(master, baudrate, arguments.seconds))
+            yards += bare
+            rows.append(row(baudrate, master, slices, bare))
+        rows.append(row(baudrate, BARE, yards, yards))
+    tables.show(COLUMNS, rows)
+    print(
+        "\nutilisation: ideal bus cycle / measured; over 1 where the silence is not kept."
+        "\ntoo early: requests more than 20 us before the silence was over, and their share of all requests."
+        "\nlate: median time from the end of the silence until a request is seen."
+        "\nCPU: of the master's process, per exchange; failed: exchanges without the right values."
+        f"\n{ASLEEP}: until shortly before the reply's end, and not woken by each byte before that."
+    )
+
+
+if __name__ == "__main__":
+    main()

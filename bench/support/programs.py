@@ -1,0 +1,87 @@
+"""The C programs of bench/: compiled once a run, and the paced line as a context."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+HERE = Path(__file__).parents[1]
+PROCESSORS = sorted(os.sched_getaffinity(0))
+CORE = HERE.parent / "csrc"
+CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that take the core's own checksums
+FRAMES = (*CHECKSUM, str(CORE / "frame.c"))
+
+
+@cache
+def _directory() -> TemporaryDirectory[str]:
+    return TemporaryDirectory(prefix="multidrop-bench-")  # removed when the process ends
+
+
+@cache
+def compiled(source: str, *flags: str) -> Path:
+    """The program made of a C file in bench/."""
+    target = Path(_directory().name) / Path(source).stem
+    subprocess.run(["cc", "-O2", str(HERE / source), "-o", str(target), *flags], check=True)
+    return target
+
+
+def module(name: str, *words: object) -> list[str]:
+    """Return the command that runs a module of bench/ in a process of its own."""
+    return [sys.executable, "-m", name, *(str(word) for word in words)]
+
+
+@dataclass
+class Talker:
+    """A program that plays a line, or many; its report is there when it has ended."""
+
+    said: str  # first of all: where its lines are to be found
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def path(self) -> str:
+        return self.said
+
+
+@contextmanager
+def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
+    """A program that runs until its standard input ends, and then prints its report as JSON."""
+    words = [str(word) for word in command]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(words, text=True, **pipes, **details) as process:
+        assert process.stdout is not None
+        said = process.stdout.readline()
+        if not said.endswith("\n"):
+            raise RuntimeError(f"{Path(words[0]).name} ended before its lines were there")
+        talker = Talker(said.strip())
+        yield talker
+        told, _ = process.communicate()
+    talker.report = json.loads(told)
+
+
+@contextmanager
+def paced_line(**options: Any) -> Iterator[Talker]:
+    """paced_line.c with these options, such as baudrate=9600, stray=True, silent="3,7"."""
+    command: list[object] = [compiled("players/paced_line.c")]
+    for name, value in options.items():
+        key = f"--{name.replace('_', '-')}"
+        command += [key] if value is True else [key, value]
+    with talking(command) as line:
+        yield line
+
+
+@contextmanager
+def on_processor(number: int) -> Iterator[None]:
+    """Programs that are started meanwhile stay on that processor, or on the last there is."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {PROCESSORS[min(number, len(PROCESSORS) - 1)]})
+    yield
+    os.sched_setaffinity(0, before)
