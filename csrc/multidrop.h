@@ -12,6 +12,7 @@
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
+    MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
     MD_STATUSES = 18,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
@@ -199,7 +200,7 @@ int64_t md_delay_edge(int bucket); /* the least delay of a bucket, which is an e
 /* Hand over the late replies that are due of another drive, whose place this one takes. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
-/* ---- engine.c, engine_port.c: return NULL and set errno on failure; counts and flags else ---- */
+/* ---- engine.c, port_api.c: return NULL and set errno on failure; counts and flags else ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
@@ -224,6 +225,8 @@ struct md_exchange {
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
     const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
+    uint8_t frame_len; /* 0: the frame is built when its turn comes */
+    uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
 };
 
