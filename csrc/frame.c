@@ -106,7 +106,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Of the data only as much is written as there is: clearing the rest costs more than to parse. */
+/* Write no more data than there is: clearing the rest costs more than to parse. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];

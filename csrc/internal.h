@@ -1,4 +1,4 @@
-/* What only C calls of the core. The marked part is also there for the tests. */
+/* The functions that only C calls. Tests see the marked part, too. */
 #ifndef MULTIDROP_INTERNAL_H
 #define MULTIDROP_INTERNAL_H
 
@@ -72,8 +72,8 @@ struct md_line {
 /* Return the state that follows on an event; -1 where the event cannot happen. */
 int md_line_follows(int state, int event);
 void md_line_init(struct md_line *line, int64_t now_ns);
-/* Take up an exchange; one that is barred by late replies ends at once. Nothing happens before the line's silence
- * is over. */
+/* Take up an exchange; one that is barred by late replies ends at once. Nothing happens before the line's
+ * silence is over. */
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
@@ -85,7 +85,7 @@ void md_line_abandon(struct md_line *line, int result, int error);
 
 /* ---- port_turn.c: whose turn it is on a line; I/O and time come from outside ---- */
 
-enum md_whose { MD_NOBODYS, MD_BEFOREHAND, MD_URGENT, MD_QUEUED, MD_REPEATED }; /* BEFOREHAND: proofs, echo probes */
+enum md_whose { MD_NOBODYS, MD_BEFOREHAND /* proofs, echo probes */, MD_URGENT, MD_QUEUED, MD_REPEATED };
 
 struct md_slot {
     const struct md_exchange *exchange;
@@ -101,7 +101,7 @@ struct md_urgent {
     int is_done;
 };
 
-/* What was sent before an exchange. Zeroed, nothing was. */
+/* The requests sent before an exchange. Zeroed, none was. */
 struct md_before {
     const struct md_exchange *then; /* the exchange */
     uint64_t replies;               /* of its drive, before the last proof */
@@ -137,7 +137,7 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
 void md_turn_tell_echo(struct md_turn *turn, int echo);
 int md_turn_end(struct md_turn *turn);
-/* Return what the line wants (enum md_want), MD_DONE where there is nothing to carry out; not before wake_ns. */
+/* Return what the line wants (enum md_want), MD_DONE where there is nothing to do; not before wake_ns. */
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
 void md_turn_lose(struct md_turn *turn, int error); /* the port failed */
 void md_turn_close(struct md_turn *turn);           /* end everything */
@@ -145,17 +145,19 @@ void md_turn_close(struct md_turn *turn);           /* end everything */
 /* ---- counters.c ---- */
 
 /* Count an exchange that is over. */
-void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange, const struct md_completion *completion);
+void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange,
+                     const struct md_completion *completion);
 /* Count its reply, which came after this delay and needed so long of the line. */
 void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns);
 
 /* ---- columns.c, row_queue.c ---- */
 
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */
-int md_columns_add(struct md_columns *columns, const struct md_block *block, const struct md_completion *completion,
-                   int64_t utc_minus_monotonic_ns);
+int md_columns_add(struct md_columns *columns, const struct md_block *block,
+                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* The same to the newest chunk; a block that is NULL has no rows. */
-void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block, const struct md_completion *completion);
+void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
+                      const struct md_completion *completion);
 /* cdef: end */
 
 /* ---- frame.c, reason.c ---- */
@@ -189,11 +191,11 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 
 /* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
 
-/* How long after a request, beside its reply's own time, it is worth looking for that. */
+/* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
-/* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at); return what
- * to take for its delay. */
+/* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
+ * return what to take for its delay. */
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
 /* Learn from a late reply, so long after its request or after the last of several: wait longer from now on. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
@@ -203,8 +205,8 @@ int64_t md_window_ns(const struct md_exchange *exchange); /* in which a late rep
 
 /* ---- late.c: replies that come after their time-out ---- */
 
-/* Return the proof to ask for first, so that no late reply can be taken for this exchange's; NULL: none is needed,
- * or none would help. */
+/* Return the proof to ask for first, so that no late reply can be taken for this exchange's; NULL: none is
+ * needed, or none would help. */
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns);
 /* A late reply could be taken for its own, and it may not be sent now. */
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
