@@ -1,70 +1,32 @@
-/* What the engine's thread and its clients know of each other, and of each port: engine.c and
- * engine_port.c alone. */
+/* The engine and its ports, as its thread and its clients see them. Calls run one way: port_api.c
+ * (clients) -> engine.c (the thread) -> port_io.c (a port's system calls) -> port_turn.c -> line.c. */
 #ifndef MULTIDROP_ENGINE_H
 #define MULTIDROP_ENGINE_H
 
 #include "internal.h"
 
 #include <pthread.h>
-#include <stdatomic.h>
-
-#define MD_NEVER INT64_MAX
-
-enum { MD_MOST_LATENESS = 80000 }; /* ns of a wake-up that are reckoned with */
-
-/* An exchange that is queued. */
-struct slot {
-    const struct md_exchange *exchange;
-    int64_t not_before_ns;
-};
-
-/* An urgent exchange; it lives where its caller waits. */
-struct wish {
-    const struct md_exchange *exchange;
-    int64_t not_before_ns, expires_ns;
-    struct md_completion *completion;
-    struct wish *next;
-    int done;
-};
-
-/* Whose exchange is under way. */
-enum turn { NOBODYS, BEFORE, WISHED, QUEUED, REPEATED }; /* BEFORE: what is asked before somebody's */
 
 struct md_port {
-    struct md_engine *engine;
-    unsigned index; /* among the engine's ports */
+    /* what the thread needs at every exchange */
     int fd, must_take;
+    unsigned index;    /* among the engine's ports */
+    int is_blind;      /* nothing is worth reading before the port's waking time */
+    int is_watched;    /* the waiter tells when it can be read */
+    int is_empty;      /* it was read empty a moment ago: nothing is there yet */
     struct md_settings settings; /* in force; baudrate 0: not yet set */
+    struct md_engine *engine;
+    struct md_turn turn;
 
-    struct slot *slots;
-    unsigned room; /* a power of two */
-    struct md_progress progress; /* its counters have one writer each, and are read atomically */
-    atomic_int idle;    /* the thread waits to be told of more */
-    struct wish *wishes;
-    const struct md_exchange *const *round; /* what is repeated */
-    unsigned round_len, round_at;
-    struct md_row_queue *row_queue;
-    uint32_t number; /* there */
-
-    enum turn turn, last_turn; /* of now, and of the exchange that was carried out last */
-    int64_t owed_ns;           /* of the line, to what is polled beside urgent exchanges */
-    struct md_before before;
-    int blind;         /* nothing is worth reading before the port's waking time */
-    int watched;       /* the waiter tells when it can be read */
-    int emptied;       /* it was read empty a moment ago: nothing is there yet */
-    int lost_error;
     struct md_port *next; /* of those that wait to be opened */
-    int opened, open_error;
-    int ending, closing, closed;
-    struct md_line line;
-    struct md_completion completion;
+    int is_opened, open_error, is_closing, is_closed;
 };
 
 struct md_engine {
     pthread_t thread;
-    pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the wishes */
-    atomic_int callers;     /* clients that want the mutex, whom the thread lets in */
-    pthread_cond_t changed; /* a wish was granted, a port opened or closed */
+    pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the ports */
+    atomic_int callers;     /* clients that want the mutex */
+    pthread_cond_t changed; /* an urgent request is done, a port opened or closed */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
     struct md_port *arriving; /* clients wait for these to be opened */
@@ -74,21 +36,19 @@ struct md_engine {
     int64_t lateness_ns; /* of the thread's waking, as is usual */
 };
 
-static inline uint32_t md_get(const uint32_t *counter)
-{
-    return __atomic_load_n(counter, __ATOMIC_SEQ_CST);
-}
+enum { MD_MOST_LATENESS = 80000 }; /* ns of a wake-up that are reckoned with */
 
-static inline void md_put(uint32_t *counter, uint32_t value)
-{
-    __atomic_store_n(counter, value, __ATOMIC_SEQ_CST);
-}
+/* ---- engine.c: for its clients ---- */
 
-/* ---- engine_port.c: on the engine's thread ---- */
+void md_engine_enter(struct md_engine *engine); /* take the mutex */
+void md_engine_leave(struct md_engine *engine);
+void md_engine_wake(struct md_engine *engine);
+void md_engine_await(struct md_engine *engine, const int *is_done); /* with the mutex */
 
-int64_t md_port_hear(struct md_port *port); /* what has come; when it was read */
-/* Carry on until there is nothing to do but to wait; what time it was then. */
+/* ---- port_io.c: on the engine's thread ---- */
+
+int64_t md_port_receive(struct md_port *port); /* what has come; return when it was read */
+/* Carry on until there is nothing to do but wait; return what time it is then. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
-void md_port_finish(struct md_port *port); /* the exchange under way is over */
 
 #endif

@@ -42,9 +42,9 @@ static const struct function {
     [0x02] = {RANGE, DATA, BIT, 2000, NO_BROADCAST},
     [0x03] = {RANGE, DATA, WORD, 125, NO_BROADCAST},
     [0x04] = {RANGE, DATA, WORD, 125, NO_BROADCAST},
-    [MD_WRITE_COIL] = {ECHO, ECHO, 0, 0, BROADCAST},
-    [MD_WRITE_ONE] = {ECHO, ECHO, 0, 0, BROADCAST},
-    [MD_LOOPBACK] = {ECHO, ECHO, 0, 0, NO_BROADCAST},
+    [MD_WRITE_COIL] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
+    [MD_WRITE_ONE] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
+    [MD_LOOPBACK] = {.request = ECHO, .reply = ECHO},
     [0x0F] = {RANGE_DATA, RANGE, BIT, 1968, BROADCAST},
     [0x10] = {RANGE_DATA, RANGE, WORD, 123, BROADCAST},
 };
@@ -61,8 +61,8 @@ enum { CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
 static const struct function *find_function(int framing, uint8_t code)
 {
-    static const struct function none, delixi = {LONG, LONG, 0, 0, NO_BROADCAST};
-    static const struct function delixi_run = {LONG, LONG, 0, 0, BROADCAST};
+    static const struct function none, delixi = {.request = LONG, .reply = LONG};
+    static const struct function delixi_run = {.request = LONG, .reply = LONG, .may_be = BROADCAST};
     if (framing == MD_DELIXI) /* part 3: only a run command may be broadcast */
         return code == MD_DELIXI_RUN ? &delixi_run : &delixi;
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
@@ -106,7 +106,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Of the data only as much is written as there is: clearing the rest costs more than to parse. */
+/* Write no more data than there is: clearing the rest costs more than to parse. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];

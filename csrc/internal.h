@@ -1,4 +1,4 @@
-/* What only C calls of the core. The marked part is also there for the tests. */
+/* The functions that only C calls. Tests see the marked part, too. */
 #ifndef MULTIDROP_INTERNAL_H
 #define MULTIDROP_INTERNAL_H
 
@@ -18,33 +18,62 @@ enum md_want {
     MD_READ   /* bytes, or to be asked again at wake_ns */
 };
 
-struct md_line {
-    int state;
-    int64_t quiet_ns;   /* the line's last activity */
-    int64_t silence_ns; /* demanded after it */
-    int64_t wake_ns;
-    int64_t give_up_ns; /* end of the wait for a babbling line to fall silent, or for the reply */
-    int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
-    int64_t ready_ns;   /* before then nothing is worth reading */
-    struct md_drive *late; /* the first drive with late replies due */
-    const struct md_exchange *exchange;
-    struct md_completion *completion;
-    uint16_t tx_len, tx_at;
-    uint16_t rx_len, rx_from; /* no reply begins before rx_from */
-    int echo;                 /* of the adapter (enum md_echo): learnt, never forgotten by failures */
-    int echo_is_told;         /* to be there, and is not unlearnt */
-    int echo_due;             /* a copy of the request is still to come, and is not its reply */
-    int waited, looks;        /* since the request left: a wait was granted; looks at the port */
-    struct md_tap *tap;       /* gets all that goes over the line; NULL: none */
-    uint32_t cut;             /* bytes of late replies since the request left */
-    uint16_t sight_at, sight; /* where the reply may begin, and how much of it was there at first sight */
-    uint16_t burst;           /* most characters that wait in the adapter; 0: it may be a whole reply */
-    uint8_t tx[MD_MOST_FRAME], rx[MD_RX_ROOM];
+enum md_line_state {
+    MD_IDLE,
+    MD_SILENCE,   /* waits until the line has been silent for long enough */
+    MD_CHECK,     /* looks once for bytes that came meanwhile */
+    MD_READY,     /* the request may be written */
+    MD_WRITING,   /* a part of it has left */
+    MD_AWAITING,  /* the reply, or its rest */
+    MD_LAST_LOOK, /* the time-out is over: looks once more, because it may be late to look at all */
+    MD_LINE_STATES
 };
 
+enum md_line_event {
+    MD_BEGUN,         /* an exchange was taken up */
+    MD_FELL_SILENT,   /* or babbles for too long */
+    MD_NOTHING_CAME,
+    MD_STRAY_BYTES,   /* came before the request left, while there is time to wait for silence again */
+    MD_PART_LEFT,
+    MD_ALL_LEFT,
+    MD_TIME_OUT,
+    MD_BYTES_IN_TIME, /* came, but not yet the reply, and there is time left */
+    MD_ENDED,         /* the completion is filled in */
+    MD_LINE_EVENTS
+};
+
+struct md_line {
+    int state;           /* enum md_line_state */
+    uint16_t tx_len, tx_at;
+    uint16_t rx_len, rx_from; /* no reply begins before rx_from */
+    const uint8_t *tx;   /* the request */
+    const struct md_exchange *exchange;
+    struct md_completion *completion;
+    int64_t quiet_ns;    /* the line's last activity */
+    int64_t silence_ns;  /* demanded after it */
+    int64_t wake_ns;
+    int64_t give_up_ns;  /* end of the wait for a babbling line to fall silent, or for the reply */
+    int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
+    int64_t ready_ns;    /* before then nothing is worth reading */
+    struct md_drive *late; /* the first drive with late replies due */
+    struct md_tap *tap;  /* gets all that goes over the line; NULL: none */
+    uint8_t echo;        /* of the adapter (enum md_echo): learnt, never forgotten by failures */
+    uint8_t echo_is_told; /* to be there, and is not unlearnt */
+    uint8_t echo_due;    /* a copy of the request is still to come, and is not its reply */
+    uint8_t waited;      /* since the request left a wait was granted */
+    uint32_t looks;      /* at the port, since then */
+    uint32_t cut;        /* bytes of late replies, since then */
+    uint16_t sight_at, sight; /* where the reply may begin, and how much of it was there at first sight */
+    uint16_t burst;      /* most characters that wait in the adapter; 0: it may be a whole reply */
+    uint8_t rx[MD_RX_ROOM];
+    uint8_t long_tx[MD_MOST_FRAME]; /* of a request that its exchange does not keep */
+};
+
+/* Return the state that follows on an event; -1 where the event cannot happen. */
+int md_line_follows(int state, int event);
 void md_line_init(struct md_line *line, int64_t now_ns);
-/* Take up an exchange; one that is barred by late replies ends at once. Nothing happens before the line's silence
- * is over. */
+/* Take up an exchange; one that is barred by late replies ends at once. Nothing happens before the line's
+ * silence is over. */
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
@@ -54,35 +83,81 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
 
-/* ---- before.c: what is sent before an exchange ---- */
+/* ---- port_turn.c: whose turn it is on a line; I/O and time come from outside ---- */
 
-/* Zeroed, nothing was. */
+enum md_whose { MD_NOBODYS, MD_BEFOREHAND /* proofs, echo probes */, MD_URGENT, MD_QUEUED, MD_REPEATED };
+
+struct md_slot {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns;
+};
+
+/* An urgent request; it lives where its caller waits. */
+struct md_urgent {
+    const struct md_exchange *exchange;
+    int64_t not_before_ns, expires_ns; /* 0: at once; never */
+    struct md_completion *completion;
+    struct md_urgent *next;
+    int is_done;
+};
+
+/* The requests sent before an exchange. Zeroed, none was. */
 struct md_before {
     const struct md_exchange *then; /* the exchange */
-    uint64_t heard;                 /* replies of its drive, before the last proof */
-    uint32_t proofs, is_told;       /* proofs sent; its echo probe was sent */
+    uint64_t replies;               /* of its drive, before the last proof */
+    uint32_t proofs, is_probed;     /* proofs sent; its echo probe was sent */
     uint32_t failures;              /* of its drive, before all of that */
 };
 
-/* Return what to send next before the exchange; NULL: it is its turn. */
-const struct md_exchange *md_before(struct md_before *before, const struct md_exchange *exchange, int echo, int64_t now_ns);
-/* Its turn is over; 1: its reply may have been an earlier one, and it is to be sent again. */
-int md_is_asked_again(struct md_before *before, const struct md_exchange *exchange, const struct md_completion *completion);
+struct md_turn {
+    int whose, last;      /* enum md_whose: of the exchange under way, and of the one before it */
+    int is_ending;        /* nothing more that is polled is begun */
+    int has_done_urgent;  /* since its caller looked */
+    struct md_urgent *urgent;
+    const struct md_exchange *const *round; /* what is repeated */
+    uint32_t round_len, round_at;
+    struct md_slot *slots; /* a ring */
+    uint32_t room;         /* a power of two */
+    uint32_t is_idle;      /* somebody waits to hear that there is more in the queue */
+    int64_t owed_ns;       /* of the line, to what is polled beside urgent requests */
+    struct md_before before;
+    struct md_row_queue *row_queue;
+    uint32_t number; /* there */
+    int lost_error;
+    struct md_progress progress; /* its counters have one writer each, and are read atomically */
+    struct md_line line;
+    struct md_completion completion;
+};
+
+void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, int64_t now_ns);
+/* The same as md_port_submit() and its like. */
+int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges, const int64_t *not_before_ns,
+                   int n);
+uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *exchanges, uint32_t n);
+void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
+void md_turn_tell_echo(struct md_turn *turn, int echo);
+int md_turn_end(struct md_turn *turn);
+/* Return what the line wants (enum md_want), MD_DONE where there is nothing to do; not before wake_ns. */
+int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
+void md_turn_lose(struct md_turn *turn, int error); /* the port failed */
+void md_turn_close(struct md_turn *turn);           /* end everything */
 
 /* ---- counters.c ---- */
 
 /* Count an exchange that is over. */
-void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange, const struct md_completion *completion);
+void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange,
+                     const struct md_completion *completion);
 /* Count its reply, which came after this delay and needed so long of the line. */
 void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns);
 
 /* ---- columns.c, row_queue.c ---- */
 
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */
-int md_columns_add(struct md_columns *columns, const struct md_block *block, const struct md_completion *completion,
-                   int64_t utc_minus_monotonic_ns);
+int md_columns_add(struct md_columns *columns, const struct md_block *block,
+                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* The same to the newest chunk; a block that is NULL has no rows. */
-void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block, const struct md_completion *completion);
+void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
+                      const struct md_completion *completion);
 /* cdef: end */
 
 /* ---- frame.c, reason.c ---- */
@@ -116,11 +191,11 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 
 /* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
 
-/* How long after a request, beside its reply's own time, it is worth looking for that. */
+/* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
-/* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at); return what
- * to take for its delay. */
+/* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
+ * return what to take for its delay. */
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
 /* Learn from a late reply, so long after its request or after the last of several: wait longer from now on. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
@@ -130,8 +205,8 @@ int64_t md_window_ns(const struct md_exchange *exchange); /* in which a late rep
 
 /* ---- late.c: replies that come after their time-out ---- */
 
-/* Return the proof to ask for first, so that no late reply can be taken for this exchange's; NULL: none is needed,
- * or none would help. */
+/* Return the proof to ask for first, so that no late reply can be taken for this exchange's; NULL: none is
+ * needed, or none would help. */
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns);
 /* A late reply could be taken for its own, and it may not be sent now. */
 int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
@@ -152,8 +227,43 @@ int md_is_read(int framing, uint8_t function);
 /* The clients read it meanwhile. */
 static inline void md_count_failures(struct md_drive *drive, uint32_t failures)
 {
-    __atomic_store_n(&drive->failures, failures, __ATOMIC_RELAXED);
+    if (drive->failures != failures)
+        __atomic_store_n(&drive->failures, failures, __ATOMIC_RELAXED);
 }
+
+/* ---- reply.c: the reply among the bytes that came since the request left ---- */
+
+/* The end of an exchange: its result, and the bytes that the completion keeps. */
+struct md_ending {
+    int result;
+    size_t at, len;
+};
+
+/* Begin to wait for a reply of this length. */
+void md_reply_await(struct md_line *line, int reply_len);
+/* Look for the reply in what was received; 1: the exchange ends. */
+int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
+/* Look away from the port until the rest of a reply that has begun can be there. */
+void md_reply_foresee(struct md_line *line, int64_t now_ns);
+/* Anything came, but at most the request's echo. */
+int md_reply_has_begun(const struct md_line *line);
+/* End the exchange at its time-out. */
+struct md_ending md_reply_missed(struct md_line *line);
+/* Recognise late replies among stray bytes, from here on. */
+void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
+
+/* ---- echo.c: adapters that repeat what they send ---- */
+
+/* A copy of the request is there. */
+int md_echo_is_copy(const struct md_line *line, size_t at);
+/* All that is there begins as the request does, and is shorter. */
+int md_echo_may_follow(const struct md_line *line, size_t at);
+/* Learn from a reply that is no copy of its request. */
+void md_echo_learn(struct md_line *line, size_t reply_at);
+/* Learn from a copy that is all that came before the time-out; 1: it may have been the reply. */
+int md_echo_learn_alone(struct md_line *line, int is_reply);
+/* Drop what came while the request was leaving, but the beginning of its echo. */
+void md_echo_keep(struct md_line *line);
 
 /* ---- tap.c, unpack.c ---- */
 
@@ -193,6 +303,8 @@ void md_wakeup_ring(struct md_wakeup *wakeup);
 void md_wakeup_silence(struct md_wakeup *wakeup);
 
 /* ---- times ---- */
+
+#define MD_NEVER INT64_MAX
 
 static inline int64_t later(int64_t a, int64_t b)
 {

@@ -1,14 +1,13 @@
-/* Answers that come after their time-out, and how none of them is taken for another question's.
+/* Replies that come after their time-out, and how none of them is taken for another request's.
  *
- * Two things are known of them. A drive that is a little late may answer in any order: for some time
- * after a time-out, the window, it is asked nothing that such an answer could be taken for. And a path
- * that holds everything up (a modem, a gateway, a stalled network) keeps the order: a reply that no
- * outstanding answer could be taken for proves that all answers to earlier requests have come, or never
- * will. So what is outstanding is remembered beyond the window, and a proof is asked for first: a
- * question whose reply differs from all that is outstanding in function, length or value.
+ * A drive that is a little late may answer in any order: for some time after a time-out, the window, no request
+ * leaves that such a reply could be taken for. A path that holds everything up (a modem, a gateway, a stalled
+ * network) keeps the order: a reply that no outstanding request could have proves that all earlier ones have come,
+ * or never will. So outstanding requests are remembered beyond the window, and a proof is sent first: a request
+ * whose reply differs from all outstanding ones in function, length or value.
  *
- * A reply that fits an outstanding question as well is counted as the answer to that one. Whichever it
- * answers, the earliest request that it fits is accounted for, and so is all that was sent before it. */
+ * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the earliest
+ * request that it fits is accounted for, and so is all that was sent before it. */
 #include "internal.h"
 
 #include <string.h>
@@ -18,7 +17,7 @@ static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anythin
 
 /* ---- what could be taken for what ---- */
 
-static struct md_owed question_of(const struct md_exchange *exchange)
+static struct md_owed outstanding(const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
     struct md_owed owed = {.framing = (uint8_t)exchange->framing, .address = request->address,
@@ -30,7 +29,7 @@ static struct md_owed question_of(const struct md_exchange *exchange)
     return owed;
 }
 
-static int is_same_question(const struct md_owed *owed, const struct md_exchange *exchange)
+static int is_same_request(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
     size_t kept = request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT;
@@ -39,12 +38,18 @@ static int is_same_question(const struct md_owed *owed, const struct md_exchange
            memcmp(owed->data, request->data, kept) == 0;
 }
 
+/* Find the same request among the drive's outstanding ones. */
+static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
+{
+    for (uint32_t i = 0; i < drive->owed_count; i++)
+        if (is_same_request(&drive->owed[i], exchange))
+            return &drive->owed[i];
+    return NULL;
+}
+
 int md_late_is_repeated(const struct md_exchange *exchange)
 {
-    for (uint32_t i = 0; i < exchange->drive->owed_count; i++)
-        if (is_same_question(&exchange->drive->owed[i], exchange))
-            return 1;
-    return 0;
+    return find_same(exchange->drive, exchange) != NULL;
 }
 
 static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
@@ -57,8 +62,8 @@ int md_is_read(int framing, uint8_t function)
     return framing == MD_DELIXI ? function == STATE_QUERY || function == PARAMETER_QUERY : function <= LAST_READ;
 }
 
-/* An answer to the one could pass for the reply to the other. A refusal does not say which write it refuses,
- * and a write that is wrongly told to be refused is a motor that is wrongly told to stand. */
+/* A reply to the one could pass for the reply to the other. An exception does not say which write it refuses, and
+ * a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
 static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -98,7 +103,7 @@ static void drop_earliest_time(struct md_owed *owed)
         memmove(owed->sent_ns, owed->sent_ns + 1, (MD_TIMES_KEPT - 1) * sizeof *owed->sent_ns);
 }
 
-/* A reply to a request that left later says that this one's answer has come, or never will. */
+/* No reply to a later request has come: that would settle this one. */
 static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 {
     return last_ns(owed) > drive->answered_ns;
@@ -119,23 +124,23 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
     }
 }
 
-/* One that is outstanding could be taken for the exchange's; `own`: one to the same question too. */
+/* An outstanding reply could be taken for the exchange's; `own`: count one to the same request too. */
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
     int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->owed[i];
-        int counts = is_open(drive, owed) && (own || !is_same_question(owed, exchange));
+        int counts = is_open(drive, owed) && (own || !is_same_request(owed, exchange));
         if (counts && (is_crowded || is_mistakable(owed, exchange)))
             return 1;
     }
     return 0;
 }
 
-/* ---- what may be asked ---- */
+/* ---- what may be sent ---- */
 
-/* An exception says no more of what was asked than the function, in Delixi's own protocol not even that. */
+/* An exception names the function at most, and in Delixi's own protocol not even that. */
 static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
@@ -167,18 +172,18 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !is_proof(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last of its proofs is kept for a drive that was heard again: so it is not outstanding from the time of
- * silence, and its second reply at the latest settles all that is. */
+/* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence, so that
+ * its second reply at the latest settles everything. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
 }
 
-/* While a drive is silent nothing is gained by another question than its own; whichever is answered then. */
-static int is_asked_alone(const struct md_exchange *exchange)
+/* A silent drive gains nothing from a proof: any reply shows that it is back. */
+static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
-    struct md_owed own = question_of(exchange);
+    struct md_owed own = outstanding(exchange);
     return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) && (!last || !is_mistakable(&own, last));
 }
 
@@ -190,13 +195,11 @@ static int is_free(const struct md_drive *drive, const struct md_exchange *proof
     return 1;
 }
 
-/* When it was asked last, as far as its answer is outstanding. */
-static int64_t asked_ns(const struct md_drive *drive, const struct md_exchange *proof)
+/* Return when it was sent last; 0 where it is not outstanding. */
+static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *proof)
 {
-    for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_same_question(&drive->owed[i], proof))
-            return last_ns(&drive->owed[i]);
-    return 0;
+    const struct md_owed *owed = find_same(drive, proof);
+    return owed ? last_ns(owed) : 0;
 }
 
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns)
@@ -205,18 +208,18 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
     if (drive->owed_count == 0 || exchange->insists || is_in_window(exchange, now_ns))
         return NULL;
     forget_settled(drive, now_ns);
-    if (!has_mistakable(exchange, 1) || is_asked_alone(exchange))
+    if (!has_mistakable(exchange, 1) || is_sent_alone(exchange))
         return NULL;
-    int is_heard = drive->failures == 0;
+    int is_answering = drive->failures == 0;
     const struct md_exchange *latest = NULL;
-    for (uint32_t n = 0; n + !is_heard < drive->proof_count; n++) {
+    for (uint32_t n = 0; n + !is_answering < drive->proof_count; n++) {
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || asked_ns(drive, proof) > asked_ns(drive, latest)) /* its answer settles most */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* its reply settles most */
             latest = proof;
     }
-    return is_heard ? last_proof(drive) : latest;
+    return is_answering ? last_proof(drive) : latest;
 }
 
 /* ---- what is outstanding ---- */
@@ -232,13 +235,11 @@ static void link_drive(struct md_line *line, struct md_drive *drive)
 
 static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange *exchange)
 {
-    for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_same_question(&drive->owed[i], exchange))
-            return &drive->owed[i];
-    if (drive->owed_count == MD_MOST_OWED)
-        return NULL;
-    struct md_owed *owed = &drive->owed[drive->owed_count++];
-    *owed = question_of(exchange);
+    struct md_owed *owed = find_same(drive, exchange);
+    if (!owed && drive->owed_count < MD_MOST_OWED) {
+        owed = &drive->owed[drive->owed_count++];
+        *owed = outstanding(exchange);
+    }
     return owed;
 }
 
@@ -273,9 +274,9 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
     drive->answered_ns = before->answered_ns;
 }
 
-/* ---- what comes ---- */
+/* ---- late replies ---- */
 
-/* The length of the answer to this that begins there, MD_INCOMPLETE or a reason. */
+/* Parse the reply to this that begins there: its length, MD_INCOMPLETE or a reason. */
 static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 {
     struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
@@ -288,8 +289,8 @@ static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t l
     return used > 0 && !md_is_in_range(&reply, owed->least, owed->most) ? MD_BAD_ECHO : used;
 }
 
-/* Account for the earliest request of the drive that the answer there fits: its length, MD_INCOMPLETE or
- * MD_NO_START. What fits no other, and nothing that is asked at present, tells how late it is. */
+/* Account for the earliest request of the drive that the reply there fits: its length, MD_INCOMPLETE or
+ * MD_NO_START. One that fits a single request, and not the present one, tells how late the drive is. */
 static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
 {
     struct md_owed *earliest = NULL;
@@ -311,7 +312,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)
-        *since_ns = is_same_question(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
+        *since_ns = is_same_request(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
     else if (fits == 1)
         md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
     drop_earliest_time(earliest);

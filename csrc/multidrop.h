@@ -1,4 +1,4 @@
-/* What Python calls of the C core. internal.h has what only C calls.
+/* The functions of the C core that Python calls; internal.h has those that only C calls.
  *
  * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
  * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
@@ -12,6 +12,7 @@
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
+    MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
     MD_STATUSES = 18,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
@@ -31,7 +32,7 @@ uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's own: the sum's 
 
 enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI };
 
-/* Why bytes are no frame. */
+/* The reason why bytes are no frame. */
 enum md_frame_fault {
     MD_INCOMPLETE = 0,     /* more bytes are needed */
     MD_NO_START = -1,      /* no frame begins here */
@@ -199,7 +200,7 @@ int64_t md_delay_edge(int bucket); /* the least delay of a bucket, which is an e
 /* Hand over the late replies that are due of another drive, whose place this one takes. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
-/* ---- engine.c, engine_port.c: return NULL and set errno on failure; counts and flags else ---- */
+/* ---- engine.c, port_api.c: return NULL and set errno on failure; counts and flags else ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
@@ -224,10 +225,12 @@ struct md_exchange {
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
     const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
+    uint8_t frame_len; /* 0: the frame is built when its turn comes */
+    uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
 };
 
-/* Why an exchange has no reply. Where something came in its place, that is an enum md_frame_fault. */
+/* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */
 enum md_failure {
     MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
     MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
@@ -239,7 +242,7 @@ enum md_failure {
     MD_MAYBE_ECHO = -17        /* the reply cannot be told from the adapter's echo */
 };
 
-/* What became of an exchange. first_ns and last_ns are 0 where nothing came. */
+/* The result of an exchange. first_ns and last_ns are 0 where nothing came. */
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
@@ -341,8 +344,7 @@ struct md_tap {
     uint64_t lost;       /* bytes without room */
 };
 
-/* What stands before and behind the bytes of a packet. Each side has two: for bytes in general, and for bytes
- * that begin with ':'. */
+/* Header and trailer of a packet. Each side has two: for any bytes, and for those that begin with ':'. */
 struct md_wrapping {
     const uint8_t *head, *tail;
     uint32_t head_len, tail_len; /* the tail's is a multiple of 4 */

@@ -58,8 +58,8 @@ enum { HEAD = 6 };
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
     memset(head, 0, HEAD);
-    if (framing == MD_RTU)
-        memcpy(head, bytes, len < HEAD ? len : HEAD);
+    for (size_t i = 0; framing == MD_RTU && i < HEAD && i < len; i++) /* memcpy() would be slower */
+        head[i] = bytes[i];
     for (size_t i = 0; framing != MD_RTU && i < HEAD && 2 * i + 2 < len; i++) {
         int byte = md_hex_byte(bytes + 2 * i + 1);
         if (byte < 0)
@@ -97,23 +97,26 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
 {
     static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
     struct md_message *message = &span->message;
+    int used, may_be_copy = !splitter->is_in_step && side != MD_ASKING;
     if (splitter->awaited && side != MD_ASKING) {
-        int used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, message);
         span->kind = MD_REPLY;
         span->framing = splitter->framing;
+        used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, message);
         if (used >= least)
             return used;
     }
-    for (int way = 0; way < 6; way++) {
-        int is_request = way < 3, framing = framings[way % 3];
-        if (side == (is_request ? MD_ANSWERING : MD_ASKING) || !is_start(framing, bytes[0]))
-            continue;
-        int used = (is_request ? find_request : find_reply)(framing, bytes, len, message);
-        int may_be_copy = !splitter->is_in_step && side != MD_ASKING;
-        int is_either = used > 0 && may_be_copy && is_echoed(framing, message->function);
-        span->kind = !is_request ? MD_STRAY : is_either ? MD_EITHER : MD_REQUEST;
-        span->framing = framing;
-        if (used >= least)
+    for (int i = 0; i < 3 && side != MD_ANSWERING; i++) {
+        int framing = span->framing = framings[i];
+        if (is_start(framing, bytes[0]) && (used = find_request(framing, bytes, len, message)) >= least) {
+            int is_either = used > 0 && may_be_copy && is_echoed(framing, message->function);
+            span->kind = is_either ? MD_EITHER : MD_REQUEST;
+            return used;
+        }
+    }
+    span->kind = MD_STRAY;
+    for (int i = 0; i < 3 && side != MD_ASKING; i++) {
+        int framing = span->framing = framings[i];
+        if (is_start(framing, bytes[0]) && (used = find_reply(framing, bytes, len, message)) >= least)
             return used;
     }
     return MD_NO_START;

@@ -138,7 +138,7 @@ class PathLine:
         self.port = self.identity = "world"
         self.now = BEGIN_NS
         self.wire = wire
-        self.is_called = self.has_echo = self.is_lost = False
+        self.has_echo = self.is_lost = False
         self.queue = WorldPort(cast(World, self))
 
     def require(self, settings: tuple[int, str]) -> None:
@@ -157,8 +157,7 @@ class PathLine:
         self._pass_until(self.now + round(seconds * S))
 
     def carry_out(self, exchange: Exchange, *, expires_ns: int = 0) -> Completion:
-        self.queue.granted = None
-        self.queue.urgent.append(exchange)
+        self.queue.begin_urgent(exchange)
         self._pass_until(self.now + 1000 * S)
         assert self.queue.granted
         return self.queue.granted

@@ -1,4 +1,4 @@
-"""One line's state machine on a clock that the test sets: times in, wishes out. No descriptor, no waiting."""
+"""One line's state machine on a clock that the test sets. No descriptor, no waiting."""
 
 from __future__ import annotations
 
@@ -34,6 +34,11 @@ class LineDriver:
     @property
     def wake(self) -> int:
         return int(self._line.wake_ns)
+
+    @property
+    def state(self) -> int:
+        """The present state (enum md_line_state)."""
+        return int(self._line.state)
 
     @property
     def echo(self) -> int:

@@ -1,27 +1,23 @@
 """A poller and a simulated line on a clock of their own: an hour of the line takes seconds.
 
-The poller is the real one with its thread, plan and schedule; the line is the core's state machine.
-In place of the port, the core's thread and the clock is a world, in which time passes only while
-the test lets it, and never because the machine is busy.
+The poller is the real one with its thread, plan and schedule; line and turns are the core's own code
+(csrc/line.c, csrc/port_turn.c). In place of the descriptor, the core's thread and the clock is a world,
+in which time passes only while the test lets it, and never because the machine is busy.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
-from enum import Enum
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from completions import new_completion
-from line_driver import LineDriver
 from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import Completion, Exchange, Failure, Message, RowQueue, completion
+from multidrop.core import Completion, Exchange, Message, RowQueue, completion
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.plant.model import PolledDrive
@@ -47,196 +43,128 @@ class WorldWire(FaultyWire):
 
 
 class WorldRowQueue(RowQueue):
-    """Whoever waits for a call lets time pass meanwhile."""
+    """A row queue whose client lets time pass while it waits for a call."""
 
     pass_time: Callable[[float], None]
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._called_before: list[int] = []
+
+    @property
+    def has_called(self) -> bool:
+        self._called_before += super().await_calls(0)
+        return bool(self._called_before)
+
     def await_calls(self, seconds: float) -> list[int]:
         self.pass_time(seconds)
-        return super().await_calls(0)
-
-
-class Turn(Enum):
-    """Whose exchange is under way."""
-
-    NOBODYS = 0
-    BEFORE = 1
-    WISHED = 2
-    QUEUED = 3
-    REPEATED = 4
+        called, self._called_before = [*self._called_before, *super().await_calls(0)], []
+        return called
 
 
 class WorldPort:
-    """What the poller sees of an open port (core.Port), and what the core's thread does for it."""
+    """A port (core.Port) on which the core takes its turns, with the world's time and wire for its I/O."""
 
     room = 256
     switching = 0.0
 
     def __init__(self, world: World) -> None:
-        self.lost = False
-        self.done = 0
-        self.urgent: deque[Exchange] = deque()
         self._world = world
-        self._row_queue: RowQueue | None = None
-        self._number = 0
-        self._driver = LineDriver()
-        self._driver.now = world.now
-        self._queue: deque[tuple[Exchange, int]] = deque()
-        self._cycle: list[Exchange] = []
-        self._round: deque[Exchange] = deque()  # the next one first
-        self._turn = Turn.NOBODYS
-        self._under_way: Exchange | None = None
-        self._put_off: tuple[Turn, Exchange] | None = None  # until what is asked before it was asked
-        self._before = ffi.new("struct md_before *")
+        self._slots = ffi.new("struct md_slot[]", self.room)
+        self._turn = ffi.new("struct md_turn *")
+        self._wake = ffi.new("int64_t *")
+        self._urgent: Any = None
+        self._kept: list[object] = []  # the core may still look at it
         self._heard = b""
-        self._has_ended = False
-        self.granted: Completion | None = None  # what became of the latest urgent exchange
+        lib.md_turn_init(self._turn, self._slots, self.room, world.now)
 
-    # ---- the poller's side ----
+    # ---- the clients' side ----
 
     @property
-    def has_echo(self) -> bool:
-        return self._driver.echo == int(lib.MD_ECHO)
+    def lost(self) -> bool:
+        return bool(self._turn.progress.lost)
 
-    def report_to(self, row_queue: RowQueue, number: int) -> None:
-        self._row_queue, self._number = row_queue, number
-
-    def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        assert len(self._queue) + len(exchanges) <= self.room
-        self._queue += zip(exchanges, not_before_ns, strict=True)
-        return len(exchanges)
-
-    def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        following = self._cycle.index(self._round[0]) if self._round else 0
-        self._cycle, self._round = list(exchanges), deque(exchanges)
-        return following
+    @property
+    def done(self) -> int:
+        return int(self._turn.progress.done)
 
     @property
     def repeating(self) -> bool:
-        return bool(self._round)
+        return bool(self._turn.progress.repeating)
+
+    @property
+    def has_echo(self) -> bool:
+        return int(self._turn.progress.echo) == int(lib.MD_ECHO)
+
+    def report_to(self, row_queue: RowQueue, number: int) -> None:
+        self._kept.append(row_queue)
+        self._turn.row_queue, self._turn.number = row_queue.c, number
+
+    def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
+        return int(
+            lib.md_turn_submit(self._turn, self._pointers(exchanges), list(not_before_ns), len(exchanges))
+        )
+
+    def repeat(self, exchanges: Sequence[Exchange]) -> int:
+        return int(lib.md_turn_repeat(self._turn, self._pointers(exchanges), len(exchanges)))
+
+    def _pointers(self, exchanges: Sequence[Exchange]) -> Any:
+        pointers = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
+        self._kept += [*exchanges, pointers]
+        return pointers
+
+    def begin_urgent(self, exchange: Exchange) -> None:
+        found = ffi.new("struct md_completion *")
+        self._urgent = ffi.new("struct md_urgent *", {"exchange": exchange.c, "completion": found})
+        self._kept += [exchange, found, self._urgent]
+        lib.md_turn_add_urgent(self._turn, self._urgent)
+
+    @property
+    def granted(self) -> Completion | None:
+        """The completion of the latest urgent exchange; None while it lasts."""
+        return completion(self._urgent.completion) if self._urgent and self._urgent.is_done else None
 
     def end(self) -> bool:
-        self._has_ended = True
-        return self._turn in (Turn.QUEUED, Turn.REPEATED)
+        return bool(lib.md_turn_end(self._turn))
 
     def stop(self) -> None:
-        if self.end():
-            self._driver.abandon(Failure.POLL_ENDED)
-            self._finish()
+        lib.md_turn_close(self._turn)
 
-    # ---- the core's side ----
+    # ---- in place of the engine's thread ----
 
     def hang_up(self) -> None:
-        """What is under way fails, and so does all that is queued."""
-        self.lost = True
-        self._round.clear()
-        while self._under_way or self._take_up():
-            self._driver.abandon(Failure.LINE_LOST, ENODEV)
-            self._finish()
-        self._call()
+        lib.md_turn_lose(self._turn, ENODEV)
+        lib.md_turn_want(self._turn, self._wake, self._world.now)
 
     def advance(self, heard: bytes) -> int:
-        """Carry on until there is nothing to do but wait; until when."""
-        driver = self._driver
-        driver.now = self._world.now
+        """Carry on until there is nothing to do but wait; return until when."""
         self._heard += heard
         for _ in range(10_000):
-            if not self._under_way and not self._take_up():
-                self._listen()
-                return self._queue[0][1] if self._queue and not self._has_ended else NEVER
-            want = driver.want
-            if want == "done":
-                self._finish()
-            elif want == "write":
-                self._listen()
-                assert self._under_way
-                self._world.send(driver.take(), self._under_way.settings[0])
+            want = lib.md_turn_want(self._turn, self._wake, self._world.now)
+            wake = int(self._wake[0])
+            if want == lib.MD_DONE:
+                self._receive()
+                return wake
+            if want == lib.MD_WRITE:
+                self._send()
                 if self.lost:
                     return NEVER
-            elif want == "read" and self._heard:
-                self._listen()
-            elif want == "wait" or driver.wake > driver.now:
-                return driver.wake
+            elif want == lib.MD_READ and self._heard:
+                self._receive()
+            elif want == lib.MD_WAIT or wake > self._world.now:
+                return wake
         raise AssertionError("the line never waits")
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         heard, self._heard = self._heard, b""
-        self._driver.receive(heard)
+        lib.md_line_received(ffi.addressof(self._turn.line), heard, len(heard), self._world.now)
 
-    def _take_up(self) -> bool:
-        now = self._world.now
-        if self._put_off:
-            (turn, exchange), self._put_off = self._put_off, None
-            self._ask(turn, exchange)
-        elif self.urgent:
-            self._ask(Turn.WISHED, self.urgent.popleft())
-        elif self._has_ended:
-            return False
-        elif self._queue and (self._queue[0][1] <= now or self.lost):
-            exchange, due_ns = self._queue.popleft()
-            self._ask(Turn.QUEUED, exchange)
-            if self._turn is Turn.QUEUED and exchange.c.period_ns and now >= due_ns + exchange.c.period_ns:
-                again = (at_ns for other, at_ns in self._queue if other is exchange)
-                if now >= next(again, NEVER):
-                    self._driver.abandon(Failure.EXPIRED)
-        elif self._round:
-            self._ask(Turn.REPEATED, self._round[0])
-            self._round.rotate(-1)
-        else:
-            return False
-        return True
-
-    def _ask(self, turn: Turn, exchange: Exchange) -> None:
-        first = lib.md_before(self._before, exchange.c, self._driver.echo, self._world.now)
-        if first:
-            self._put_off = turn, exchange
-            turn, exchange = Turn.BEFORE, self._of(exchange, first)
-        self._begin(turn, exchange)
-
-    @staticmethod
-    def _of(exchange: Exchange, c: Any) -> Exchange:
-        """The one that the core means."""
-        known = [*exchange.peer.proofs, *([exchange.echo_probe] if exchange.echo_probe else [])]
-        return next(it for it in known if it.c == c)
-
-    def _begin(self, turn: Turn, exchange: Exchange) -> None:
-        self._turn, self._under_way = turn, exchange
-        self._driver.found = new_completion()
-        self._driver.begin(exchange)
-
-    def _finish(self) -> None:
-        assert self._under_way
-        turn, exchange, found = self._turn, self._under_way, self._driver.found
-        self._turn, self._under_way = Turn.NOBODYS, None
-        if turn is Turn.BEFORE:
-            return
-        if lib.md_is_asked_again(self._before, exchange.c, found) and not self.lost and not self._has_ended:
-            self._put_off = turn, exchange
-            return
-        if turn is Turn.WISHED:
-            self.granted = completion(found)
-            return
-        self._report(exchange, found)
-        if turn is Turn.QUEUED:
-            self.done += 1
-            if len(self._queue) in (0, self.room // 4):
-                self._call()
-        elif found.result < 0 and not found.sent_ns:
-            self._round.clear()
-            self._call()
-
-    def _report(self, exchange: Exchange, found: Any) -> None:
-        assert self._row_queue
-        assert exchange.block
-        lib.md_row_queue_add(self._row_queue.c, exchange.block.c, found)
-        is_refusal = found.result > 0 and found.reply.exception
-        if is_refusal or exchange.peer.failures != self._before.failures:
-            self._call()
-
-    def _call(self) -> None:
-        if self._row_queue:
-            self._row_queue.call(self._number)
-            self._world.is_called = True
+    def _send(self) -> None:
+        line, now = self._turn.line, self._world.now
+        request = bytes(ffi.buffer(line.tx, line.tx_len))
+        baudrate = int(line.exchange.settings.baudrate)
+        lib.md_line_sent(ffi.addressof(line), len(request), now, now)
+        self._world.send(request, baudrate)
 
 
 class WorldLine:
@@ -276,7 +204,7 @@ class World:
         self.now = self._limit = BEGIN_NS
         self.wire = wire
         self.port: WorldPort | None = None
-        self.is_called = False
+        self._queue: WorldRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
@@ -318,7 +246,7 @@ class World:
         """Have a request carried out ahead of the polling, if the port is there."""
         ours = self.poller.bus("line")
         if self.port:
-            self.port.urgent.append(make_exchange(drive, request, ours.peer(drive), NO_ROWS))
+            self.port.begin_urgent(make_exchange(drive, request, ours.peer(drive), NO_ROWS))
 
     # ---- the poller's thread ----
 
@@ -329,9 +257,9 @@ class World:
     _is_waiting = False
 
     def _row_queue(self) -> WorldRowQueue:
-        made = WorldRowQueue()
-        made.pass_time = self._pass_time
-        return made
+        self._queue = WorldRowQueue()
+        self._queue.pass_time = self._pass_time
+        return self._queue
 
     def _pass_time(self, seconds: float) -> None:
         for thread in {*threading.enumerate()} - self._threads - {threading.current_thread()}:
@@ -353,16 +281,17 @@ class World:
 
     def _pass_until(self, end_ns: int) -> None:
         while self.now < end_ns:
-            self._look(end_ns)
+            wake = self._settle()
+            self.now = min(max(wake, self.now + 1), end_ns)
 
     def _look(self, end_ns: int) -> None:
-        """Let time pass until then, or until the port wants more."""
-        self.is_called = False
-        while True:
+        """Let time pass until then, or until the poller is called."""
+        while self.now < end_ns:
             wake = self._settle()
-            if self.is_called or self.now >= end_ns:
+            if self._queue and self._queue.has_called:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
+        self._settle()
 
     def _settle(self) -> int:
         """All that happens now; when something happens next."""

@@ -125,7 +125,8 @@ class Exchange:
         permit: Permit | None = None,
     ) -> None:
         least, most = answer or (0, 0)
-        build_request(framing, request)  # raises for what no frame can say
+        frame = build_request(framing, request)
+        kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core builds a longer one again
         self.framing = framing
         self.request = request
         self.peer = peer
@@ -138,6 +139,8 @@ class Exchange:
             {
                 "framing": framing,
                 "request": to_c(request)[0],
+                "frame_len": len(kept),
+                "frame": list(kept),
                 "settings": settings_to_c(baudrate, format),
                 "character_ns": round(character * 1e9),
                 "silence_ns": round(silence * 1e9),

@@ -12,7 +12,6 @@ from contextlib import suppress
 import serial
 
 from multidrop.core import (
-    REFUSALS,
     STATUSES,
     Completion,
     Echo,
@@ -22,15 +21,15 @@ from multidrop.core import (
     Port,
     Tap,
     build_request,
+    must_take,
+    refused_names,
 )
 from multidrop.core.fork import register_at_fork
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
-from multidrop.transport.opening import connection_of, identity_of, is_pseudo_terminal, reason_of, unopened
+from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
 
-_ALL_SETTINGS = sum(REFUSALS)
-_BAUDRATE = min(REFUSALS)
 _NO_SETTINGS = -1
 
 # struct serial_icounter_struct of linux/serial.h
@@ -112,7 +111,7 @@ class Line:
         """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
             fd = port.fileno()
-            return Port(fd, _BAUDRATE if is_pseudo_terminal(os.ttyname(fd)) else _ALL_SETTINGS)
+            return Port(fd, must_take(os.ttyname(fd)))
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
         if self.port.startswith("socket://"):
@@ -253,8 +252,7 @@ class Line:
 
     def _failure(self, result: int, error: int) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
-            refused = ", ".join(name for bit, name in REFUSALS.items() if error & bit)
-            return LineError(self.port, f"the port does not take the {refused} that the drive needs")
+            return LineError(self.port, f"the port does not take the {refused_names(error)} that the drive needs")
         if self._core is None:
             return self._closed()
         why = os.strerror(error) if error else "hung up"

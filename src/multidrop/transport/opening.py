@@ -71,8 +71,3 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
         return port_identity.of_device(os.ttyname(port.fileno()))
     except (OSError, ValueError, AttributeError):  # it has no device, as loop:// has none
         return port_identity.of_name(name)
-
-
-def is_pseudo_terminal(path: str) -> bool:
-    """Return True for the device of a pty, which stays at 8 bits without parity whatever it is told."""
-    return path.startswith(("/dev/pts/", "/dev/ttys"))  # Linux, macOS

@@ -25,7 +25,7 @@ from multidrop.cli.doctor.findings import (
 from multidrop.cli.support.arguments import add_json_argument, add_port_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import wrapped
-from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request
+from multidrop.core import is_pseudo_terminal, Completion, Exchange, Framing, Message, Peer, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
@@ -33,7 +33,6 @@ from multidrop.errors import LineError
 from multidrop.planning.blocks import blocks
 from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
-from multidrop.transport.opening import is_pseudo_terminal
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back

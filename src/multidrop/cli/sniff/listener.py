@@ -13,15 +13,14 @@ import time
 from io import FileIO
 from typing import Any, NoReturn
 
-from multidrop.core import REFUSALS, Stream, set_settings
+from multidrop.core import Stream, must_take, refused_names, set_settings
 from multidrop.drive.timing import Settings
 from multidrop.errors import LineError
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.opening import is_pseudo_terminal, reason_of, unopened
+from multidrop.transport.opening import reason_of, unopened
 
 LOOK_S = 0.05  # the longest wait for bytes
 _MOST = 4096  # bytes of one read
-_BAUDRATE = min(REFUSALS)
 
 
 def _open_device(port: str, settings: Settings) -> FileIO:
@@ -29,12 +28,9 @@ def _open_device(port: str, settings: Settings) -> FileIO:
     fd = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        refused = set_settings(fd, settings.baudrate, settings.format)
-        if is_pseudo_terminal(os.ttyname(fd)):
-            refused &= _BAUDRATE  # a pty stays at 8 bits without parity
+        refused = set_settings(fd, settings.baudrate, settings.format) & must_take(os.ttyname(fd))
         if refused:
-            names = ", ".join(name for bit, name in REFUSALS.items() if refused & bit)
-            raise LineError(port, f"the port does not take the {names} of {settings}")
+            raise LineError(port, f"the port does not take the {refused_names(refused)} of {settings}")
     except OSError:
         os.close(fd)
         raise

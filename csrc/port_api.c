@@ -1,0 +1,141 @@
+/* What clients do with a port, on any thread of theirs. */
+#define _GNU_SOURCE
+#include "engine.h"
+
+#include <errno.h>
+#include <stdlib.h>
+
+static struct md_port *new_port(unsigned room)
+{
+    if (room == 0 || (room & (room - 1)))
+        return NULL;
+    struct md_port *port = calloc(1, sizeof *port);
+    struct md_slot *slots = calloc(room, sizeof *slots);
+    if (port && slots) {
+        md_turn_init(&port->turn, slots, room, md_now_ns());
+        return port;
+    }
+    free(port);
+    free(slots);
+    return NULL;
+}
+
+void md_port_free(struct md_port *port)
+{
+    free(port->turn.slots);
+    free(port);
+}
+
+struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room)
+{
+    struct md_port *port = new_port(room);
+    if (!port) {
+        errno = ENOMEM;
+        return NULL;
+    }
+    port->engine = engine;
+    port->fd = fd;
+    port->must_take = must_take;
+    port->is_watched = 1;
+    /* Raw before it is first read: a terminal at VMIN 0 looks like one that hung up. */
+    struct md_settings settings;
+    if (must_take >= 0 && md_port_get(fd, &settings) == 0)
+        md_port_set(fd, &settings);
+    md_engine_enter(engine);
+    port->next = engine->arriving;
+    engine->arriving = port;
+    md_engine_wake(engine);
+    md_engine_await(engine, &port->is_opened);
+    md_engine_leave(engine);
+    if (!port->open_error)
+        return port;
+    int error = port->open_error;
+    md_port_free(port);
+    errno = error;
+    return NULL;
+}
+
+void md_port_stop(struct md_port *port)
+{
+    md_engine_enter(port->engine);
+    port->is_closing = 1;
+    md_engine_wake(port->engine);
+    md_engine_await(port->engine, &port->is_closed);
+    md_engine_leave(port->engine);
+}
+
+int md_port_end(struct md_port *port)
+{
+    md_engine_enter(port->engine);
+    int is_under_way = md_turn_end(&port->turn);
+    md_engine_leave(port->engine);
+    return is_under_way;
+}
+
+void md_port_tap(struct md_port *port, struct md_tap *tap)
+{
+    md_engine_enter(port->engine);
+    port->turn.line.tap = tap;
+    md_engine_leave(port->engine);
+}
+
+void md_port_tell_echo(struct md_port *port, int echo)
+{
+    md_engine_enter(port->engine);
+    md_turn_tell_echo(&port->turn, echo);
+    md_engine_leave(port->engine);
+}
+
+void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before)
+{
+    md_engine_enter(port->engine);
+    md_late_inherit(drive, before);
+    md_engine_leave(port->engine);
+}
+
+void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number)
+{
+    md_engine_enter(port->engine);
+    port->turn.row_queue = row_queue;
+    port->turn.number = number;
+    md_engine_leave(port->engine);
+}
+
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns,
+                   int n)
+{
+    int taken = md_turn_submit(&port->turn, exchanges, not_before_ns, n);
+    if (taken && __atomic_exchange_n(&port->turn.is_idle, 0, __ATOMIC_SEQ_CST))
+        md_engine_wake(port->engine);
+    return taken;
+}
+
+unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n)
+{
+    md_engine_enter(port->engine);
+    unsigned next = md_turn_repeat(&port->turn, exchanges, n);
+    md_engine_leave(port->engine);
+    md_engine_wake(port->engine);
+    return next;
+}
+
+const struct md_progress *md_port_progress(struct md_port *port)
+{
+    return &port->turn.progress;
+}
+
+void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
+                       int64_t expires_ns, struct md_completion *completion)
+{
+    struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
+                               .completion = completion};
+    md_engine_enter(port->engine);
+    if (port->is_closing) { /* nobody carries it out any more */
+        *completion = (struct md_completion){.result = MD_LINE_LOST};
+    } else {
+        md_turn_add_urgent(&port->turn, &urgent);
+        md_engine_wake(port->engine);
+        md_engine_await(port->engine, &urgent.is_done);
+    }
+    md_engine_leave(port->engine);
+}

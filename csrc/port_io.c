@@ -1,0 +1,162 @@
+/* One port on the engine's thread: reading, writing and switching, until there is nothing to do but wait. */
+#define _GNU_SOURCE
+#include "engine.h"
+
+#include <errno.h>
+#include <unistd.h>
+
+enum {
+    WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
+    HELD_UP_NS = 200000,      /* no write takes so long by itself */
+    MOST_SPINNING = 4         /* ports; with more of them the processor has better to do */
+};
+static const int64_t RETRY_WRITE_NS = 1000000;
+
+static void watch(struct md_port *port, int is_watched)
+{
+    if (port->is_watched == is_watched || port->turn.progress.lost)
+        return;
+    md_waiter_change(port->engine->waiter, port->fd, port, is_watched);
+    port->is_watched = is_watched;
+}
+
+static void lose(struct md_port *port, int error)
+{
+    md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is ready for ever */
+    md_turn_lose(&port->turn, error);
+}
+
+static int is_transient(int error)
+{
+    return error == EAGAIN || error == EWOULDBLOCK || error == EINTR;
+}
+
+int64_t md_port_receive(struct md_port *port)
+{
+    uint8_t bytes[1024];
+    ssize_t got = read(port->fd, bytes, sizeof bytes);
+    int64_t now_ns = md_now_ns();
+    port->is_empty = got < (ssize_t)sizeof bytes;
+    if (got > 0)
+        md_line_received(&port->turn.line, bytes, (size_t)got, now_ns);
+    else if (got == 0)
+        lose(port, 0);
+    else if (!is_transient(errno))
+        lose(port, errno);
+    return now_ns;
+}
+
+/* Write; 1: the port took something, or is lost. The request leaves when it is written; where the thread was held
+ * up just then, perhaps afterwards: from too early a time on its reply, and a late one, would be waited for too
+ * short. */
+static int send(struct md_port *port, int64_t begun_ns)
+{
+    struct md_line *line = &port->turn.line;
+    ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
+    int64_t done_ns = md_now_ns();
+    if (written > 0)
+        md_line_sent(line, (size_t)written, begun_ns, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
+    else if (written < 0 && !is_transient(errno))
+        lose(port, errno);
+    return written != 0 && (written > 0 || port->turn.progress.lost);
+}
+
+static int is_in_force(const struct md_port *port, const struct md_settings *wanted)
+{
+    const struct md_settings *settings = &port->settings;
+    return port->must_take < 0 ||
+           (settings->baudrate == wanted->baudrate && settings->databits == wanted->databits &&
+            settings->parity == wanted->parity && settings->stopbits == wanted->stopbits);
+}
+
+/* Switch baud rate and format; return what time it is then. */
+static int64_t apply(struct md_port *port, const struct md_settings *settings)
+{
+    struct md_progress *progress = &port->turn.progress;
+    int64_t begun_ns = md_now_ns();
+    int refused = md_port_set(port->fd, settings);
+    int64_t now_ns = md_now_ns();
+    progress->switching_ns += now_ns - begun_ns;
+    __atomic_store_n(&progress->switches, progress->switches + 1, __ATOMIC_SEQ_CST);
+    port->settings = *settings;
+    if (refused < 0 || (refused & port->must_take))
+        port->settings = (struct md_settings){0}; /* some of them may be in force now */
+    if (refused < 0)
+        lose(port, -refused);
+    else if (refused & port->must_take)
+        md_line_abandon(&port->turn.line, MD_SETTINGS_REFUSED, refused);
+    return now_ns;
+}
+
+/* The request is out, and its reply is awaited. */
+static int is_sent(const struct md_port *port)
+{
+    return port->turn.whose != MD_NOBODYS && port->turn.line.completion->sent_ns;
+}
+
+/* A sleeping processor wakes late, and by much the same time again and again. So the sleep before a request is
+ * shortened by what is usual, and the rest is spun away: with few lines some 20 us of each exchange. A look at a
+ * reply may be early, and is not spun for. */
+static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
+{
+    if (until_ns - *now_ns > MD_MOST_LATENESS || port->engine->count > MOST_SPINNING || port->turn.progress.lost)
+        return 0;
+    if (!port->is_empty) /* what came meanwhile is looked for now, not when the request must leave */
+        *now_ns = md_port_receive(port);
+    while (*now_ns < until_ns)
+        *now_ns = md_now_ns();
+    return 1;
+}
+
+/* Do what is wanted; 1: there may be more to do. */
+static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns)
+{
+    const struct md_exchange *exchange = port->turn.line.exchange;
+    switch (want) {
+    case MD_WRITE: /* asked for again after a switch: a stop may have come meanwhile */
+        if (!is_in_force(port, &exchange->settings)) {
+            *now_ns = apply(port, &exchange->settings);
+            return 1;
+        }
+        if (send(port, *now_ns))
+            return 1;
+        *wake_ns = *now_ns + RETRY_WRITE_NS;
+        return 0;
+    case MD_READ:
+        if (!port->is_blind && *now_ns < *wake_ns)
+            return 0;
+        port->is_blind = 0;
+        if (!port->is_empty)
+            *now_ns = md_port_receive(port);
+        return 1;
+    case MD_WAIT:
+        return !is_sent(port) && spin_until(port, *wake_ns, now_ns);
+    default:
+        return spin_until(port, *wake_ns, now_ns);
+    }
+}
+
+int64_t md_port_advance(struct md_port *port, int64_t now_ns)
+{
+    struct md_turn *turn = &port->turn;
+    struct md_engine *engine = port->engine;
+    int64_t wake_ns;
+    int want;
+    do
+        want = md_turn_want(turn, &wake_ns, now_ns);
+    while (act(port, want, &wake_ns, &now_ns));
+    if (turn->has_done_urgent) {
+        turn->has_done_urgent = 0;
+        pthread_cond_broadcast(&engine->changed);
+    }
+    port->is_empty = 0;
+    port->is_blind = want == MD_WAIT || (port->is_blind && want != MD_READ);
+    if (port->is_blind && wake_ns - now_ns > WORTH_BLINDNESS)
+        watch(port, 0);
+    else if (!port->is_blind)
+        watch(port, 1);
+    int is_early = wake_ns != MD_NEVER && (port->is_blind || turn->whose == MD_NOBODYS) &&
+                   (is_sent(port) || engine->count <= MOST_SPINNING);
+    engine->wakes[port->index] = wake_ns - (is_early ? engine->lateness_ns : 0);
+    return now_ns;
+}

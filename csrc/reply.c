@@ -1,0 +1,245 @@
+/* The reply among the bytes that came since the request left: when to look, where it begins, what it tells.
+ *
+ * It may begin at any byte. Late replies stand in front of it, or in its place. */
+#include "internal.h"
+
+#include <string.h>
+
+enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* of a row's value */
+
+static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int used = md_parse_reply(exchange->framing, line->rx + at, line->rx_len - at, &exchange->request, reply);
+    return used > 0 && !md_is_in_range(reply, exchange->least, exchange->most) ? MD_BAD_ECHO : used;
+}
+
+/* ---- when to look ---- */
+
+void md_reply_await(struct md_line *line, int reply_len)
+{
+    const struct md_exchange *exchange = line->exchange;
+    const struct md_drive *drive = exchange->drive;
+    int64_t reply_ns = reply_len * exchange->character_ns, timeout_ns = md_timeout_ns(exchange);
+    line->give_up_ns = line->quiet_ns + timeout_ns + reply_ns;
+    line->ready_ns = 0;
+    line->begun_by_ns = line->give_up_ns;
+    if (line->burst > 0 && drive->delay_ns) /* what comes at once is there when the port is ready */
+        line->ready_ns = line->quiet_ns + md_look_ns(drive, exchange->character_ns) + reply_ns;
+    if (line->burst > 0 && drive->failures == 0) {
+        int64_t begun_ns = timeout_ns + (line->burst + 2) * exchange->character_ns;
+        line->begun_by_ns = sooner(line->quiet_ns + begun_ns, line->begun_by_ns);
+        if (line->begun_by_ns + begun_ns < line->ready_ns) /* a look is cheaper than so long a wait in vain */
+            line->ready_ns = line->begun_by_ns;
+    }
+    line->waited = 0;
+    line->looks = 0;
+    line->sight = 0;
+    line->cut = 0;
+}
+
+int md_reply_has_begun(const struct md_line *line)
+{
+    return line->rx_len > 0 && !(line->rx_len == line->tx_len && md_echo_is_copy(line, 0));
+}
+
+/* A reply that has begun comes character by character: it is not worth looking at each. */
+void md_reply_foresee(struct md_line *line, int64_t now_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    const uint8_t *begun = line->rx + line->rx_from;
+    int have = line->rx_len - line->rx_from;
+    if (have > 0 && (line->sight == 0 || line->sight_at != line->rx_from)) {
+        line->sight_at = line->rx_from;
+        line->sight = (uint16_t)have;
+    }
+    int function_at = exchange->framing == MD_RTU ? 1 : 3;
+    int missing = md_reply_length(exchange->framing, &exchange->request) - have;
+    int may_be_exception = have <= function_at || (begun[function_at] & 0x80) || begun[function_at] >= '8';
+    if (missing > 1 && !(may_be_exception && have > 0))
+        line->ready_ns = now_ns + (missing - 1) * exchange->character_ns;
+}
+
+/* A late reply came meanwhile: the reply may be as late. */
+static void extend(struct md_line *line)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    line->give_up_ns = later(line->give_up_ns, line->quiet_ns + md_timeout_ns(exchange) + reply_ns);
+    line->begun_by_ns = line->give_up_ns;
+}
+
+/* ---- a reply ---- */
+
+/* Tell the drive's response delay, and what the exchange needed of the line. */
+static void measure(struct md_line *line, int reply_len)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_completion *completion = line->completion;
+    struct md_drive *drive = exchange->drive;
+    int64_t request_ns = line->tx_len * exchange->character_ns, reply_ns = reply_len * exchange->character_ns;
+    int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
+    /* Characters that follow each other tell better when the first came than a late look at them. */
+    completion->first_ns = sooner(completion->first_ns, later(begun_ns + exchange->character_ns, left_ns));
+    int is_whole = line->waited && line->looks == 1;
+    int64_t delay_ns = md_learn_delay(drive, later(begun_ns - left_ns, 0), is_whole, exchange->character_ns);
+    int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
+    /* A port that is faster than its settings, such as a network's, needs no more than it took. */
+    int64_t took_ns = line->silence_ns + later(completion->last_ns, left_ns) - completion->sent_ns;
+    md_counters_answer(&drive->counters, delay_ns, sooner(ideal_ns, took_ns));
+}
+
+/* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
+static void learn_burst(struct md_line *line, size_t at, int reply_len)
+{
+    if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST && line->sight > line->burst)
+        line->burst = line->sight;
+}
+
+static void accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
+{
+    if (!line->exchange->insists)
+        line->exchange->drive->answered_ns = line->quiet_ns;
+    md_copy_message(&line->completion->reply, reply);
+    line->completion->skipped -= (uint32_t)used;
+    md_echo_learn(line, at);
+    learn_burst(line, at, used);
+    measure(line, used);
+}
+
+/* ---- late replies ---- */
+
+/* Take out what is no part of this exchange. */
+static void cut_out(struct md_line *line, size_t at, size_t len)
+{
+    md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx + at, len);
+    line->cut += (uint32_t)len;
+    line->sight = 0;
+    line->rx_len = (uint16_t)(line->rx_len - len);
+    memmove(line->rx + at, line->rx + at + len, line->rx_len - at);
+}
+
+void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
+{
+    for (size_t at = from; line->late && at < line->rx_len; at++) {
+        int used = md_late_take(line, at, now_ns, NULL);
+        if (used > 0)
+            at += (size_t)used - 1;
+    }
+}
+
+/* It answers this request or an earlier one, and the other's reply may still come. A row may have it, with a
+ * time that leaves that open. A value that was asked for by hand must be the present one: it is read again. */
+static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply,
+                                     int64_t now_ns, int64_t since_ns)
+{
+    struct md_completion *completion = line->completion;
+    const struct md_block *block = line->exchange->block;
+    int64_t request_ns = line->tx_len * line->exchange->character_ns;
+    int is_row = since_ns && block && block->count > 0 && now_ns - since_ns < OLDEST_IN_DOUBT;
+    md_late_expect(line, 0);
+    if (!is_row) {
+        md_reply_find_late(line, at + (size_t)used, now_ns);
+        return (struct md_ending){MD_LATE_ANSWER_DUE, 0, line->rx_len};
+    }
+    md_copy_message(&completion->reply, reply);
+    completion->skipped -= (uint32_t)used;
+    completion->sent_ns = since_ns - request_ns;
+    md_counters_answer(&line->exchange->drive->counters, 0, request_ns + used * line->exchange->character_ns);
+    return (struct md_ending){used, at, (size_t)used};
+}
+
+/* ---- the search ---- */
+
+enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again, or behind an echo */
+
+/* The bytes there could be the reply: decide whether they are its echo or a late reply instead. */
+static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply, int64_t now_ns,
+                        struct md_ending *ending)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int64_t since_ns;
+    if (line->echo_due && md_echo_is_copy(line, *at)) {
+        line->echo_due = 0; /* the adapter's, or it cannot be told from that */
+        *at += line->tx_len;
+        return SKIPPED;
+    }
+    int is_late = !exchange->insists && exchange->drive->owed_count && md_late_take(line, *at, now_ns, &since_ns) > 0;
+    if (!is_late) {
+        accept(line, *at, used, reply);
+        *ending = (struct md_ending){used, *at, (size_t)used};
+        return ENDED;
+    }
+    md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0); /* whichever it answers, it took that long */
+    extend(line);
+    if (md_is_read(exchange->framing, exchange->request.function)) {
+        *ending = end_in_doubt(line, *at, used, reply, now_ns, since_ns);
+        return ENDED;
+    }
+    cut_out(line, *at, (size_t)used);
+    return SKIPPED;
+}
+
+/* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
+ * cannot be the reply's beginning: it may be the inside of the reply. */
+int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending)
+{
+    struct md_message reply;
+    size_t at = line->rx_from, first_open = SIZE_MAX;
+    while (at < line->rx_len) {
+        int used = parse_at(line, at, &reply);
+        if (used > 0 && line->echo_due && md_echo_may_follow(line, at))
+            used = MD_INCOMPLETE;
+        if (used > 0) {
+            size_t judged_at = at;
+            if (judge(line, &at, used, &reply, now_ns, ending) == ENDED)
+                return 1;
+            if (at > judged_at)
+                first_open = SIZE_MAX;
+            continue;
+        }
+        if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
+            used = md_late_take(line, at, now_ns, NULL);
+        if (used > 0) {
+            extend(line);
+            cut_out(line, at, (size_t)used);
+            continue;
+        }
+        if (used == MD_INCOMPLETE && first_open == SIZE_MAX)
+            first_open = at;
+        at++;
+    }
+    line->rx_from = first_open < line->rx_len ? (uint16_t)first_open : line->rx_len;
+    return 0;
+}
+
+/* ---- no reply ---- */
+
+/* A damaged frame of the drive's own, at the beginning of what came, says that it has answered. Others' frames,
+ * the echo and noise do not, and what looks like one further on may be the inside of another. */
+static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
+{
+    if (begin == 0 && line->echo == MD_ECHO)
+        return 0;
+    if (found == MD_BAD_CHARACTER) /* of which the framing looks at no address */
+        return line->rx_len >= begin + 5 && md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
+               md_hex_byte(line->rx + begin + 3) >= 0;
+    return found == MD_BAD_CHECKSUM;
+}
+
+struct md_ending md_reply_missed(struct md_line *line)
+{
+    const struct md_exchange *exchange = line->exchange;
+    struct md_message reply;
+    size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
+    int is_alone = begin > 0 && begin == line->rx_len;
+    int is_doubtful = is_alone && md_echo_learn_alone(line, parse_at(line, 0, &reply) > 0);
+    int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
+    if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first)) /* it may be an earlier one's */
+        md_late_expect(line, md_window_ns(exchange));
+    if (!is_doubtful)
+        md_learn_silence(exchange->drive);
+    int reason = md_reason(exchange->framing, &exchange->request, line->rx + begin, line->rx_len - begin);
+    return (struct md_ending){is_doubtful ? MD_MAYBE_ECHO : reason, 0, line->rx_len};
+}
