@@ -90,7 +90,12 @@ class Walk:
     def begin(self) -> None:
         if self.line.state == STATES["MD_IDLE"]:
             asked = self.chance.choices([READ, WRITE, BROADCAST], [9, 1, 1])[0]
-            details: dict[str, Any] = {"baudrate": 9600, "format": "8N1", "character": 0.001, "silence": 0.004}
+            details: dict[str, Any] = {
+                "baudrate": 9600,
+                "format": "8N1",
+                "character": 0.001,
+                "silence": 0.004,
+            }
             self.rest = b""
             self.line.begin(Exchange(Framing.RTU, asked, self.peer, **details))
 

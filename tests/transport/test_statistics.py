@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from line_driver import MS, LineDriver
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
-from multidrop._core import ffi, lib
+from multidrop._core import lib
 from test_learning import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from toy import Toy
 
