@@ -9,19 +9,8 @@ from c_programs import build_and_run
 
 @pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
-    core = (
-        "checksum",
-        "frame",
-        "reason",
-        "tap",
-        "line",
-        "reply",
-        "echo",
-        "late",
-        "delay",
-        "counters",
-        "columns",
-    )
+    line = ("line", "reply", "echo", "late", "delay", "counters")
+    core = ("checksum", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
 

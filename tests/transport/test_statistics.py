@@ -15,7 +15,7 @@ from line_driver import MS, LineDriver
 from line_exchanges import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
-from multidrop._core import ffi, lib
+from multidrop._core import lib
 from toy import Toy
 
 import multidrop.transport.line
@@ -34,7 +34,7 @@ LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these the error is known
 def counters_of(delays_ns: list[int]) -> Counters:
     known = Peer(least_timeout=0.02, most_timeout=1)
     for delay in delays_ns:
-        lib.md_counters_answer(ffi.addressof(known.c.counters), delay, 0)
+        lib.md_counters_answer(known.c, delay, 0)
     return known.counters()
 
 

@@ -252,7 +252,9 @@ class Line:
 
     def _failure(self, result: int, error: int) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
-            return LineError(self.port, f"the port does not take the {refused_names(error)} that the drive needs")
+            return LineError(
+                self.port, f"the port does not take the {refused_names(error)} that the drive needs"
+            )
         if self._core is None:
             return self._closed()
         why = os.strerror(error) if error else "hung up"

@@ -25,7 +25,7 @@ from multidrop.cli.doctor.findings import (
 from multidrop.cli.support.arguments import add_json_argument, add_port_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import wrapped
-from multidrop.core import is_pseudo_terminal, Completion, Exchange, Framing, Message, Peer, build_request
+from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request, is_pseudo_terminal
 from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
