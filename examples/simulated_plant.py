@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from multidrop import Plant, load_plant
-from multidrop.sim import Faults, HostileWire, Simulator, simulated
+from multidrop.sim import Simulator, Wire, simulated
 
 
 @contextmanager
-def simulated_plant(text: str, faults: Faults | None = None) -> Iterator[Plant]:
-    """Yield the plant that the text describes; `{ports}` in it is a directory for simulated ports."""
+def simulated_plant(text: str, wire_of: Callable[..., Wire] = Wire) -> Iterator[Plant]:
+    """Yield the plant that the text describes; `{ports}` in it is a directory for simulated ports.
+
+    `wire_of` makes a wire of simulated drives and `port`, the path of the link to it.
+    """
     with TemporaryDirectory() as directory:
         path = Path(directory) / "plant.toml"
         path.write_text(text.replace("{ports}", directory))
         plant = load_plant(path)
         wires = [
-            HostileWire(
-                [simulated(polled.drive) for polled in line.drives], faults or Faults(), port=line.port
-            )
+            wire_of([simulated(polled.drive) for polled in line.drives], port=line.port)
             for line in plant.lines
         ]
         with Simulator(wires):

@@ -42,6 +42,9 @@ def _defined(node: ast.stmt) -> Iterator[str]:
         yield from (target.id for target in node.targets if isinstance(target, ast.Name))
 
 
+INTERNAL = "forked, leave, part, tended, peer, peers"  # methods that other rooms call
+
+
 class PublicNames(Directive):
     """Documents public names of the package in the argument."""
 
@@ -79,7 +82,7 @@ def _documented(package: ModuleType, name: str) -> list[str]:
     if inspect.isclass(found) and issubclass(found, BaseException):
         return [f".. autoexception:: {place}", "   :show-inheritance:", ""]
     if inspect.isclass(found):
-        return [f".. autoclass:: {place}", "   :members:", ""]
+        return [f".. autoclass:: {place}", "   :members:", f"   :exclude-members: {INTERNAL}", ""]
     if inspect.isfunction(found):
         return [f".. autofunction:: {place}", ""]
     return [f".. py:data:: {place}", f"   :value: {found!r}", ""]

@@ -23,7 +23,7 @@ from diagrams import DIAGRAMS, draw
 
 HERE = Path(__file__).parent
 WIDTH, HEIGHT = 104, 16  # characters
-COMMAND = [sys.executable, "-m", "multidrop.cli"]
+COMMAND = [str(Path(sys.executable).with_name("multidrop"))]
 
 PLANT = """
 [[line]]
@@ -59,7 +59,7 @@ def _drawn(directory: str) -> str:
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLORTERM="truecolor", COLUMNS=str(WIDTH), LINES=str(HEIGHT))
         os.chdir(directory)
-        os.execv(sys.executable, [*COMMAND, "demo", "--seconds", "20"])
+        os.execv(COMMAND[0], [*COMMAND, "demo", "--seconds", "20"])
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", HEIGHT, WIDTH, 0, 0))
     drawn = b""
     try:

@@ -173,7 +173,8 @@ class Session:
 
     def _simulate(self, words: list[str]) -> str:
         """Start the simulator, which runs until the page's end; return its first line."""
-        command = [sys.executable, "-m", "multidrop.cli", *words, "--unpaced"]
+        program = "import sys; from multidrop.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", program, *words, "--unpaced"]
         process = self._stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         self._stack.callback(process.terminate)
         assert process.stdout is not None
