@@ -14,7 +14,7 @@ from simulated_plant import simulated_plant
 
 from multidrop import Plant, Poller
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
-from multidrop.sim import Faults, HostileWire
+from multidrop.sim import Faults, FaultyWire
 
 PLANT = """
 [[line]]
@@ -55,7 +55,7 @@ def hunt(plant: Plant, seconds: float, directory: Path) -> Counter[tuple[str, st
 
 
 def main(seconds: float) -> None:
-    with simulated_plant(PLANT, partial(HostileWire, faults=FAULTS)) as plant:
+    with simulated_plant(PLANT, partial(FaultyWire, faults=FAULTS)) as plant:
         lost = hunt(plant, seconds, Path("noise"))
     for (drive, status), count in lost.most_common():
         print(f"{drive:8}{count:5}  {status}")

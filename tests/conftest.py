@@ -35,7 +35,7 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_configure(config: pytest.Config) -> None:
     """Compile the tests before the workers begin: each of them would do it at the same time."""
     is_worker = hasattr(config, "workerinput")
-    if is_worker or not config.option.numprocesses or sys.dont_write_bytecode:
+    if is_worker or not config.getoption("numprocesses", None) or sys.dont_write_bytecode:
         return
     rooms = [room for room in sorted(TESTS.iterdir()) if [*room.glob("test_*.py")]]
     if any((room / "__pycache__").exists() for room in rooms):

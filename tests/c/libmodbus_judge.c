@@ -82,7 +82,8 @@ static void fill(void)
 static void show_changes(void)
 {
     int changes = 0;
-    if (memcmp(map->tab_bits, coils, sizeof coils) || memcmp(map->tab_registers, registers, sizeof registers)) {
+    if (memcmp(map->tab_bits, coils, sizeof coils) ||
+        memcmp(map->tab_registers, registers, sizeof registers)) {
         for (int i = 0; i < CELLS; i++) {
             if (map->tab_bits[i] != coils[i])
                 printf("%s1:%d:%d", changes++ ? "," : "", i, map->tab_bits[i]);
@@ -138,7 +139,8 @@ static int ask(int function, int start, int count, const uint8_t *data, uint8_t 
     }
 }
 
-static void judge_reply(int address, int function, int start, int count, const char *data_text, const char *text)
+static void judge_reply(int address, int function, int start, int count, const char *data_text,
+                        const char *text)
 {
     uint8_t frame[MOST_FRAME], data[MOST_FRAME], request[MOST_FRAME], bits[2048] = {0};
     uint16_t words[128] = {0};
@@ -170,7 +172,8 @@ int main(void)
     while (fgets(line, sizeof line, stdin)) {
         if (sscanf(line, "request %s", first) == 1)
             judge_request(first);
-        else if (sscanf(line, "reply %d %d %d %d %s %s", &address, &function, &start, &count, first, second) == 6)
+        else if (sscanf(line, "reply %d %d %d %d %s %s", &address, &function, &start, &count, first,
+                        second) == 6)
             judge_reply(address, function, start, count, first, second);
         else
             return 2;

@@ -314,7 +314,8 @@ def test_a_failure_stays_until_it_is_acknowledged(tmp_path: Path, monkeypatch: p
     assert failure in seen(monitor)
     assert "1 of 2 drives on hall-1 have stopped" in seen(monitor)
     assert "a acknowledges what FAILED" in seen(monitor)
-    poller.stop_all = lambda: {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}  # type: ignore[method-assign]
+    stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
+    poller.stop_all = lambda: stopped  # type: ignore[method-assign]
     for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a drive's page, and after a success
         monitor._obey(key)
         assert failure in seen(monitor)

@@ -351,8 +351,7 @@ def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.M
     """Its reply may be the answer to an earlier request."""
     hall, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
-    counters = hall.bus.peer(drive).c.counters
-    counters.ended[10] = 1
+    hall.bus.peer(drive).c.history.ended[10] = 1
     drive.stop()
     assert hall.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
 

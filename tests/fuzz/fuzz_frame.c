@@ -5,16 +5,19 @@
 
 enum { HEADER = 2 * REQUEST_BYTES, MOST_RECEIVED = 600 };
 
-typedef int parser(int framing, const uint8_t *bytes, size_t len, const struct md_message *request, struct md_message *out);
+typedef int parser(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
+                   struct md_message *out);
 
-static int parse_request(int framing, const uint8_t *bytes, size_t len, const struct md_message *request, struct md_message *out)
+static int parse_request(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
+                         struct md_message *out)
 {
     (void)request;
     return md_parse_request(framing, bytes, len, out);
 }
 
 /* Byte by byte: incomplete until it is decided, and then decided for good. What it comes to in the end. */
-static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size_t len, const struct md_message *request)
+static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size_t len,
+                          const struct md_message *request)
 {
     struct md_message out;
     int decided = MD_INCOMPLETE;
@@ -46,11 +49,13 @@ static void check_request(int framing, const uint8_t *bytes, size_t len)
         return;
     }
     must(length == used && memcmp(built, bytes, (size_t)used) == 0);
-    must(md_reply_length(framing, &found) <= MD_MOST_FRAME && (md_reply_length(framing, &found) > 0) == (found.address > 0));
+    must(md_reply_length(framing, &found) <= MD_MOST_FRAME &&
+         (md_reply_length(framing, &found) > 0) == (found.address > 0));
 }
 
 /* A reply that is accepted answers the question, and no other that it could not be mistaken for. */
-static void check_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request, const struct md_message *other)
+static void check_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
+                        const struct md_message *other)
 {
     struct md_message found, again;
     uint8_t built[MD_MOST_FRAME], asked[MD_MOST_FRAME];
@@ -70,7 +75,8 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
         return; /* 89H stands for 88H */
     must(memcmp(built, bytes, (size_t)used) == 0);
     if (md_parse_reply(framing, bytes, len, other, &again) > 0) /* line.c waits before it asks that */
-        must(request->address == other->address && (framing == MD_DELIXI || request->function == other->function));
+        must(request->address == other->address &&
+             (framing == MD_DELIXI || request->function == other->function));
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
@@ -99,7 +105,8 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
         for (size_t at = 0; at < HEADER; at += REQUEST_BYTES) {
             data[at] = data[0];
             data[at + 1] = data[1];
-            data[at + 2] = wire->framing == MD_DELIXI ? (uint8_t)(2 + (seed >> 4) % 6) : functions[(seed >> 4) % sizeof functions];
+            data[at + 2] = wire->framing == MD_DELIXI ? (uint8_t)(2 + (seed >> 4) % 6)
+                : functions[(seed >> 4) % sizeof functions];
             data[at + 5] = 0;
             data[at + 6] %= 126;
             if (data[at + 2] == 5) { /* a coil is on or off */

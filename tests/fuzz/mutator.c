@@ -104,7 +104,8 @@ static size_t mend_modbus(uint8_t *body, size_t have, const struct wire *wire, u
         body[1] = functions[draw(seed, sizeof functions)];
     if (!request && !is_rare(seed))
         body[0] &= 0x0F;
-    size_t len = request || body[1] & 0x80 || draw(seed, 2) ? mend_reply(body, have, request) : mend_request(body, have);
+    size_t len = request || body[1] & 0x80 || draw(seed, 2) ? mend_reply(body, have, request)
+        : mend_request(body, have);
     return is_rare(seed) && len > 1 ? len - 1 : len;
 }
 
@@ -171,10 +172,12 @@ static size_t close_frame(int framing, uint8_t *body, size_t len, uint8_t *frame
 }
 
 /* Put the frame in the place of what lies there; the input's new size. */
-static size_t replace(uint8_t *data, size_t size, size_t most, const struct wire *wire, const uint8_t *frame, size_t len)
+static size_t replace(uint8_t *data, size_t size, size_t most, const struct wire *wire,
+                      const uint8_t *frame, size_t len)
 {
     size_t behind = size - wire->at - wire->len;
-    if ((wire->is_fixed && len != wire->len) || size - wire->len + len > most || (wire->length_at != SIZE_MAX && len > 255))
+    if ((wire->is_fixed && len != wire->len) || size - wire->len + len > most ||
+        (wire->length_at != SIZE_MAX && len > 255))
         return size;
     memmove(data + wire->at + len, data + wire->at + wire->len, behind);
     memcpy(data + wire->at, frame, len);
@@ -201,7 +204,8 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
     } else
         junk = 0;
     size_t have = take_body(data + wire.at, wire.len, framing, body);
-    size_t len = framing == MD_DELIXI ? mend_delixi(body, &wire, &seed) : mend_modbus(body, have, &wire, &seed);
+    size_t len = framing == MD_DELIXI ? mend_delixi(body, &wire, &seed)
+        : mend_modbus(body, have, &wire, &seed);
     len = close_frame(framing, body, len, frame);
     if (is_rare(&seed))
         frame[draw(&seed, (unsigned)len)] ^= (uint8_t)(1u << draw(&seed, 8));

@@ -1,4 +1,4 @@
-/* Runs files through a harness without libFuzzer: `replay FILE...`, all that were found to be worth keeping. */
+/* Runs files through a harness without libFuzzer: `replay FILE...`, all that were worth keeping. */
 #include "fuzz.h"
 
 int main(int argc, char **argv)

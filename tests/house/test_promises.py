@@ -25,7 +25,7 @@ FILE = r"(?:tests|bench|csrc|src|docs|\.ci)/[\w./]*\w/?"
 
 
 def rows() -> dict[str, list[str]]:
-    """The first table's cells, by the promise."""
+    """Return the first table's cells, by the promise."""
     table = PAGE.partition("## The promises")[2].partition("\n## ")[0]
     cells = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in re.findall(r"^\|.*", table, re.M)
@@ -41,7 +41,7 @@ def test_every_promise_has_its_row() -> None:
 
 
 def named(pattern: str) -> list[str]:
-    return sorted({it for code in CODE for it in re.findall(rf"(?<![\w./]){pattern}", code)})
+    return sorted({name for code in CODE for name in re.findall(rf"(?<![\w./]){pattern}", code)})
 
 
 @pytest.mark.parametrize("path", named(FILE))
@@ -57,23 +57,17 @@ def test_tests_that_are_named_exist(name: str) -> None:
         assert f"def {name}(" in (ROOT / file).read_text("utf-8")
 
 
-MODULE = r"(?<=-m )bench\.[\w.]+"
-SCRIPT = rf"{FILE}|{MODULE}"
+def script(command: str) -> Path | None:
+    """Return the file that a command runs, where it is one of ours."""
+    if module := re.search(r"-m (bench[\w.]+)", command):
+        return ROOT / f"{module[1].replace('.', '/')}.py"
+    files = [ROOT / file for file in re.findall(FILE, command)]
+    return files[0] if files and files[0].suffix == ".py" else None
 
 
-@pytest.mark.parametrize("module", named(MODULE))
-def test_benchmarks_that_are_named_exist(module: str) -> None:
-    assert _source(module).exists()
-
-
-@pytest.mark.parametrize(
-    "command", [it for it in CODE if re.search(r" --(?!benchmark)", it) and re.search(SCRIPT, it)]
-)
-def test_options_that_are_named_exist(command: str) -> None:
-    (script,) = re.findall(SCRIPT, command)
-    sources = "".join(it.read_text("utf-8") for it in (_source(script), ROOT / "tests/conftest.py"))
+@pytest.mark.parametrize("command", [command for command in CODE if script(command)])
+def test_commands_and_options_that_are_named_exist(command: str) -> None:
+    file = script(command)
+    assert file is not None
+    sources = "".join(path.read_text("utf-8") for path in (file, ROOT / "tests" / "conftest.py"))
     assert all(f'"{option}"' in sources for option in re.findall(r"--[\w-]+", command))
-
-
-def _source(script: str) -> Path:
-    return ROOT / (script if "/" in script else f"{script.replace('.', '/')}.py")
