@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterable
 from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar, cast
 
 from multidrop.control.audit_log import AuditLog
@@ -121,12 +120,7 @@ class Bus:
     def __enter__(self) -> Bus:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def leave(self) -> None:
@@ -188,7 +182,6 @@ class Bus:
             self._exchanges.add(made)
             self._latches.add(made)
             self.drives = [*self.drives, made]  # anew, for others may be going through them
-        _log.debug("%s: attached %r", self.line.port, made)
         return made
 
     def _made(self, drive: D | type[D], address: int | None, details: dict[str, Any]) -> D:
@@ -217,7 +210,6 @@ class Bus:
             self._exchanges.remove(drive)
             self._writer.identity_check.forget(drive)
             self._free([drive])
-        _log.debug("%s: detached %s", self.line.port, drive.name)
 
     def _free(self, drives: Iterable[Drive]) -> None:
         """Let these drives be attached to another bus."""
@@ -335,7 +327,7 @@ class Bus:
     def _stop_at_last(self) -> None:
         for stopped in self.stop_all().values():
             if stopped.seen is not Seen.STOPPED:
-                logging.getLogger("multidrop.control").warning("%s", stopped)
+                _log.warning("%s", stopped)
 
     # ---- how it went ----
 
