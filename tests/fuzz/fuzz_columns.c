@@ -59,7 +59,7 @@ static void check_rows(const uint8_t *head, const struct md_block *block, const 
         must(added == (room - before >= (size_t)block->count ? block->count : 0) && rows.rows == before + (size_t)added);
         for (size_t row = before; row < rows.rows; row++) {
             const struct md_field *field = &block->fields[row - before];
-            double value = expected(completion->reply.data, completion->reply.data_len, field->at, field->wire);
+            double value = expected(completion->reply.data, completion->reply.data_len, field->at, field->format);
             int is_value = completion->result >= 0 && !completion->reply.exception;
             must(rows.drive[row] == block->drive && rows.reg[row] == field->reg && rows.time[row] == rows.sent[row] + 1000);
             must((rows.valid[row / 8] >> row % 8 & 1) == (rows.status[row] == 0));

@@ -59,7 +59,7 @@ static void check_line(void)
 {
     const struct md_line *line = &scene.line;
     must(line->rx_from <= line->rx_len && line->rx_len <= sizeof line->rx && line->tx_at <= line->tx_len);
-    must(line->tx_len <= sizeof line->tx);
+    must(line->tx_len <= MD_MOST_FRAME);
 }
 
 static int is_read(const struct md_message *request)
