@@ -5,7 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const uint8_t wire_bytes[] = {
+static const uint8_t bytes_of[] = {
     [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_U32_SWAPPED] = 4,
     [MD_I32_SWAPPED] = 4, [MD_U32_EITHER] = 4, [MD_F32] = 4, [MD_F32_SWAPPED] = 4,
 };
@@ -17,22 +17,22 @@ static double as_float(uint32_t bits)
     return (double)value;
 }
 
-static int is_inside(size_t len, size_t at, int wire)
+static int is_inside(size_t len, size_t at, int format)
 {
-    if (wire == MD_BIT)
+    if (format == MD_BIT)
         return at / 8 < len;
-    return wire >= 0 && (size_t)wire < sizeof wire_bytes && at < len && 2 * at + wire_bytes[wire] <= len;
+    return format >= 0 && (size_t)format < sizeof bytes_of && at < len && 2 * at + bytes_of[format] <= len;
 }
 
-double md_value(const uint8_t *data, size_t len, size_t at, int wire)
+double md_value(const uint8_t *data, size_t len, size_t at, int format)
 {
-    if (!is_inside(len, at, wire))
+    if (!is_inside(len, at, format))
         return (double)NAN;
-    if (wire == MD_BIT) /* the first coil is the least significant bit of the first byte */
+    if (format == MD_BIT) /* the first coil is the least significant bit of the first byte */
         return (data[at / 8] >> (at % 8)) & 1;
     const uint8_t *first = data + 2 * at;
-    uint32_t one = md_get16(first), two = wire_bytes[wire] == 4 ? md_get16(first + 2) : 0;
-    switch (wire) {
+    uint32_t one = md_get16(first), two = bytes_of[format] == 4 ? md_get16(first + 2) : 0;
+    switch (format) {
     case MD_I16: return (int16_t)one;
     case MD_U32: return one << 16 | two;
     case MD_I32: return (int32_t)(one << 16 | two);
@@ -86,11 +86,11 @@ static uint16_t status_of(const struct md_completion *completion, const struct m
         return (uint16_t)-completion->result;
     if (reply->exception)
         return (uint16_t)(MD_EXCEPTION + reply->exception);
-    return is_inside(reply->data_len, field->at, field->wire) ? MD_OK : -MD_BAD_LENGTH;
+    return is_inside(reply->data_len, field->at, field->format) ? MD_OK : -MD_BAD_LENGTH;
 }
 
-int md_columns_add(struct md_columns *columns, const struct md_block *block, const struct md_completion *completion,
-                   int64_t utc_minus_monotonic_ns)
+int md_columns_add(struct md_columns *columns, const struct md_block *block,
+                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns)
 {
     if (columns->room - columns->rows < (size_t)block->count)
         return 0;
@@ -106,7 +106,7 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block, con
         columns->drive[row] = block->drive;
         columns->reg[row] = field->reg;
         columns->status[row] = status;
-        columns->value[row] = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->wire) *
+        columns->value[row] = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->format) *
                                                field->multiplier / field->divisor;
         set_bit(columns->valid, row, status == 0);
     }

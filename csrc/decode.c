@@ -26,7 +26,8 @@ static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
     return &decoder->known[place];
 }
 
-int md_know(struct md_decoder *decoder, int framing, const struct md_message *request, const struct md_block *block)
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
+            const struct md_block *block)
 {
     if (4 * decoder->taken >= 3 * decoder->places)
         return 0;
@@ -47,7 +48,7 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         md_copy_message(reply, request);
 }
 
-/* Add the rows of the last request: what its reply says, or why there is none. Return 0 when there is no room. */
+/* Add the rows of the last request: its reply, or why there is none. Return 0 when there is no room. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;
@@ -92,7 +93,8 @@ static void explain(struct md_decoder *decoder, const struct md_stream *stream)
         return;
     memcpy(completion->raw + completion->raw_len, stream->bytes + span->at, len);
     completion->raw_len = (uint16_t)(completion->raw_len + len);
-    decoder->failure = md_reason(decoder->splitter.framing, &decoder->splitter.request, completion->raw, completion->raw_len);
+    const struct md_splitter *splitter = &decoder->splitter;
+    decoder->failure = md_reason(splitter->framing, &splitter->request, completion->raw, completion->raw_len);
 }
 
 static int take(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns)

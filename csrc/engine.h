@@ -1,4 +1,4 @@
-/* What the engine's thread and its clients know of each other and of each port. Calls run one way: port_api.c
+/* The engine and its ports, as its thread and its clients see them. Calls run one way: port_api.c
  * (clients) -> engine.c (the thread) -> port_io.c (a port's system calls) -> port_turn.c -> line.c. */
 #ifndef MULTIDROP_ENGINE_H
 #define MULTIDROP_ENGINE_H

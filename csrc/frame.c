@@ -29,41 +29,42 @@ static const struct fields {
 
 enum { BIT = 1, WORD = 16 };
 
+/* Nobody answers a broadcast, so that it cannot ask for anything. */
+enum { NO_BROADCAST, BROADCAST };
+
 static const struct function {
     uint8_t request, reply; /* enum layout */
     uint8_t unit_bits;      /* BIT or WORD: the unit of count */
     uint16_t most;          /* the largest count */
+    uint8_t may_be;         /* BROADCAST, or not */
 } functions[] = {
-    [0x01] = {RANGE, DATA, BIT, 2000},
-    [0x02] = {RANGE, DATA, BIT, 2000},
-    [0x03] = {RANGE, DATA, WORD, 125},
-    [0x04] = {RANGE, DATA, WORD, 125},
-    [MD_WRITE_COIL] = {.request = ECHO, .reply = ECHO},
-    [MD_WRITE_ONE] = {.request = ECHO, .reply = ECHO},
+    [0x01] = {RANGE, DATA, BIT, 2000, NO_BROADCAST},
+    [0x02] = {RANGE, DATA, BIT, 2000, NO_BROADCAST},
+    [0x03] = {RANGE, DATA, WORD, 125, NO_BROADCAST},
+    [0x04] = {RANGE, DATA, WORD, 125, NO_BROADCAST},
+    [MD_WRITE_COIL] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
+    [MD_WRITE_ONE] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
     [MD_LOOPBACK] = {.request = ECHO, .reply = ECHO},
-    [0x0F] = {RANGE_DATA, RANGE, BIT, 1968},
-    [0x10] = {RANGE_DATA, RANGE, WORD, 123},
+    [0x0F] = {RANGE_DATA, RANGE, BIT, 1968, BROADCAST},
+    [0x10] = {RANGE_DATA, RANGE, WORD, 123, BROADCAST},
 };
-
-/* Delixi's K stands for all of them. */
-static const struct function delixi = {.request = LONG, .reply = LONG};
 
 enum {
     MOST_BODY = 253, /* 125 registers read; the standard has room for 254 */
     EXCEPTION_BODY = 3,
     EXCEPTION_BIT = 0x80,
-    DELIXI_BODY = 8,
-    DELIXI_FRAME = 21
+    DELIXI_BODY = 8
 };
 
-/* Delixi's K of a drive alone (part 3). */
+/* Delixi's K that only a drive sends (part 3). */
 enum { CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
 static const struct function *find_function(int framing, uint8_t code)
 {
-    static const struct function none = {.request = NONE, .reply = NONE};
-    if (framing == MD_DELIXI)
-        return &delixi;
+    static const struct function none, delixi = {.request = LONG, .reply = LONG};
+    static const struct function delixi_run = {.request = LONG, .reply = LONG, .may_be = BROADCAST};
+    if (framing == MD_DELIXI) /* part 3: only a run command may be broadcast */
+        return code == MD_DELIXI_RUN ? &delixi_run : &delixi;
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
 }
 
@@ -84,6 +85,13 @@ static size_t data_bytes(const struct function *function, unsigned count)
 
 /* ---- bodies ---- */
 
+/* Return the length of a body but for the data that a byte count announces. */
+static int head_length(int layout)
+{
+    const struct fields *fields = &fields_of[layout];
+    return 2 + 2 * fields->start + 2 * fields->count + fields->byte_count + fields->data_len;
+}
+
 static size_t put_body(int layout, const struct md_message *message, uint8_t *body)
 {
     const struct fields *fields = &fields_of[layout];
@@ -98,7 +106,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Of the data only as much is written as there is: clearing the rest costs more than to parse. */
+/* Write no more data than there is: clearing the rest costs more than to parse. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];
@@ -127,47 +135,49 @@ static void begin_message(struct md_message *message, uint8_t address, uint8_t f
  * drive's side answers it with an exception. */
 static int request_length(int framing, const uint8_t *body, size_t have)
 {
-    if (framing == MD_DELIXI)
-        return have >= 2 && body[1] >= CANNOT_EXECUTE ? MD_BAD_FUNCTION : DELIXI_BODY;
     if (have < 2)
         return MD_INCOMPLETE;
     const struct function *function = find_function(framing, body[1]);
-    if (function->request == NONE)
+    if (function->request == NONE || (framing == MD_DELIXI && body[1] >= CANNOT_EXECUTE))
         return MD_BAD_FUNCTION;
+    int head = head_length(function->request);
     if (function->request != RANGE_DATA)
-        return 6;
-    if (have < 7)
+        return head;
+    if (have < (size_t)head)
         return MD_INCOMPLETE;
     unsigned count = md_get16(body + 4);
     if (count > function->most || body[6] != data_bytes(function, count))
         return MD_BAD_LENGTH;
-    return 7 + body[6];
+    return head + body[6];
 }
 
 /* Do the same for the reply to `request`, which is refused as soon as its first bytes differ. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
+    const struct function *function = find_function(framing, request->function);
     if (have >= 1 && (request->address == 0 || body[0] != request->address))
         return MD_BAD_ADDRESS;
     if (request->function & EXCEPTION_BIT) /* no request has it */
         return MD_BAD_FUNCTION;
-    if (framing == MD_DELIXI)
-        return have >= 2 && body[1] != request->function && !is_delixi_refusal(body[1]) ? MD_BAD_FUNCTION : DELIXI_BODY;
     if (have < 2)
         return MD_INCOMPLETE;
-    const struct function *function = find_function(framing, request->function);
+    if (framing == MD_DELIXI && is_delixi_refusal(body[1]))
+        return DELIXI_BODY;
     /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
-    if (body[1] == (request->function | EXCEPTION_BIT) || (request->function == MD_LOOPBACK && body[1] == 0x89))
+    if (framing != MD_DELIXI && (body[1] == (request->function | EXCEPTION_BIT) ||
+                                 (request->function == MD_LOOPBACK && body[1] == 0x89)))
         return have >= EXCEPTION_BODY && body[2] == 0 ? MD_BAD_FUNCTION : EXCEPTION_BODY;
     if (body[1] != request->function || function->reply == NONE)
         return MD_BAD_FUNCTION;
+    int head = head_length(function->reply);
     if (function->reply != DATA)
-        return 6;
-    if (have < 3)
+        return head;
+    if (have < (size_t)head)
         return MD_INCOMPLETE;
-    if (request->count == 0 || request->count > function->most || body[2] != data_bytes(function, request->count))
+    unsigned count = request->count;
+    if (count == 0 || count > function->most || body[2] != data_bytes(function, count))
         return MD_BAD_LENGTH;
-    return 3 + body[2];
+    return head + body[2];
 }
 
 /* ---- frames ---- */
@@ -198,7 +208,8 @@ static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
 }
 
 /* Open what is written in hex digits: unhex its body, and return the frame's length. */
-static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request, uint8_t *body)
+static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request,
+                     uint8_t body[MOST_BODY + 1])
 {
     if (len > 0 && text[0] != ':')
         return MD_NO_START;
@@ -275,7 +286,26 @@ static int close_frame(int framing, uint8_t *body, size_t len, uint8_t *out, siz
 
 static int is_range(const struct function *function, const struct md_message *message)
 {
-    return message->count >= 1 && message->count <= function->most && message->start + message->count <= 0x10000;
+    unsigned count = message->count;
+    return count >= 1 && count <= function->most && message->start + count <= 0x10000;
+}
+
+/* Check that a body of this layout can say it. */
+static int fits(int layout, const struct function *function, const struct md_message *message)
+{
+    switch (layout) {
+    case RANGE:
+        return is_range(function, message) && message->data_len == 0;
+    case RANGE_DATA:
+        return is_range(function, message) && message->data_len == data_bytes(function, message->count);
+    case DATA:
+        return message->data_len >= 1 && message->data_len <= data_bytes(function, function->most) &&
+               8 * message->data_len % function->unit_bits == 0;
+    case LONG:
+        return message->data_len == 4 && is_delixi_command(message->function);
+    default:
+        return layout == ECHO && message->data_len == 2;
+    }
 }
 
 static int is_coil(const uint8_t *data)
@@ -283,27 +313,13 @@ static int is_coil(const uint8_t *data)
     return data[1] == 0 && (data[0] == 0xFF || data[0] == 0);
 }
 
-/* Nobody answers a broadcast, so that it cannot ask for anything. */
 static int is_request(int framing, const struct md_message *message)
 {
     const struct function *function = find_function(framing, message->function);
-    int is_broadcast = message->address == 0;
-    if (message->address > MD_MOST_ADDRESS)
+    if (message->address > MD_MOST_ADDRESS || (message->address == 0 && function->may_be != BROADCAST))
         return 0;
-    switch (function->request) {
-    case RANGE:
-        return !is_broadcast && is_range(function, message) && message->data_len == 0;
-    case RANGE_DATA:
-        return is_range(function, message) && message->data_len == data_bytes(function, message->count);
-    case ECHO:
-        return message->data_len == 2 && (message->function != MD_WRITE_COIL || is_coil(message->data)) &&
-               (message->function != MD_LOOPBACK || !is_broadcast);
-    case LONG: /* part 3: only a run command may be broadcast */
-        return message->data_len == 4 && is_delixi_command(message->function) &&
-               (message->function == MD_DELIXI_RUN || !is_broadcast);
-    default:
-        return 0;
-    }
+    return fits(function->request, function, message) &&
+           (framing == MD_DELIXI || message->function != MD_WRITE_COIL || is_coil(message->data));
 }
 
 static int is_reply(int framing, const struct md_message *message)
@@ -313,19 +329,7 @@ static int is_reply(int framing, const struct md_message *message)
         return 0;
     if (message->exception)
         return framing != MD_DELIXI || is_delixi_refusal(message->exception);
-    switch (function->reply) {
-    case RANGE:
-        return is_range(function, message) && message->data_len == 0;
-    case DATA:
-        return message->data_len >= 1 && message->data_len <= data_bytes(function, function->most) &&
-               8 * message->data_len % function->unit_bits == 0;
-    case ECHO:
-        return message->data_len == 2;
-    case LONG:
-        return message->data_len == 4 && is_delixi_command(message->function);
-    default:
-        return 0;
-    }
+    return fits(function->reply, function, message);
 }
 
 /* Check that the reply says what the request asked for. A write is confirmed by its own address and value,
@@ -410,19 +414,18 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
         reply->start = request->start;
         reply->count = request->count;
     }
-    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* show the answer where all others have theirs */
+    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* as all others have it */
         md_put16(reply->data + 2, reply->start);
     return used;
 }
 
 int md_reply_length(int framing, const struct md_message *request)
 {
+    const struct function *function = find_function(framing, request->function);
+    int data = function->reply == DATA ? (int)data_bytes(function, request->count) : 0;
+    int body = head_length(function->reply) + data;
     if (request->address == 0)
         return 0;
-    if (framing == MD_DELIXI)
-        return DELIXI_FRAME;
-    const struct function *function = find_function(framing, request->function);
-    int body = function->reply == DATA ? 3 + (int)data_bytes(function, request->count) : 6;
     return framing == MD_RTU ? body + 2 : 2 * body + 5;
 }
 

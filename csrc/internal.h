@@ -1,4 +1,4 @@
-/* What only C calls of the core. The marked part is also there for the tests. */
+/* The functions that only C calls. Tests see the marked part, too. */
 #ifndef MULTIDROP_INTERNAL_H
 #define MULTIDROP_INTERNAL_H
 
@@ -102,7 +102,7 @@ struct md_urgent {
     int is_done;
 };
 
-/* What was sent before an exchange. Zeroed, nothing was. */
+/* The requests sent before an exchange. Zeroed, none was. */
 struct md_before {
     const struct md_exchange *then; /* the exchange */
     uint64_t replies;               /* of its drive, before the last proof */
@@ -153,10 +153,11 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
 /* ---- columns.c, row_queue.c ---- */
 
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */
-int md_columns_add(struct md_columns *columns, const struct md_block *block, const struct md_completion *completion,
-                   int64_t utc_minus_monotonic_ns);
+int md_columns_add(struct md_columns *columns, const struct md_block *block,
+                   const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* The same to the newest chunk; a block that is NULL has no rows. */
-void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block, const struct md_completion *completion);
+void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
+                      const struct md_completion *completion);
 /* cdef: end */
 
 /* ---- frame.c, reason.c ---- */
@@ -190,7 +191,7 @@ int md_reason(int framing, const struct md_message *request, const uint8_t *byte
 
 /* ---- delay.c: what is learnt of a drive from the delays of its replies ---- */
 
-/* How long after a request, beside its reply's own time, it is worth looking for that. */
+/* Return the time after a request, beside its reply's own, before which it is not worth looking for that. */
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);

@@ -1,7 +1,7 @@
-/* What Python calls of the C core. internal.h has what only C calls.
+/* The functions of the C core that Python calls; internal.h has those that only C calls.
  *
  * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
- * The pure parts (all but ports, engine, row queue and clock) do no I/O, call nobody back and have no globals. */
+ * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
@@ -32,7 +32,7 @@ uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's own: the sum's 
 
 enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI };
 
-/* Why bytes are no frame. */
+/* The reason why bytes are no frame. */
 enum md_frame_fault {
     MD_INCOMPLETE = 0,     /* more bytes are needed */
     MD_NO_START = -1,      /* no frame begins here */
@@ -80,7 +80,12 @@ struct md_settings {
     uint8_t stopbits; /* 1, 2 */
 };
 
-enum md_refusal { MD_REFUSED_BAUDRATE = 1, MD_REFUSED_DATABITS = 2, MD_REFUSED_PARITY = 4, MD_REFUSED_STOPBITS = 8 };
+enum md_refusal {
+    MD_REFUSED_BAUDRATE = 1,
+    MD_REFUSED_DATABITS = 2,
+    MD_REFUSED_PARITY = 4,
+    MD_REFUSED_STOPBITS = 8
+};
 
 /* Make the port raw with these settings, and read them back to find what it did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
@@ -95,15 +100,18 @@ int64_t md_utc_minus_monotonic_ns(void);
 
 /* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
 
-enum md_wire { MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32, MD_F32_SWAPPED, MD_BIT };
+enum md_number_format {
+    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32,
+    MD_F32_SWAPPED, MD_BIT
+};
 
 /* Read the number at word (MD_BIT: bit) `at` of a reply's data. */
-double md_value(const uint8_t *data, size_t len, size_t at, int wire);
+double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
 struct md_field {
     uint16_t at;
-    uint8_t wire;
+    uint8_t format; /* enum md_number_format */
     uint16_t reg; /* code of its name */
     double multiplier, divisor;
 };
@@ -145,7 +153,7 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
 
 /* ---- delay.c, late.c, counters.c: what is known of a drive; return a time in ns ---- */
 
-/* What became of a drive's exchanges; all but longest_ns only grow. A value is one of the exchange's block. */
+/* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */
 struct md_counters {
     uint64_t exchanges, answered, values;
     uint64_t sent;        /* requests that began to leave */
@@ -185,9 +193,9 @@ struct md_drive {
     int64_t answered_ns;            /* requests that left before then are answered, or never will be */
     uint32_t failures;              /* in a row */
     uint32_t owed_count, proof_count;
-    const struct md_exchange *const *proofs; /* reads whose replies differ from each other's and most others' */
+    const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
-    struct md_history *history;     /* apart: with thousands of drives, fewer pages are touched at each exchange */
+    struct md_history *history;     /* apart: an exchange touches fewer pages */
     struct md_counters counters;
 };
 
@@ -223,11 +231,11 @@ struct md_exchange {
     struct md_message request;
     int64_t turnaround_ns; /* after a broadcast */
     int64_t period_ns;     /* between its slots in a queue; 0: it has none */
-    const uint32_t *stops; /* of its drive (md_count_stop): sent only while they are stops_seen; NULL: always */
+    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
 };
 
-/* Why an exchange has no reply. Where something came in its place, that is an enum md_frame_fault. */
+/* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */
 enum md_failure {
     MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
     MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
@@ -239,7 +247,7 @@ enum md_failure {
     MD_MAYBE_ECHO = -17        /* the reply cannot be told from the adapter's echo */
 };
 
-/* What became of an exchange. first_ns and last_ns are 0 where nothing came. */
+/* The result of an exchange. first_ns and last_ns are 0 where nothing came. */
 struct md_completion {
     int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
@@ -290,7 +298,8 @@ void md_port_tell_echo(struct md_port *port, int echo);
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
 /* Queue exchanges, none to be sent before its time; return how many there was room for. One client at a
  * time. A slot that is late by a period is not sent (MD_EXPIRED) when the same exchange's next one is due. */
-int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns, int n);
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns, int n);
 /* Repeat these in turn while nothing that is queued is due, until they are replaced, the port is lost, or one
  * of them could not be sent. Return which one of those before would have been next. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
@@ -310,7 +319,8 @@ struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
 /* Free it once no port reports to it. Chunks taken before may be given back afterwards. */
 void md_row_queue_free(struct md_row_queue *row_queue);
 /* Add rows for values that were due at a time and not asked for. */
-void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status, int64_t due_ns);
+void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
+                       int64_t due_ns);
 struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
 void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
 size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* with rows; the newest is still being filled */
@@ -339,8 +349,7 @@ struct md_tap {
     uint64_t lost;       /* bytes without room */
 };
 
-/* What stands before and behind the bytes of a packet. Each side has two: for bytes in general, and for bytes
- * that begin with ':'. */
+/* Header and trailer of a packet. Each side has two: for any bytes, and for those that begin with ':'. */
 struct md_wrapping {
     const uint8_t *head, *tail;
     uint32_t head_len, tail_len; /* the tail's is a multiple of 4 */
@@ -354,7 +363,7 @@ size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t f
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- stream.c, split.c: return 1, or 0 when room (md_hear, md_know) or more bytes (md_split) are needed ---- */
+/* ---- split.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
 
 /* Bytes that came together, from `at` up to the next piece. */
 struct md_piece {
@@ -398,8 +407,10 @@ struct md_splitter {
     struct md_message request; /* the last one */
 };
 
-int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece); /* append */
-void md_forget(struct md_stream *stream, struct md_splitter *splitter); /* what was split */
+/* Append a piece. */
+int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
+/* Forget what was split. */
+void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
 /* Find the next span. Every byte is part of one. Only pauses and sides matter of how the bytes came in; junk
  * comes in any number of spans. */
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
@@ -433,7 +444,8 @@ enum md_decoded {
 };
 
 /* Say what replies to this request hold; NULL: nothing that makes rows. Return 0 when the table is full. */
-int md_know(struct md_decoder *decoder, int framing, const struct md_message *request, const struct md_block *block);
+int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
+            const struct md_block *block);
 /* Add the rows of every sniffed exchange, also of requests without a reply. */
 int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
 

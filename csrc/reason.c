@@ -1,8 +1,8 @@
 /* Find out why a request has no reply from what came in its place. */
 #include "internal.h"
 
-/* How much a reason says about what went wrong. The one that says most is reported, and of several
- * that say as much the first: a frame from another address may hold our own further on. */
+/* Weigh a reason by how much it tells. The one that tells most is reported, and of several that tell as
+ * much the first: a frame from another address may hold our own further on. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {

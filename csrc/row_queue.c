@@ -48,8 +48,8 @@ static void init_condition(pthread_cond_t *condition)
 static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_t until_ns)
 {
 #ifdef __APPLE__
-    int64_t left = until_ns - md_now_ns();
-    struct timespec span = {.tv_sec = left > 0 ? left / 1000000000 : 0, .tv_nsec = left > 0 ? left % 1000000000 : 0};
+    int64_t left = later(until_ns - md_now_ns(), 0);
+    struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
     return pthread_cond_timedwait_relative_np(condition, mutex, &span);
 #else
     struct timespec until = {.tv_sec = until_ns / 1000000000, .tv_nsec = until_ns % 1000000000};
@@ -127,7 +127,8 @@ static struct md_columns *begin_chunk(struct md_row_queue *queue)
     return chunk;
 }
 
-void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block, const struct md_completion *completion)
+void md_row_queue_add(struct md_row_queue *queue, const struct md_block *block,
+                      const struct md_completion *completion)
 {
     if (!block || block->count == 0)
         return;

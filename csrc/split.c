@@ -27,7 +27,8 @@ static int is_start(int framing, uint8_t first)
 /* A good reply to such a request is its copy, or looks like one. */
 static int is_echoed(int framing, uint8_t function)
 {
-    return framing == MD_DELIXI || function == MD_WRITE_COIL || function == MD_WRITE_ONE || function == MD_LOOPBACK;
+    int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE;
+    return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
 /* Delixi's requests look like replies, but the value that a query asks for is 0 in it. */
@@ -57,8 +58,8 @@ enum { HEAD = 6 };
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
     memset(head, 0, HEAD);
-    if (framing == MD_RTU)
-        memcpy(head, bytes, len < HEAD ? len : HEAD);
+    for (size_t i = 0; framing == MD_RTU && i < HEAD && i < len; i++) /* memcpy() would be slower */
+        head[i] = bytes[i];
     for (size_t i = 0; framing != MD_RTU && i < HEAD && 2 * i + 2 < len; i++) {
         int byte = md_hex_byte(bytes + 2 * i + 1);
         if (byte < 0)
@@ -89,29 +90,33 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     return used;
 }
 
-/* Find the frame that begins here: return its length, and set its kind, framing and message in `span`. `least` is
- * MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
-static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len, int least,
-                      struct md_span *span)
+/* Find the frame that begins here: return its length, and set its kind, framing and message in `span`.
+ * `least` is MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
+static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len,
+                      int least, struct md_span *span)
 {
     static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
     struct md_message *message = &span->message;
+    int used, may_be_copy = !splitter->is_in_step && side != MD_ASKING;
     if (splitter->awaited && side != MD_ASKING) {
-        int used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, message);
         span->kind = MD_REPLY;
         span->framing = splitter->framing;
+        used = md_parse_reply(splitter->framing, bytes, len, &splitter->request, message);
         if (used >= least)
             return used;
     }
-    for (int way = 0; way < 6; way++) {
-        int is_request = way < 3, framing = framings[way % 3];
-        if (side == (is_request ? MD_ANSWERING : MD_ASKING) || !is_start(framing, bytes[0]))
-            continue;
-        int used = (is_request ? find_request : find_reply)(framing, bytes, len, message);
-        int may_be_copy = used > 0 && !splitter->is_in_step && side != MD_ASKING && is_echoed(framing, message->function);
-        span->kind = !is_request ? MD_STRAY : may_be_copy ? MD_EITHER : MD_REQUEST;
-        span->framing = framing;
-        if (used >= least)
+    for (int i = 0; i < 3 && side != MD_ANSWERING; i++) {
+        int framing = span->framing = framings[i];
+        if (is_start(framing, bytes[0]) && (used = find_request(framing, bytes, len, message)) >= least) {
+            int is_either = used > 0 && may_be_copy && is_echoed(framing, message->function);
+            span->kind = is_either ? MD_EITHER : MD_REQUEST;
+            return used;
+        }
+    }
+    span->kind = MD_STRAY;
+    for (int i = 0; i < 3 && side != MD_ASKING; i++) {
+        int framing = span->framing = framings[i];
+        if (is_start(framing, bytes[0]) && (used = find_reply(framing, bytes, len, message)) >= least)
             return used;
     }
     return MD_NO_START;
@@ -191,7 +196,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
 
 /* ---- the stream ---- */
 
-int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece)
+int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece)
 {
     if (stream->room - stream->len < len || stream->most == stream->count)
         return 0;
@@ -202,7 +207,7 @@ int md_hear(struct md_stream *stream, const uint8_t *bytes, size_t len, struct m
     return 1;
 }
 
-void md_forget(struct md_stream *stream, struct md_splitter *splitter)
+void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
 {
     size_t gone = splitter->at, first = splitter->piece;
     while (first + 1 < stream->count && stream->pieces[first + 1].at <= gone)

@@ -69,12 +69,15 @@ static uint8_t *put32(uint8_t *at, uint32_t value)
 }
 
 /* Write all of a packet but its bytes; return where those belong. */
-static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len, uint8_t *out)
+static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int64_t time_ns, uint32_t len,
+                     uint8_t *out)
 {
     uint32_t packet = wrapping->head_len + len, padding = -packet & 3;
     uint32_t size = MD_PACKET_HEAD + packet + padding + wrapping->tail_len + MD_PACKET_END;
     uint64_t time = (uint64_t)time_ns;
-    const uint32_t head[] = {MD_PACKET_BLOCK, size, interface, (uint32_t)(time >> 32), (uint32_t)time, packet, packet};
+    const uint32_t head[] = {
+        MD_PACKET_BLOCK, size, interface, (uint32_t)(time >> 32), (uint32_t)time, packet, packet,
+    };
     for (size_t i = 0; i < sizeof head / sizeof *head; i++)
         out = put32(out, head[i]);
     memcpy(out, wrapping->head, wrapping->head_len);
@@ -85,21 +88,22 @@ static uint8_t *wrap(const struct md_wrapping *wrapping, uint32_t interface, int
     return bytes;
 }
 
-static const struct md_wrapping *wrapping_of(const struct md_wrapping *wrappings, uint32_t side, uint8_t first)
+static const struct md_wrapping *choose(const struct md_wrapping *wrappings, uint32_t side, uint8_t first)
 {
     return &wrappings[2 * side + (first == ':')];
 }
 
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len)
 {
-    const struct md_wrapping *wrapping = wrapping_of(wrappings, (uint32_t)side, first);
-    return MD_PACKET_HEAD + ((wrapping->head_len + len + 3) & ~(size_t)3) + wrapping->tail_len + MD_PACKET_END;
+    const struct md_wrapping *wrapping = choose(wrappings, (uint32_t)side, first);
+    size_t packet = (wrapping->head_len + len + 3) & ~(size_t)3;
+    return MD_PACKET_HEAD + packet + wrapping->tail_len + MD_PACKET_END;
 }
 
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out)
 {
-    const struct md_wrapping *wrapping = wrapping_of(wrappings, (uint32_t)side, len ? *bytes : 0);
+    const struct md_wrapping *wrapping = choose(wrappings, (uint32_t)side, len ? *bytes : 0);
     memcpy(wrap(wrapping, interface, time_ns, (uint32_t)len, out), bytes, len);
 }
 
@@ -116,8 +120,9 @@ size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint
         size_t size = md_packet_length(wrappings, (int)mark.side, first, mark.len);
         if (room - used < size)
             break;
-        const struct md_wrapping *wrapping = wrapping_of(wrappings, mark.side, first);
-        uint8_t *bytes = wrap(wrapping, interface, mark.time_ns + utc_minus_monotonic_ns, mark.len, out + used);
+        const struct md_wrapping *wrapping = choose(wrappings, mark.side, first);
+        int64_t time_ns = mark.time_ns + utc_minus_monotonic_ns;
+        uint8_t *bytes = wrap(wrapping, interface, time_ns, mark.len, out + used);
         copy_out(tap, taken + (uint32_t)sizeof mark, bytes, mark.len);
         used += size;
         taken += (uint32_t)(sizeof mark + mark.len);

@@ -60,7 +60,7 @@ static int put(struct md_channel *channel, const uint8_t *packet, size_t len, ui
     uint64_t seconds = ticks / channel->ticks_per_s, rest = ticks % channel->ticks_per_s;
     uint64_t time_ns = seconds * 1000000000u + rest * 1000000000u / channel->ticks_per_s;
     piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* a senseless one may wrap around */
-    return md_hear(&channel->stream, packet + header, len - header, piece);
+    return md_stream_put(&channel->stream, packet + header, len - header, piece);
 }
 
 static int unpack_pcap(struct md_capture *capture)

@@ -197,6 +197,12 @@ static const struct {
     {"a count that wraps around", MD_RTU, 0, {.address = 1, .function = 3, .start = 1, .count = 0xFFFF}},
     {"a read with data", MD_RTU, 0, {.address = 1, .function = 3, .count = 1, .data_len = 2}},
     {"a broadcast read", MD_RTU, 0, {.function = 3, .count = 1}},
+    {"a broadcast read of coils", MD_RTU, 0, {.function = 1, .count = 1}},
+    {"a broadcast read of inputs", MD_RTU, 0, {.function = 2, .count = 1}},
+    {"a broadcast read of input registers", MD_RTU, 0, {.function = 4, .count = 1}},
+    {"a broadcast write of words", MD_RTU, 11, {.function = 0x10, .count = 1, .data_len = 2}},
+    {"a broadcast write of coils", MD_RTU, 10, {.function = 0x0F, .count = 1, .data_len = 1}},
+    {"a broadcast coil", MD_RTU, 8, {.function = 5, .data_len = 2}},
     {"a broadcast write", MD_RTU, 8, {.function = 6, .data_len = 2}},
     {"a broadcast loopback", MD_RTU, 0, {.function = 8, .data_len = 2}},
     {"the last address", MD_RTU, 8, {.address = 247, .function = 6, .data_len = 2}},
@@ -342,7 +348,7 @@ static const struct {
     const char *name;
     uint8_t data[4];
     size_t len, at;
-    int wire;
+    int format;
     double value;
 } values[] = {
     {"unsigned", {0xFF, 0xFE}, 2, 0, MD_U16, 65534},
@@ -372,7 +378,7 @@ static void check_values(void)
 {
     for (size_t i = 0; i < COUNT(values); i++) {
         row = values[i].name;
-        double value = md_value(at_the_edge(values[i].data, values[i].len), values[i].len, values[i].at, values[i].wire);
+        double value = md_value(at_the_edge(values[i].data, values[i].len), values[i].len, values[i].at, values[i].format);
         CHECK(isnan(values[i].value) ? isnan(value) : value == values[i].value);
     }
 }

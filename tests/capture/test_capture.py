@@ -16,7 +16,7 @@ from peers import require_program
 
 from multidrop.capture import Capture, CaptureError, CaptureWriter, Decoding, Side
 from multidrop.core import (
-    HEARD_ROOM,
+    STREAM_ROOM,
     FrameSpan,
     Framing,
     Kind,
@@ -354,7 +354,7 @@ def test_a_packet_that_ends_within_its_tags_holds_nothing(tmp_path: Path, tags: 
     assert [span.raw for span in found] == [READ]
 
 
-@pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, HEARD_ROOM // 700 + 1)])
+@pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, STREAM_ROOM // 700 + 1)])
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
 def test_a_capture_may_hold_more_than_is_heard_at_once(
     tmp_path: Path, format: str, content: bytes, count: int

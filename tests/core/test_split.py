@@ -11,7 +11,7 @@ from frames import PRINTED, Printed
 from hypothesis import given
 from hypothesis import strategies as st
 
-from multidrop.core import HEARD_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
+from multidrop.core import STREAM_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
 
 Pair = tuple[Printed, Printed]
 REPLIES = [it for it in PRINTED if it.request is not None and isinstance(it.says, Message)]
@@ -169,7 +169,7 @@ def test_what_cannot_be_a_frame_is_junk_at_once() -> None:
 
 def test_more_than_fits_is_refused() -> None:
     stream = Stream()
-    stream.put(bytes(HEARD_ROOM), 0)
+    stream.put(bytes(STREAM_ROOM), 0)
     with pytest.raises(BufferError, match="split it first"):
         stream.put(b"\0", 1)
 

@@ -76,7 +76,7 @@ static void read_all(struct reader *reader)
             size_t before = stream->len;
             stream->is_all = state != MD_CHANNEL_FULL;
             decode(reader, (int)i);
-            md_forget(stream, &reader->decoders[i].splitter);
+            md_stream_forget(stream, &reader->decoders[i].splitter);
             must(stream->len <= MD_MOST_FRAME && stream->count <= stream->len && (!stream->is_all || stream->len == 0));
             reader->bytes += before - stream->len;
             is_stuck &= stream->len == before;

@@ -107,7 +107,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     struct md_field fields[FIELDS];
     for (int i = 0; i < FIELDS; i++) {
         const uint8_t *from = data + HEADER + FIELD * i;
-        fields[i] = (struct md_field){.at = (uint16_t)(from[0] << 8 | from[1]), .wire = from[2], .reg = (uint16_t)(from[3] << 8 | from[4]),
+        fields[i] = (struct md_field){.at = (uint16_t)(from[0] << 8 | from[1]), .format = from[2], .reg = (uint16_t)(from[3] << 8 | from[4]),
                                       .multiplier = 1, .divisor = 1 + from[5]};
     }
     const uint8_t *bytes = data + HEADER + FIELDS * FIELD;
@@ -117,7 +117,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         for (size_t at = 0; at <= 8 * len + 1; at++)
             must(is_same(md_value(exact, len, at, wire), expected(exact, len, at, wire)));
     for (int i = 0; i < FIELDS; i++)
-        must(isnan(md_value(exact, len, SIZE_MAX - data[6 + i % 2], fields[i].wire)));
+        must(isnan(md_value(exact, len, SIZE_MAX - data[6 + i % 2], fields[i].format)));
     struct md_completion completion = {.result = data[0] & 0x80 ? -(1 + data[0] % 15) : 5, .begun_ns = 7, .sent_ns = data[7],
                                        .first_ns = data[7] + 3, .reply = {.data_len = (uint16_t)len}};
     completion.reply.exception = data[0] & 0x40 ? data[6] : 0;

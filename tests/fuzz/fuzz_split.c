@@ -83,7 +83,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (size_t at = 0; at + HEAD < size; at += HEAD + len) {
         struct md_piece piece = piece_of(data, size, at, &len);
         if (len)
-            must(md_hear(&whole.stream, data + at + HEAD, len, piece));
+            must(md_stream_put(&whole.stream, data + at + HEAD, len, piece));
         total += len;
     }
     whole.stream.is_all = 1;
@@ -91,14 +91,14 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (size_t at = 0; at + HEAD < size; at += HEAD + len) {
         struct md_piece piece = piece_of(data, size, at, &len);
         if (len)
-            must(md_hear(&parts.stream, data + at + HEAD, len, piece));
+            must(md_stream_put(&parts.stream, data + at + HEAD, len, piece));
         parts.stream.is_all = at + HEAD + len + HEAD >= size;
         while (next_frame(&parts, &found, &part_at)) {
             must(next_frame(&whole, &expected, &whole_at));
             must(part_at == whole_at && found.len == expected.len && found.kind == expected.kind);
             must(found.time_ns == expected.time_ns && found.message.start == expected.message.start);
         }
-        md_forget(&parts.stream, &parts.splitter);
+        md_stream_forget(&parts.stream, &parts.splitter);
         must(parts.splitter.at == 0 && parts.stream.len <= MD_MOST_FRAME && parts.stream.count <= parts.stream.len);
     }
     must(!next_frame(&whole, &expected, &whole_at));

@@ -19,11 +19,19 @@ from multidrop.core.frame import (
 )
 from multidrop.core.latch import Latch, Permit
 from multidrop.core.port import Echo, Port, now_ns, utc_minus_monotonic_ns
-from multidrop.core.port_settings import REFUSALS, get_settings, set_settings
+from multidrop.core.port_settings import (
+    REFUSALS,
+    CharacterFormat,
+    get_settings,
+    is_pseudo_terminal,
+    must_take,
+    refused_names,
+    set_settings,
+)
 from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Failure, FrameFault, Status
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.sniffer import (
-    HEARD_ROOM,
+    STREAM_ROOM,
     Decoded,
     Decoder,
     FrameSpan,
@@ -40,10 +48,11 @@ __all__ = [
     "COLUMNS",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
-    "HEARD_ROOM",
     "REFUSALS",
     "STATUSES",
+    "STREAM_ROOM",
     "UNASKED",
+    "CharacterFormat",
     "Columns",
     "Completion",
     "Counters",
@@ -80,11 +89,14 @@ __all__ = [
     "crc16",
     "delay_edge",
     "get_settings",
+    "is_pseudo_terminal",
     "lrc",
+    "must_take",
     "now_ns",
     "parse_reply",
     "parse_request",
     "raw_value",
+    "refused_names",
     "reply_length",
     "set_settings",
     "spell",

@@ -1,4 +1,4 @@
-"""What replies hold, as columns of numbers in the core's own memory."""
+"""Columns of numbers in the core's own memory, made of replies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from multidrop._core import ffi, lib
 
 
 class NumberFormat(IntEnum):
-    """How a number lies in a reply's data; words are big-endian, SWAPPED has the low word first."""
+    """The format of a number in a reply's data; words are big-endian, SWAPPED has the low word first."""
 
     U16 = lib.MD_U16
     I16 = lib.MD_I16
@@ -27,13 +27,13 @@ class NumberFormat(IntEnum):
     BIT = lib.MD_BIT
 
 
-def raw_value(data: bytes, at: int, wire: NumberFormat) -> float:
-    """The number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it."""
-    return float(lib.md_value(data, len(data), at, wire))
+def raw_value(data: bytes, at: int, number_format: NumberFormat) -> float:
+    """Read the number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it."""
+    return float(lib.md_value(data, len(data), at, number_format))
 
 
 class Field(NamedTuple):
-    """Where a register lies in a block's reply, its scale, and the code of its name."""
+    """A register's place in a block's reply, its scale, and the code of its name."""
 
     at: int
     number_format: NumberFormat
@@ -44,12 +44,12 @@ class Field(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def _shared(fields: tuple[Field, ...]) -> Any:
-    """One array for all drives of a kind: the core goes through it faster than through many."""
+    """Return one array for all drives of a kind: it stays in the processor's cache."""
     return ffi.new("struct md_field[]", fields)
 
 
 class RowLayout:
-    """What one exchange's reply holds: fields of a drive, given by the code of its name (struct md_block)."""
+    """The fields of one exchange's reply, of a drive given by the code of its name (struct md_block)."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
         self._fields = _shared(tuple(fields))
@@ -90,7 +90,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """What the core made, until nobody looks at it any more."""
+        """Return columns that the core made, and give them back when nobody looks at them any more."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -104,16 +104,16 @@ class Columns:
         return int(self.c.rows)
 
     def _at(self, name: str) -> int:
-        """How far behind the struct a column begins."""
+        """Return the offset of a column from the struct."""
         return int(ffi.cast("uint8_t *", getattr(self.c, name)) - ffi.cast("uint8_t *", self.c))
 
     @cached_property
     def _memory(self) -> memoryview[Any]:
-        """One piece, which is there for as long as any view of it."""
+        """The struct and all columns: one piece, which lives as long as any view of it."""
         return memoryview(ffi.buffer(self.c, self._at("valid") + (self.c.room + 7) // 8))
 
     def array(self, name: str) -> memoryview[Any]:
-        """A column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
+        """Return a column's numbers, without a copy; `valid` is a bitmap, least significant bit first."""
         rows, at = len(self), self._at(name)
         if name == "valid":
             return self._memory[at : at + (rows + 7) // 8]
@@ -127,11 +127,11 @@ class Spelling(NamedTuple):
     names: int
     longest: int
     text: bytes
-    ends: Any  # int32_t[]: where each begins, and the last ends
+    ends: Any  # int32_t[]: the beginning of each, and the end of the last
 
 
 class Names:
-    """Names, of which columns hold the numbers. They only become more: a number's name never changes."""
+    """Names, whose numbers columns hold. They only become more: a number's name never changes."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)
@@ -139,7 +139,7 @@ class Names:
         self._spelling = self._spell()
 
     def number(self, name: str) -> int:
-        """The name's own, or else the next one."""
+        """Return the name's number; a new name gets the next one."""
         found = self._numbers.setdefault(name, len(self._names))
         if found == len(self._names):
             self._names.append(name)
@@ -165,7 +165,10 @@ class Names:
 
 
 def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memoryview[Any]]:
-    """Offsets (int32) and text of an Arrow utf8 column that has the name of each of the codes."""
+    """Return offsets (int32) and text of an Arrow utf8 column with the name of each code.
+
+    ValueError for a code without a name.
+    """
     known = names.spelling
     rows = len(codes)
     room = rows * known.longest

@@ -1,4 +1,4 @@
-"""What became of a drive's exchanges, as the core counts it."""
+"""Counters of a drive's exchanges, as the core keeps them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multidrop.core.result import Status
 
 
 class Counters(NamedTuple):
-    """What became of exchanges, by number (struct md_counters); all of them only grow."""
+    """Counters of exchanges (struct md_counters); all but longest_ns and timeout_ns only grow."""
 
     exchanges: int = 0
     answered: int = 0
@@ -34,12 +34,12 @@ DELAY_BUCKETS: int = lib.MD_DELAY_BUCKETS
 
 
 def delay_edge(bucket: int) -> int:
-    """The least response delay of a bucket, in ns; the next bucket's is where it ends."""
+    """Return the least response delay of a bucket, in ns; it ends where the next one begins."""
     return int(lib.md_delay_edge(bucket))
 
 
 def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
-    """Return what a struct md_drive counted, with its time-out and the values that were not asked for."""
+    """Read what a struct md_drive counted; `unasked` are values that were due and not asked for."""
     c, history = drive.counters, drive.history
     return Counters(
         c.exchanges,
@@ -66,6 +66,6 @@ def _by_status(array: Any) -> Counter[Status]:
 
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
-    """The numbers that are not 0."""
+    """Return the numbers that are not 0, by their index."""
     numbers = memoryview(ffi.buffer(array)).cast(kind)
-    return Counter({at: number for at, number in enumerate(numbers) if number})
+    return Counter({index: number for index, number in enumerate(numbers) if number})

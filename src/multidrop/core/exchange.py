@@ -1,4 +1,4 @@
-"""An exchange: who is asked what, what is known of how they answer, and what became of it."""
+"""An exchange: the peer, the request, and what became of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_PROOFS: int = lib.MD_MOST_PROOFS
 
 
 class Peer:
-    """What is known of a drive as one who answers (struct md_drive): shared by all its exchanges.
+    """The knowledge of one drive's replies (struct md_drive), shared by all its exchanges.
 
     `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
     bit to the reply's first; between them it is learnt from the drive's own response delays.
@@ -36,16 +36,16 @@ class Peer:
             },
         )
         self.proofs: tuple[Exchange, ...] = ()
-        self.unasked: Counter[Status] = Counter()  # values that its client did not ask for, by reason
+        self.unasked: Counter[Status] = Counter()  # values that were due and not asked for
 
     @property
     def exchanges(self) -> int:
-        """How many there were."""
+        """Exchanges so far."""
         return int(self.c.counters.exchanges)
 
     @property
     def has_answered(self) -> bool:
-        """Whether a reply of it was ever good, a refusal included."""
+        """True once a reply was good; an exception is."""
         return bool(self.c.counters.answered)
 
     @property
@@ -55,23 +55,23 @@ class Peer:
 
     @property
     def late(self) -> int:
-        """Answers that came after their time-out and were known for what they were."""
+        """Replies that came after their time-out and were recognised."""
         return int(self.c.counters.late)
 
     @property
     def late_until_ns(self) -> int:
-        """So long the answer to an earlier request may still come."""
+        """The time until which the reply to an earlier request may still come."""
         return int(self.c.late_until_ns)
 
     def inherit(self, before: Peer) -> None:
-        """Take the place of another at its address, whose answers may still come."""
+        """Take the place of another at its address, whose replies may still come."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Ask one of these, at most MOST_PROOFS, first where a late answer could be taken for a reply.
+        """Send one of these, at most MOST_PROOFS, first where a late reply could be taken for another.
 
-        No reply to one of them may pass for the reply to another. Once only, and before it is asked anything:
-        the core looks at them from then on.
+        No reply to one of them may pass for the reply to another. Call it once, before the first exchange:
+        the core reads them from then on.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
@@ -79,34 +79,33 @@ class Peer:
 
     @property
     def timeout(self) -> float:
-        """In s, how long a reply is waited for at present."""
+        """The present time-out, in s."""
         return float(lib.md_present_timeout_ns(self.c)) / 1e9
 
     @property
     def response_delay(self) -> float:
-        """In s, smoothed; 0 before the first reply."""
+        """The smoothed response delay, in s; 0 before the first reply."""
         return float(self.c.delay_ns) / 1e9
 
     @property
     def vain_ns(self) -> int:
-        """How long its next answer is waited for, if it stays silent."""
+        """The time-out of its next read, if it stays silent."""
         return int(lib.md_vain_ns(self.c))
 
     def counters(self) -> Counters:
-        """What became of its exchanges so far, and of values that were due and not asked for."""
+        """Count its exchanges so far, and values that were due and not asked for."""
         return read_counters(self.c, int(lib.md_present_timeout_ns(self.c)), self.unasked)
 
 
 class Exchange:
-    """One request and all that is needed to carry it out; made once, run as often as wanted.
+    """One request with all that is needed to carry it out; made once, run as often as wanted.
 
     Times are in seconds: `character` of one character, `silence` before the request and after
     its reply, `turnaround` after a broadcast, `period` between its slots in a queue, if it has any.
-    `insists`: not to wait for an earlier answer, which may then pass for its own. `timeout`: at least so
-    long its reply is waited for; 0 as learnt. `answer`: the one register of its reply lies between these.
-    `block` is what rows are made of. `echo_probe` goes first while it is unknown whether the adapter echoes:
-    unlike this one's, its reply is never a copy of its request. `permit` keeps it from being
-    sent once a stop was called.
+    One that `insists` is sent even where a late reply may pass for its own. `timeout` is the least
+    time-out; 0: as learnt. The one register of its reply lies between the two of `answer`. `block` has
+    the fields for rows. `echo_probe` is sent first while it is unknown whether the adapter echoes: its
+    reply is never a copy of its request. Once a stop was called, `permit` keeps the request from being sent.
     """
 
     __slots__ = ("block", "c", "echo_probe", "framing", "peer", "permit", "request", "settings")
@@ -167,7 +166,7 @@ class Exchange:
 
 @dataclass(frozen=True)
 class Completion:
-    """What became of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
+    """The result of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
 
     result: int
     error: int
@@ -182,7 +181,7 @@ class Completion:
 
 
 def completion(found: Any) -> Completion:
-    """What the core's memory says."""
+    """Copy a struct md_completion."""
     return Completion(
         found.result,
         found.error,

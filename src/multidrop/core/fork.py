@@ -1,6 +1,6 @@
 """Forks: a child made by fork() inherits all objects of its parent, but none of the threads behind them.
 
-There a lock that another thread held is held for ever, and what a thread was to answer never comes.
+In the child a lock that another thread held is held for ever, and what a thread was to answer never comes.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ from typing import Protocol
 from weakref import WeakSet
 
 
-class Heirloom(Protocol):
+class Inherited(Protocol):
     def forked(self) -> None:
         """In the child: leave to the parent what is the parent's, and wait for nobody."""
 
 
-_heirlooms: WeakSet[Heirloom] = WeakSet()
+_registered: WeakSet[Inherited] = WeakSet()
 
 
-def register_at_fork(it: Heirloom) -> None:
-    """Call its `forked` in every child, as long as it is there."""
-    _heirlooms.add(it)
+def register_at_fork(inherited: Inherited) -> None:
+    """Call its `forked` in every child, as long as it lives."""
+    _registered.add(inherited)
 
 
-def _tell() -> None:
-    for it in list(_heirlooms):  # none of them goes before all were told
-        it.forked()
+def _call_all() -> None:
+    for inherited in list(_registered):  # the list keeps all of them until the last one was called
+        inherited.forked()
 
 
-os.register_at_fork(after_in_child=_tell)
+os.register_at_fork(after_in_child=_call_all)
 
 
 def only_here(act: Callable[..., object]) -> Callable[..., None]:
-    """The same in this process; nothing in its children."""
+    """Return a function that does the same in this process, and nothing in its children."""
     here = os.getpid()
 
     def act_here(*details: object) -> None:

@@ -1,4 +1,4 @@
-"""Frames: their meaning as bytes in three framings, and back."""
+"""Frames in three framings: built and parsed."""
 
 from __future__ import annotations
 
@@ -75,29 +75,32 @@ def _build(build: Any, framing: Framing, message: Message) -> bytes:
 
 
 def build_request(framing: Framing, message: Message) -> bytes:
-    """The frame of a request; ValueError when a field is out of bounds."""
+    """Build a request; ValueError when a field is out of bounds."""
     return _build(lib.md_build_request, framing, message)
 
 
 def build_reply(framing: Framing, message: Message) -> bytes:
-    """The frame of a reply, for the drive's side; ValueError when a field is out of bounds."""
+    """Build a reply, as the drive; ValueError when a field is out of bounds."""
     return _build(lib.md_build_reply, framing, message)
 
 
 def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | None]:
-    """The request at the beginning of `received`: bytes consumed, 0 or a Result, and its meaning."""
+    """Parse the request at the beginning of `received`.
+
+    Returns the bytes consumed and the message, or a FrameFault and None.
+    """
     found = ffi.new("struct md_message *")
     used = lib.md_parse_request(framing, received, len(received), found)
     return used, from_c(found) if used > 0 else None
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """The reply to `request` at the beginning of `received`: as parse_request."""
+    """Parse the reply to `request`, as parse_request does."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None
 
 
 def reply_length(framing: Framing, request: Message) -> int:
-    """Length in bytes of the good reply to `request`; 0 after a broadcast."""
+    """Return the length in bytes of the good reply to `request`; 0 after a broadcast."""
     return int(lib.md_reply_length(framing, to_c(request)))

@@ -1,4 +1,4 @@
-"""Latch: what a stop raises, so that nothing that was begun before it is sent after it."""
+"""Latch: raised by a stop, so that no write that was begun before it is sent after it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from multidrop._core import ffi, lib
 
 
 class Latch:
-    """Counts the stops of one drive; the core compares the count right before a request begins to leave.
+    """The stops of one drive, counted; the core compares the count right before a request begins to leave.
 
     `rise` takes no lock: a signal handler may call it.
     """
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # it rose last
+        self.why = ""  # of the last rise
         self._is_shut = False
         self._holds = 0  # stops under way
         self._lock = threading.Lock()
@@ -47,9 +47,9 @@ class Latch:
                 self._holds -= 1
 
     def permit(self) -> Permit:
-        """Return what is good until the latch rises; while a stop is under way it never is."""
+        """Return a permit that is good until the latch rises; while a stop is under way it never is."""
         seen = int(self.c[0])
-        if self._is_shut or self._holds:  # looked at afterwards: who rises then ends this permit
+        if self._is_shut or self._holds:  # read after `seen`: a rise between the two ends this permit
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
 

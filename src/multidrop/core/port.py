@@ -1,4 +1,4 @@
-"""Lines driven on descriptors by the core's own thread: exchanges are queued, or repeated."""
+"""Ports: lines that the core's own thread drives on descriptors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """Whether an adapter repeats to the client what it sends; `AUTO`: that is learnt."""
+    """An adapter's echo: it repeats to the client what it sends; `AUTO`: that is learnt."""
 
     AUTO = "auto"
     ON = "on"
@@ -44,7 +44,7 @@ class _Engine:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """In the child the next port that is opened starts another."""
+        """Start another one, in the child, with the next port that is opened."""
         _engine.cache_clear()
 
 
@@ -70,60 +70,63 @@ class Port:
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self.room = room
-        # Read in place: a call of the core would let go of the interpreter, and wait to have it back.
+        # Read in place: a call of the core would release the GIL, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
-        self._free = finalize(self, _let_go, self.c)  # before that at which the core still looks
-        self._free.atexit = False  # others may still use it then
-        self._kept: set[Exchange | Peer] = set()  # at which the core may still look
+        self._free = finalize(self, _let_go, self.c)  # before what the core still reads is freed
+        self._free.atexit = False  # others may still use the port at exit
+        self._kept: set[Exchange | Peer] = set()  # the core may still read them
         self._submitted: deque[Exchange] = deque(maxlen=room)  # at most so many are pending
         self._row_queue: RowQueue | None = None
         self._round: object = None
         register_at_fork(self)
 
     def forked(self) -> None:
-        """In the child it is closed, without a word to the engine, which is not there to answer."""
+        """Close it, in the child, without a word to the engine, whose thread is the parent's."""
         self._free.detach()
         self.close()
 
     def tap(self, tap: Tap) -> None:
-        """Tell this tap, and no other any more, of all that goes over the line."""
+        """Put all that goes over the line into this tap, and into no other any more."""
         lib.md_port_tap(self.c, tap.c)
         self._tap = tap
 
     def tell_echo(self, echo: Echo) -> None:
-        """Whether its adapter echoes."""
+        """Say whether its adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Have one take the place of another, which may be on the line."""
+        """Have a peer take the place of another, which may be on the line."""
         self._kept.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
     def end(self) -> bool:
-        """Nothing more of the queue is begun; whether one of it is under way. Urgent exchanges still are."""
+        """Begin nothing more of the queue; return True while one of it is under way.
+
+        Urgent exchanges are still carried out.
+        """
         return bool(lib.md_port_end(self.c))
 
     def stop(self) -> None:
-        """Nothing more is carried out, and the descriptor is the caller's."""
+        """Carry out nothing more, and give the descriptor back."""
         if self._free.alive:
             lib.md_port_stop(self.c)
 
     def close(self) -> None:
-        """Stop, and let go of its memory."""
+        """Stop, and free its memory."""
         self._free()
         self.c = self._progress = None
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
-        """Whose rows are what becomes of exchanges, and who is called when the port is to be looked at:
+        """Deliver rows to `row_queue`, and call it with `number` when the port needs attention.
 
-        when little is queued, when the port was lost or repeats nothing any more, and when a drive
+        That is when little is queued, when the port was lost or repeats nothing any more, and when a drive
         refuses, fails to answer, or answers again.
         """
         self._row_queue = row_queue
         lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        """Carry these out again and again while nothing that is queued is due, until they are replaced.
+        """Carry these out in turn while nothing that is queued is due, until they are replaced.
 
         Returns which of those that are replaced would have been next.
         """
@@ -135,31 +138,31 @@ class Port:
 
     @property
     def repeating(self) -> bool:
-        """It does so; it does not any more when the port was lost, or an exchange could not be sent."""
+        """True while it repeats: until the port is lost, or an exchange could not be sent."""
         return bool(self._progress.repeating)
 
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
-        """Queue exchanges, none to be sent before its time; how many there was room for."""
+        """Queue exchanges, none to be sent before its time; return how many there was room for."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
         taken = int(lib.md_port_submit(self.c, todo, times, len(exchanges)))
         self._submitted.extend(exchanges[:taken])
-        self._kept.update(exchange.peer for exchange in exchanges)  # for when a late answer comes
+        self._kept.update(exchange.peer for exchange in exchanges)  # a late reply may come
         return taken
 
     @property
     def done(self) -> int:
-        """How many queued exchanges were carried out; it wraps around at 2^32."""
+        """Queued exchanges that were carried out; it wraps around at 2^32."""
         return int(self._progress.done)
 
     @property
     def lost(self) -> bool:
-        """The descriptor failed, and nothing more is carried out on it."""
+        """True once the descriptor failed: nothing more is carried out on it."""
         return bool(self._progress.lost)
 
     @property
     def has_echo(self) -> bool:
-        """Its adapter is known to repeat what it sends, and a reply that is a copy is told from that."""
+        """True once its adapter is known to echo: then no echo is taken for a reply."""
         return int(self._progress.echo) == int(lib.MD_ECHO)
 
     @property
@@ -168,8 +171,11 @@ class Port:
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
-        """Carry one out ahead of the queue and wait for it; after `expires_ns` it is not sent."""
-        self._kept.add(exchange.peer)  # for when a late answer comes
+        """Carry one out ahead of the queue and wait for it.
+
+        After `expires_ns` (0: never), or after a stop, it is not sent.
+        """
+        self._kept.add(exchange.peer)  # a late reply may come
         found = ffi.new("struct md_completion *")
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
         return completion(found)

@@ -1,6 +1,8 @@
-"""A port's baud rate and format, set and read back."""
+"""A port's baud rate and format: parsed, set and read back."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 from multidrop._core import ffi, lib
 
@@ -12,8 +14,36 @@ REFUSALS = {
 }
 
 
+class CharacterFormat(NamedTuple):
+    """The bits of a character."""
+
+    databits: int
+    parity: str
+    stopbits: int
+
+    @classmethod
+    def parse(cls, text: str) -> CharacterFormat:
+        """Parse a format such as "8N1"."""
+        return cls(int(text[0]), text[1], int(text[2]))
+
+
+def is_pseudo_terminal(device: str) -> bool:
+    """Tell a pseudo-terminal by the path of its device."""
+    return device.startswith(("/dev/pts/", "/dev/ttys"))
+
+
+def must_take(device: str) -> int:
+    """Return the mask of REFUSALS that are failures: a pseudo-terminal stays at 8N whatever it is told."""
+    return int(lib.MD_REFUSED_BAUDRATE) if is_pseudo_terminal(device) else sum(REFUSALS)
+
+
+def refused_names(mask: int) -> str:
+    """Name the refused settings."""
+    return ", ".join(name for bit, name in REFUSALS.items() if mask & bit)
+
+
 def get_settings(fd: int) -> tuple[int, str]:
-    """Baud rate and format in force on a port; OSError where it has none."""
+    """Return baud rate and format in force on a port; OSError where it has none."""
     settings = ffi.new("struct md_settings *")
     failure = lib.md_port_get(fd, settings)
     if failure:
@@ -22,7 +52,7 @@ def get_settings(fd: int) -> tuple[int, str]:
 
 
 def set_settings(fd: int, baudrate: int, format: str) -> int:
-    """Make a port raw with these settings; the mask of what it did not take. OSError where it has none."""
+    """Make a port raw with these settings; return the mask of REFUSALS. OSError where it has none."""
     refused = lib.md_port_set(fd, ffi.new("struct md_settings *", settings_to_c(baudrate, format)))
     if refused < 0:
         raise OSError(-refused, "no serial settings")
@@ -30,9 +60,6 @@ def set_settings(fd: int, baudrate: int, format: str) -> int:
 
 
 def settings_to_c(baudrate: int, format: str) -> dict[str, object]:
-    return {
-        "baudrate": baudrate,
-        "databits": int(format[0]),
-        "parity": format[1].encode(),
-        "stopbits": int(format[2]),
-    }
+    """Return the fields of a struct md_settings."""
+    bits = CharacterFormat.parse(format)
+    return {"baudrate": baudrate, **bits._asdict(), "parity": bits.parity.encode()}

@@ -1,4 +1,4 @@
-"""Why there is no frame, no reply, no value: as numbers, and in words."""
+"""Reasons why there is no frame, no reply, no value: as numbers, and in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from multidrop._core import lib
 
 
 class FrameFault(IntEnum):
-    """Why bytes are no frame (enum md_frame_fault)."""
+    """Reasons why bytes are no frame (enum md_frame_fault)."""
 
     INCOMPLETE = lib.MD_INCOMPLETE
     NO_START = lib.MD_NO_START
@@ -22,7 +22,7 @@ class FrameFault(IntEnum):
 
 
 class Failure(IntEnum):
-    """Why an exchange has no reply; a FrameFault where something came in its place (enum md_failure)."""
+    """Reasons why an exchange has no reply, beside those of FrameFault (enum md_failure)."""
 
     CUT_SHORT = lib.MD_CUT_SHORT
     NO_REPLY = lib.MD_NO_REPLY

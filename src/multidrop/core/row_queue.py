@@ -1,4 +1,4 @@
-"""What the core's thread leaves for a client: rows of what was carried out, and calls to look at a port."""
+"""Rows and calls from the core's thread to a client."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from multidrop.core.columns import Columns, RowLayout
 from multidrop.core.fork import only_here, register_at_fork
 from multidrop.core.result import Status
 
-CHUNK_ROWS = 1 << 12  # of columns that are taken
-MOST_CHUNKS = 256  # that wait to be taken; further rows are dropped, and counted
+CHUNK_ROWS = 1 << 12
+MOST_CHUNKS = 256  # waiting to be taken; further rows are dropped, and counted
 
 
 class RowQueue:
@@ -32,11 +32,11 @@ class RowQueue:
         self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
 
     def forked(self) -> None:
-        """In the child it is empty: what waits is the parent's to take."""
+        """Be empty, in the child: the rows that wait are the parent's to take."""
         self._begin()
 
     def take(self) -> Columns | None:
-        """The oldest rows that wait; None when there are none."""
+        """Return the oldest rows that wait; None when there are none."""
         made = lib.md_row_queue_take(self.c)
         return None if made == ffi.NULL else Columns.lent(made, self._give_back)
 
@@ -46,7 +46,7 @@ class RowQueue:
 
     @property
     def chunks(self) -> int:
-        """How many columns there are to take; the newest are still being filled."""
+        """Columns that wait to be taken; the newest are still being filled."""
         return int(lib.md_row_queue_chunks(self.c))
 
     @property
@@ -55,10 +55,10 @@ class RowQueue:
         return int(lib.md_row_queue_dropped(self.c))
 
     def call(self, number: int) -> None:
-        """Wake whoever waits, as if the port of this number was to be looked at."""
+        """Wake whoever waits, as if the port of this number needed attention."""
         lib.md_row_queue_call(self.c, number)
 
     def await_calls(self, seconds: float) -> list[int]:
-        """Wait for a call, no longer than that; the numbers of the ports that are to be looked at."""
+        """Wait for calls, at most so long; return the numbers of the ports that need attention."""
         count = lib.md_row_queue_await(self.c, round(seconds * 1e9), self._called, self._MOST_AT_ONCE)
         return ffi.unpack(self._called, count) if count else []

@@ -1,4 +1,4 @@
-"""What was sniffed on a line or lies in a capture: cut into frames, and made rows of."""
+"""Bytes that were sniffed on a line or lie in a capture: cut into frames, and decoded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.core.frame import Framing, Message, from_c
 
 
 class Side(IntEnum):
-    """Who sent what was sniffed, where that is known (enum md_side)."""
+    """The sender of sniffed bytes, where it is known (enum md_side)."""
 
     EITHER = lib.MD_EITHER_SIDE
     ASKING = lib.MD_ASKING
@@ -22,13 +22,13 @@ class Side(IntEnum):
 
 
 class Kind(IntEnum):
-    """What a span of sniffed bytes is (enum md_kind)."""
+    """The kind of a span of sniffed bytes (enum md_kind)."""
 
     JUNK = lib.MD_JUNK
     REQUEST = lib.MD_REQUEST
     EITHER = lib.MD_EITHER  # a request, or its copy that confirms it
     REPLY = lib.MD_REPLY
-    STRAY = lib.MD_STRAY  # a reply whose request was not heard
+    STRAY = lib.MD_STRAY  # a reply without its request
 
 
 class FrameSpan(NamedTuple):
@@ -41,7 +41,7 @@ class FrameSpan(NamedTuple):
     raw: bytes
 
 
-HEARD_ROOM = 1 << 20
+STREAM_ROOM = 1 << 20
 _MOST_PIECES = 1 << 15
 
 
@@ -50,42 +50,42 @@ class Stream:
 
     def __init__(self, place: Any = None) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
-        self._bytes = ffi.new("uint8_t[]", HEARD_ROOM)
+        self._bytes = ffi.new("uint8_t[]", STREAM_ROOM)
         self._pieces = ffi.new("struct md_piece[]", _MOST_PIECES)
-        self.c.bytes, self.c.room = self._bytes, HEARD_ROOM
+        self.c.bytes, self.c.room = self._bytes, STREAM_ROOM
         self.c.pieces, self.c.most = self._pieces, _MOST_PIECES
 
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
     ) -> None:
-        """Append what came at this time; after a pause it is a hint where frames begin."""
+        """Append bytes that came at this time; a pause before them hints where frames begin."""
         piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
-        if not lib.md_hear(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
+        if not lib.md_stream_put(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
             raise BufferError("more was heard than fits: split it first")
 
     def end(self, is_end: bool) -> None:
-        """Whether nothing more is to be waited for, as when the line has long been silent."""
+        """Say whether nothing more will come, as when the line has long been silent."""
         self.c.is_all = is_end
 
 
 class Splitter:
-    """Cuts what was heard into spans (struct md_splitter)."""
+    """Cuts a stream into spans (struct md_splitter)."""
 
     def __init__(self) -> None:
         self._c = ffi.new("struct md_splitter *")
         self._span = ffi.new("struct md_span *")
 
     def spans(self, stream: Stream) -> Iterator[FrameSpan]:
-        """All that is understood so far; then it is forgotten. Every byte is part of one span."""
+        """Yield all spans that are complete, and forget them. Every byte is part of one."""
         span = self._span
         while lib.md_split(self._c, stream.c, span):
             raw = bytes(ffi.buffer(stream.c.bytes + span.at, span.len))
             yield FrameSpan(Kind(span.kind), Framing(span.framing), span.time_ns, from_c(span.message), raw)
-        lib.md_forget(stream.c, self._c)
+        lib.md_stream_forget(stream.c, self._c)
 
 
 class Decoder:
-    """Makes rows of the exchanges that were heard on one line (struct md_decoder)."""
+    """Makes rows of the exchanges that were sniffed on one line (struct md_decoder)."""
 
     _PLACES = 1 << 14
 
@@ -94,7 +94,7 @@ class Decoder:
         self.forget()
 
     def forget(self) -> None:
-        """Know no request any more."""
+        """Forget all requests."""
         self._known = ffi.new("struct md_known[]", self._PLACES)
         self._blocks: list[RowLayout] = []
         self._c.known, self._c.places, self._c.taken = self._known, self._PLACES, 0
@@ -102,25 +102,25 @@ class Decoder:
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """The request of which it is to be said what its reply holds."""
+        """The request whose fields are to be told by know()."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """What the reply to `asked` holds, None: no rows; False when it knows too much already."""
+        """Tell the fields of the reply to `asked`, None: no rows; return False where the table is full."""
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL
         return bool(lib.md_know(self._c, self._c.span.framing, ffi.addressof(self._c.span, "message"), c))
 
     def decode(self, stream: Stream, columns: Columns) -> Decoded:
-        """Make rows, and forget what they were made of."""
+        """Make rows of the stream, and forget it."""
         done = Decoded(lib.md_decode(self._c, stream.c, columns.c))
         if done is Decoded.ALL:
-            lib.md_forget(stream.c, ffi.addressof(self._c, "splitter"))
+            lib.md_stream_forget(stream.c, ffi.addressof(self._c, "splitter"))
         return done
 
     def counts(self) -> dict[str, int]:
-        """So far: frames, exchanges, replies without a request, bytes that are part of no frame."""
+        """Count frames, exchanges, replies without a request, and bytes that are part of no frame."""
         c = self._c
         return {"frames": c.frames, "exchanges": c.exchanges, "strays": c.strays, "unknown_bytes": c.junk}
 
@@ -140,7 +140,7 @@ class Unpacked(IntEnum):
 
 
 class Unpacker:
-    """Takes packets out of a capture file's bytes (struct md_capture); `at` is how far in the file it is."""
+    """Takes packets out of a capture file's bytes (struct md_capture); `at` is its position in the file."""
 
     MOST_CHANNELS = 64
 
@@ -167,7 +167,7 @@ class Unpacker:
         self._c.at = at - self._begin
 
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
-        """The next interface of the file: its link type, whose sent what, and its clock."""
+        """Add the next interface of the file; `has_sides`: its packets tell their senders."""
         channel = self._channels[self._c.count]
         channel.link, channel.has_sides = link, has_sides
         channel.ticks_per_s, channel.offset_ns = ticks_per_s, offset_ns
@@ -175,5 +175,5 @@ class Unpacker:
         self._c.count += 1
 
     def unpack(self) -> Unpacked:
-        """Append packets to what was heard on their channels, until something is to be done."""
+        """Append packets to their channels' streams, until there is something to do."""
         return Unpacked(lib.md_unpack(self._c))

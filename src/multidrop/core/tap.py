@@ -1,4 +1,4 @@
-"""What goes over a line, tapped while it is driven, and taken as packets of a pcapng file."""
+"""A tap: all that goes over a line, taken as packets of a pcapng file."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from multidrop._core import ffi, lib
 from multidrop.core.sniffer import Side
 
-_RING = 1 << 18  # bytes: what a fast line says in some seconds
+_RING = 1 << 18  # bytes: some seconds of a fast line
 _TAKEN = 1 << 16  # bytes of packets at a time
 
 
 class Wrappings:
-    """What stands before and behind a packet's bytes, by side and whether they begin with ':'."""
+    """Headers and trailers of packets, by side, and apart for bytes that begin with ':'."""
 
     def __init__(self, wrappings: Mapping[tuple[Side, bool], tuple[bytes, bytes]]) -> None:
         self._kept: list[Any] = []
@@ -28,7 +28,7 @@ class Wrappings:
         return self._kept[-1]
 
     def packet(self, interface: int, side: Side, time_ns: int, raw: bytes) -> bytes:
-        """One packet with these bytes."""
+        """Return one packet with these bytes."""
         length = lib.md_packet_length(self.c, side, raw[0] if raw else 0, len(raw))
         out = ffi.new("uint8_t[]", length)
         lib.md_put_packet(self.c, interface, side, time_ns, raw, len(raw), out)
@@ -45,11 +45,11 @@ class Tap:
 
     @property
     def lost(self) -> int:
-        """Bytes for which there was no room, because nobody took the others in time."""
+        """Bytes without room, because nobody took the others in time."""
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
-        """All there is, as packets of this interface, many at a time."""
+        """Yield all bytes as packets of this interface, many at a time."""
         if self.c.put == self.c.taken:
             return
         out = self._out = self._out or ffi.new("uint8_t[]", _TAKEN)
