@@ -1,7 +1,7 @@
-/* What became of a drive's exchanges, counted: a few additions for each, in memory that does not grow.
+/* What became of a drive's exchanges, counted in memory that does not grow.
  *
- * Numbers only rise, and nobody else writes them: whoever wants those of a span of time takes the
- * difference of two looks. Response delays fall into buckets, PARTS of them to each doubling. */
+ * Numbers only rise, so that a span of time is the difference of two looks. Response delays fall into
+ * buckets, PARTS of them to each doubling. */
 #include "internal.h"
 
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
@@ -26,33 +26,36 @@ int64_t md_delay_edge(int bucket)
     return (int64_t)(PARTS + bucket % PARTS) << (FIRST_DOUBLING - PART_BITS + bucket / PARTS);
 }
 
-void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange, const struct md_completion *completion)
+void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion)
 {
+    struct md_counters *counters = &exchange->drive->counters;
+    struct md_history *history = exchange->drive->history;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
-        values = 0; /* it is asked again */
+        values = 0; /* they are read again */
     uint8_t exception = completion->reply.exception;
     counters->exchanges++;
     counters->sent += completion->sent_ns != 0;
     counters->stray_bytes += completion->stale + completion->skipped;
-    if (completion->result <= 0)
-        counters->ended[-completion->result]++;
-    if (completion->result < 0)
-        counters->missed[-completion->result] += values;
-    else if (exception) {
-        counters->exceptions++;
-        counters->naks += exception == NAK;
-        counters->busies += exception == BUSY;
-        counters->refused[exception] += (uint32_t)values;
-    } else
-        counters->values += values;
     counters->answered += completion->result > 0;
+    if (completion->result <= 0)
+        history->ended[-completion->result]++;
+    if (completion->result < 0) {
+        history->missed[-completion->result] += values;
+    } else if (exception) {
+        history->exceptions++;
+        history->naks += exception == NAK;
+        history->busies += exception == BUSY;
+        history->refused[exception] += (uint32_t)values;
+    } else {
+        counters->values += values;
+    }
 }
 
-void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns)
+void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns)
 {
+    struct md_counters *counters = &drive->counters;
     counters->ideal_ns += (uint64_t)ideal_ns;
-    counters->delays[bucket(delay_ns)]++;
-    if (delay_ns > counters->longest_ns)
-        counters->longest_ns = delay_ns;
+    counters->longest_ns = later(counters->longest_ns, delay_ns);
+    drive->history->delays[bucket(delay_ns)]++;
 }

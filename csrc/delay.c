@@ -3,8 +3,9 @@
 
 /* ---- when to look ---- */
 
-/* Early rather than late: that costs a wake-up, this would delay the next request. A look that was learnt to
- * come just when replies are whole saved one sleep of three, and lost the line a 300th: sleeps end late. */
+/* Err on the early side: an early look costs one wake-up, a late one delays the next request. A look that
+ * was learnt to come just when replies are whole saved one sleep of three, and lost the line a 300th:
+ * sleeps end late. */
 int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns)
 {
     return later(0, drive->delay_ns - drive->deviation_ns - character_ns / 2);
@@ -12,7 +13,7 @@ int64_t md_look_ns(const struct md_drive *drive, int64_t character_ns)
 
 /* ---- how long to wait ---- */
 
-/* What the engine's thread learns, and others look at. */
+/* The engine's thread learns it, and others read it meanwhile. */
 static int64_t learnt(const int64_t *ns)
 {
     return __atomic_load_n(ns, __ATOMIC_RELAXED);
@@ -33,10 +34,10 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
     return sooner(usual_ns, drive->most_timeout_ns);
 }
 
-/* After a failure a question has all the time that the document allows: the drive may have become slower.
- * While it stays silent that is rare, because it is time that the other drives lose. What must not wait so
- * long before it is repeated, a stop, has twice the time after each failure but the first, which is a look's;
- * and where answers are known to be late, as long as its sender bears. */
+/* After a failure a request has all the time that the document allows: the drive may have become slower.
+ * While it stays silent that is rare, because the other drives lose that time. A stop must be repeated
+ * sooner: its time doubles after each failure but the first, which is the identity check's; and where
+ * replies are known to be late, it has as long as its sender bears. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -81,7 +82,7 @@ static void smooth(struct md_drive *drive, int64_t delay_ns)
     learn(&drive->delay_ns, later(drive->delay_ns + off_ns / 8, 1));
 }
 
-/* ---- answers that came late ---- */
+/* ---- late replies ---- */
 
 /* No more than the usual time is no patience. */
 static void be_patient(struct md_drive *drive, int64_t patience_ns)
@@ -99,7 +100,8 @@ int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, i
     return delay_ns;
 }
 
-/* Half as long again: delays vary. Of a question that was asked several times nobody knows which is answered. */
+/* Half as long again: delays vary. Of a request that was sent several times nobody knows which is
+ * answered. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
 {
     int64_t patience_ns = sooner(delay_ns + delay_ns / 2, MOST_PATIENCE);

@@ -1,5 +1,6 @@
-/* Adapters that repeat what they send. A reply that is no copy of its request tells whether the adapter does, and
- * so does a copy that is all that comes before a time-out. Until that is known, no copy is taken for the reply. */
+/* Adapters that repeat what they send. A reply that is no copy of its request tells whether the adapter
+ * does, and so does a copy that is all that comes before a time-out. Until that is known, no copy is taken
+ * for the reply. */
 #include "internal.h"
 
 #include <string.h>
@@ -21,8 +22,8 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
-/* A copy that goes before replies shows on this line, and so do two copies. A few stray bytes are no echo, but
- * what is left of one where there is known to be one. */
+/* A copy that goes before replies shows on this line, and so do two copies. A few stray bytes are no echo,
+ * but what is left of one where there is known to be one. */
 void md_echo_learn(struct md_line *line, size_t reply_at)
 {
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;

@@ -1,5 +1,5 @@
-/* The thread that runs every line of the process. It never takes the interpreter lock. A line that is polled as
- * fast as it allows needs nobody but this thread. */
+/* The thread that runs every line of the process. It never takes the interpreter lock. A line that is
+ * polled as fast as it allows needs nobody but this thread. */
 #define _GNU_SOURCE
 #include "engine.h"
 

@@ -85,7 +85,8 @@ void md_line_abandon(struct md_line *line, int result, int error);
 
 /* ---- port_turn.c: whose turn it is on a line; I/O and time come from outside ---- */
 
-enum md_whose { MD_NOBODYS, MD_BEFOREHAND /* proofs, echo probes */, MD_URGENT, MD_QUEUED, MD_REPEATED };
+/* Proofs and echo probes are sent beforehand. */
+enum md_whose { MD_NOBODYS, MD_BEFOREHAND, MD_URGENT, MD_QUEUED, MD_REPEATED };
 
 struct md_slot {
     const struct md_exchange *exchange;
@@ -118,7 +119,7 @@ struct md_turn {
     uint32_t round_len, round_at;
     struct md_slot *slots; /* a ring */
     uint32_t room;         /* a power of two */
-    uint32_t is_idle;      /* somebody waits to hear that there is more in the queue */
+    uint32_t is_idle;      /* the thread waits to be woken when more is queued */
     int64_t owed_ns;       /* of the line, to what is polled beside urgent requests */
     struct md_before before;
     struct md_row_queue *row_queue;
@@ -137,7 +138,7 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
 void md_turn_tell_echo(struct md_turn *turn, int echo);
 int md_turn_end(struct md_turn *turn);
-/* Return what the line wants (enum md_want), MD_DONE where there is nothing to do; not before wake_ns. */
+/* Return what the line wants (enum md_want); MD_DONE: there is nothing to carry out before wake_ns. */
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns);
 void md_turn_lose(struct md_turn *turn, int error); /* the port failed */
 void md_turn_close(struct md_turn *turn);           /* end everything */
@@ -145,10 +146,9 @@ void md_turn_close(struct md_turn *turn);           /* end everything */
 /* ---- counters.c ---- */
 
 /* Count an exchange that is over. */
-void md_counters_end(struct md_counters *counters, const struct md_exchange *exchange,
-                     const struct md_completion *completion);
+void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
 /* Count its reply, which came after this delay and needed so long of the line. */
-void md_counters_answer(struct md_counters *counters, int64_t delay_ns, int64_t ideal_ns);
+void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 
 /* ---- columns.c, row_queue.c ---- */
 
@@ -197,7 +197,8 @@ int64_t md_timeout_ns(const struct md_exchange *exchange);
 /* Learn from a reply's delay (the longest possible, where the reply was whole when first looked at);
  * return what to take for its delay. */
 int64_t md_learn_delay(struct md_drive *drive, int64_t delay_ns, int is_whole, int64_t character_ns);
-/* Learn from a late reply, so long after its request or after the last of several: wait longer from now on. */
+/* Learn from a late reply, so long after its request or after the last of several: wait longer from now
+ * on. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
 /* Learn from a time-out, which takes back half of that. */
 void md_learn_silence(struct md_drive *drive);
@@ -216,9 +217,9 @@ int md_late_is_repeated(const struct md_exchange *exchange);
 void md_late_expect(struct md_line *line, int64_t window_ns);
 /* Replies of this drive may still come to requests on another line, or before the port was lost. */
 void md_late_resume(struct md_line *line, struct md_drive *drive);
-/* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may answer
- * the exchange under way instead, `since_ns` is to have the time at which that was sent first, 0 if it never
- * was; else NULL. */
+/* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may
+ * answer the exchange under way instead, `since_ns` is to have the time at which that was sent first, 0 if
+ * it never was; else NULL. */
 int md_late_take(struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns);
 /* The reply is an exception, or its one register lies between these; `most` 0: anything. */
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most);

@@ -1,18 +1,18 @@
 /* Replies that come after their time-out, and how none of them is taken for another request's.
  *
- * A drive that is a little late may answer in any order: for some time after a time-out, the window, no request
- * leaves that such a reply could be taken for. A path that holds everything up (a modem, a gateway, a stalled
- * network) keeps the order: a reply that no outstanding request could have proves that all earlier ones have come,
- * or never will. So outstanding requests are remembered beyond the window, and a proof is sent first: a request
- * whose reply differs from all outstanding ones in function, length or value.
+ * A drive that is a little late may answer in any order: for some time after a time-out, the window, no
+ * request leaves that such a reply could be taken for. A path that holds everything up (a modem, a gateway, a
+ * stalled network) keeps the order: a reply that no outstanding request could have proves that all earlier
+ * ones have come, or never will. So outstanding requests are remembered beyond the window, and a proof is
+ * sent first: a request whose reply differs from all outstanding ones in function, length or value.
  *
- * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the earliest
- * request that it fits is accounted for, and so is all that was sent before it. */
+ * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the
+ * earliest request that it fits is accounted for, and so is all that was sent before it. */
 #include "internal.h"
 
 #include <string.h>
 
-enum { DATA_KEPT = sizeof((struct md_owed){0}.data), STATE_QUERY = 0x03, PARAMETER_QUERY = 0x07, LAST_READ = 0x04 };
+enum { DATA_KEPT = sizeof((struct md_owed){0}.data), LAST_READ = 0x04 };
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
 
 /* ---- what could be taken for what ---- */
@@ -42,8 +42,8 @@ static int is_same_request(const struct md_owed *owed, const struct md_exchange 
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_same_request(&drive->owed[i], exchange))
-            return &drive->owed[i];
+        if (is_same_request(&drive->history->owed[i], exchange))
+            return &drive->history->owed[i];
     return NULL;
 }
 
@@ -59,11 +59,13 @@ static int may_hold_the_same(const struct md_owed *owed, const struct md_exchang
 
 int md_is_read(int framing, uint8_t function)
 {
-    return framing == MD_DELIXI ? function == STATE_QUERY || function == PARAMETER_QUERY : function <= LAST_READ;
+    if (framing == MD_DELIXI)
+        return function == MD_DELIXI_STATE_QUERY || function == MD_DELIXI_PARAMETER_QUERY;
+    return function <= LAST_READ;
 }
 
-/* A reply to the one could pass for the reply to the other. An exception does not say which write it refuses, and
- * a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
+/* A reply to the one could pass for the reply to the other. An exception does not say which write it
+ * refuses, and a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
 static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -74,7 +76,7 @@ static int is_mistakable(const struct md_owed *owed, const struct md_exchange *e
     if (owed->function != request->function)
         return 0;
     if (exchange->framing == MD_DELIXI)
-        return owed->start == request->start || owed->function == STATE_QUERY;
+        return owed->start == request->start || owed->function == MD_DELIXI_STATE_QUERY;
     return owed->reply_len == md_reply_length(exchange->framing, request) && may_hold_the_same(owed, exchange);
 }
 
@@ -111,13 +113,13 @@ static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 
 static void drop(struct md_drive *drive, struct md_owed *owed)
 {
-    *owed = drive->owed[--drive->owed_count];
+    *owed = drive->history->owed[--drive->owed_count];
 }
 
 static void forget_settled(struct md_drive *drive, int64_t now_ns)
 {
     for (uint32_t i = drive->owed_count; i-- > 0;) {
-        struct md_owed *owed = &drive->owed[i];
+        struct md_owed *owed = &drive->history->owed[i];
         int is_over = now_ns >= drive->late_until_ns && (!is_open(drive, owed) || drive->proof_count == 0);
         if (is_over || now_ns - last_ns(owed) > FORGET_NS)
             drop(drive, owed);
@@ -130,7 +132,7 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     const struct md_drive *drive = exchange->drive;
     int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
-        const struct md_owed *owed = &drive->owed[i];
+        const struct md_owed *owed = &drive->history->owed[i];
         int counts = is_open(drive, owed) && (own || !is_same_request(owed, exchange));
         if (counts && (is_crowded || is_mistakable(owed, exchange)))
             return 1;
@@ -147,7 +149,7 @@ static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
     if (now_ns >= drive->late_until_ns)
         return 0;
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (exchange->framing == MD_DELIXI || drive->owed[i].function == exchange->request.function)
+        if (exchange->framing == MD_DELIXI || drive->history->owed[i].function == exchange->request.function)
             return 1;
     return 0;
 }
@@ -172,8 +174,8 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !is_proof(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence, so that
- * its second reply at the latest settles everything. */
+/* The last proof is kept for a drive that answers again: it is not outstanding from the time of silence,
+ * so that its second reply at the latest settles everything. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
@@ -190,7 +192,7 @@ static int is_sent_alone(const struct md_exchange *exchange)
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_open(drive, &drive->owed[i]) && is_mistakable(&drive->owed[i], proof))
+        if (is_open(drive, &drive->history->owed[i]) && is_mistakable(&drive->history->owed[i], proof))
             return 0;
     return 1;
 }
@@ -237,7 +239,7 @@ static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange
 {
     struct md_owed *owed = find_same(drive, exchange);
     if (!owed && drive->owed_count < MD_MOST_OWED) {
-        owed = &drive->owed[drive->owed_count++];
+        owed = &drive->history->owed[drive->owed_count++];
         *owed = outstanding(exchange);
     }
     return owed;
@@ -269,7 +271,7 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
     if (drive == before || before->owed_count == 0 || is_known)
         return;
     drive->owed_count = before->owed_count;
-    memcpy(drive->owed, before->owed, sizeof drive->owed);
+    memcpy(drive->history->owed, before->history->owed, sizeof drive->history->owed);
     drive->late_until_ns = before->late_until_ns;
     drive->answered_ns = before->answered_ns;
 }
@@ -296,7 +298,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     struct md_owed *earliest = NULL;
     int found = MD_NO_START, length = 0, fits = 0;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
-        struct md_owed *owed = &drive->owed[i];
+        struct md_owed *owed = &drive->history->owed[i];
         int used = parse_owed(owed, line->rx + at, line->rx_len - at);
         if (used == MD_INCOMPLETE)
             found = used;

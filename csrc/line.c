@@ -1,8 +1,8 @@
-/* One line as a state machine: silence, request, reply or time-out. Bytes and time come in as arguments; it knows
- * neither descriptor nor clock.
+/* One line as a state machine: silence, request, reply or time-out. Bytes and time come in as arguments; it
+ * knows neither descriptor nor clock.
  *
- * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a damaged
- * frame end the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
+ * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a
+ * damaged frame end the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
 #include "internal.h"
 
 #include <errno.h>
@@ -69,7 +69,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
 {
     struct md_drive *drive = exchange->drive;
     struct md_block *block = exchange->block;
-    md_counters_end(&drive->counters, exchange, completion);
+    md_counters_end(exchange, completion);
     if (is_failure(completion->result))
         md_count_failures(drive, drive->failures + 1);
     if (completion->result <= 0)

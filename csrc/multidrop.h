@@ -155,17 +155,12 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
 
 /* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */
 struct md_counters {
-    uint64_t exchanges, answered, values; /* counted at every exchange: the first eight share a cache line */
+    uint64_t exchanges, answered, values;
     uint64_t sent;        /* requests that began to leave */
     uint64_t stray_bytes; /* bytes that were no part of a reply */
     uint64_t ideal_ns;    /* the least time on the line that the answered exchanges needed */
     int64_t longest_ns;   /* response delay */
     uint64_t late;        /* replies that came after their time-out */
-    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
-    uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
-    uint64_t missed[MD_STATUSES];      /* values, by status */
-    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
-    uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
 };
 
 /* A request whose replies may still come. */
@@ -176,6 +171,16 @@ struct md_owed {
     uint16_t least, most; /* of the reply, as in md_exchange */
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
+};
+
+/* The same in parts, and requests whose replies may still come. */
+struct md_history {
+    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
+    uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
+    uint64_t missed[MD_STATUSES];      /* values, by status */
+    uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
+    uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
+    struct md_owed owed[MD_MOST_OWED];
 };
 
 /* A drive: the bounds of its time-out are given, the rest is learnt from its exchanges and begins as 0.
@@ -190,8 +195,8 @@ struct md_drive {
     uint32_t owed_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
+    struct md_history *history;     /* apart: an exchange touches fewer pages */
     struct md_counters counters;
-    struct md_owed owed[MD_MOST_OWED];
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */
@@ -204,30 +209,30 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
-/* One request with all that is needed to carry it out; constant while in use. The fields of every exchange
- * come first: with many lines each of them is read from memory. */
+/* One request with all that is needed to carry it out; constant while in use. What every exchange needs comes
+ * first: with many lines each cache line of it is read from memory. */
 struct md_exchange {
     struct md_drive *drive;
     struct md_block *block; /* fields of its reply; NULL: no rows */
     int64_t character_ns;   /* one character on the wire */
     int64_t silence_ns;     /* before the request and after its reply */
-    int64_t turnaround_ns;  /* after a broadcast */
-    int64_t period_ns;      /* between its slots in a queue; 0: it has none */
-    struct md_settings settings;
-    int framing;
-    /* Sent first while it is unknown whether the adapter echoes: its reply is never a copy of its request.
-     * NULL: none. */
-    const struct md_exchange *echo_probe;
-    int insists; /* a stop: sent even where a late reply may pass for its own */
     /* The least time-out, of a write; 0: as learnt. One that insists waits as long as late replies are
      * known to take, but not beyond this. */
     int64_t timeout_ns;
+    /* Sent first while it is unknown whether the adapter echoes: its reply is never a copy of its request.
+     * NULL: none. */
+    const struct md_exchange *echo_probe;
+    struct md_settings settings;
+    int framing;
+    int insists;          /* a stop: sent even where a late reply may pass for its own */
     uint16_t least, most; /* the reply's one register lies between these; most 0: anything */
-    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
-    uint32_t stops_seen;
-    uint8_t frame_len; /* 0: the frame is built when its turn comes */
+    uint8_t frame_len;    /* 0: the frame is built when its turn comes */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
+    int64_t turnaround_ns; /* after a broadcast */
+    int64_t period_ns;     /* between its slots in a queue; 0: it has none */
+    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
+    uint32_t stops_seen;
 };
 
 /* The reason why an exchange has no reply; an enum md_frame_fault where something came in its place. */

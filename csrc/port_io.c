@@ -46,9 +46,9 @@ int64_t md_port_receive(struct md_port *port)
     return now_ns;
 }
 
-/* Write; 1: the port took something, or is lost. The request leaves when it is written; where the thread was held
- * up just then, perhaps afterwards: from too early a time on its reply, and a late one, would be waited for too
- * short. */
+/* Write; 1: the port took something, or is lost. The request leaves when it is written; where the thread
+ * was held up just then, perhaps afterwards: from too early a time on its reply, and a late one, would be
+ * waited for too short. */
 static int send(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
@@ -94,9 +94,9 @@ static int is_sent(const struct md_port *port)
     return port->turn.whose != MD_NOBODYS && port->turn.line.completion->sent_ns;
 }
 
-/* A sleeping processor wakes late, and by much the same time again and again. So the sleep before a request is
- * shortened by what is usual, and the rest is spun away: with few lines some 20 us of each exchange. A look at a
- * reply may be early, and is not spun for. */
+/* A sleeping processor wakes late, and by much the same time again and again. So the sleep before a
+ * request is shortened by what is usual, and the rest is spun away: with few lines some 20 us of each
+ * exchange. A look at a reply may be early, and is not spun for. */
 static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
 {
     if (until_ns - *now_ns > MD_MOST_LATENESS || port->engine->count > MOST_SPINNING || port->turn.progress.lost)

@@ -87,7 +87,7 @@ static void measure(struct md_line *line, int reply_len)
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
     /* A port that is faster than its settings, such as a network's, needs no more than it took. */
     int64_t took_ns = line->silence_ns + later(completion->last_ns, left_ns) - completion->sent_ns;
-    md_counters_answer(&drive->counters, delay_ns, sooner(ideal_ns, took_ns));
+    md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
 }
 
 /* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
@@ -129,8 +129,9 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
     }
 }
 
-/* It answers this request or an earlier one, and the other's reply may still come. A row may have it, with a
- * time that leaves that open. A value that was asked for by hand must be the present one: it is read again. */
+/* It answers this request or an earlier one, and the other's reply may still come. A row may have it, with
+ * a time that leaves that open. A value that was asked for by hand must be the present one: it is read
+ * again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply,
                                      int64_t now_ns, int64_t since_ns)
 {
@@ -146,7 +147,7 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used, 
     md_copy_message(&completion->reply, reply);
     completion->skipped -= (uint32_t)used;
     completion->sent_ns = since_ns - request_ns;
-    md_counters_answer(&line->exchange->drive->counters, 0, request_ns + used * line->exchange->character_ns);
+    md_counters_answer(line->exchange->drive, 0, request_ns + used * line->exchange->character_ns);
     return (struct md_ending){used, at, (size_t)used};
 }
 
@@ -216,8 +217,8 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
 
 /* ---- no reply ---- */
 
-/* A damaged frame of the drive's own, at the beginning of what came, says that it has answered. Others' frames,
- * the echo and noise do not, and what looks like one further on may be the inside of another. */
+/* A damaged frame of the drive's own, at the beginning of what came, says that it has answered. Others'
+ * frames, the echo and noise do not, and what looks like one further on may be the inside of another. */
 static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
 {
     if (begin == 0 && line->echo == MD_ECHO)

@@ -14,7 +14,9 @@ STEP, TOP, LEFT, WIDTH, HEIGHT = 90, 40, 330, 170, 40  # of the boxes, in px
 def names(kind: str) -> list[str]:
     """Return the names of a core's enum, in order, without the one that counts them."""
     elements = ffi.typeof(f"enum {kind}").elements
-    return [elements[number].removeprefix("MD_").replace("_", " ").lower() for number in sorted(elements)][:-1]
+    return [elements[number].removeprefix("MD_").replace("_", " ").lower() for number in sorted(elements)][
+        :-1
+    ]
 
 
 STATES, EVENTS = names("md_line_state"), names("md_line_event")

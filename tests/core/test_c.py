@@ -42,19 +42,8 @@ def build_and_run(program: Path, *core: str, arguments: Sequence[str] = ()) -> N
 
 
 def test_core(tmp_path: Path) -> None:
-    core = (
-        "checksum",
-        "frame",
-        "reason",
-        "tap",
-        "line",
-        "reply",
-        "echo",
-        "late",
-        "delay",
-        "counters",
-        "columns",
-    )
+    line = ("line", "reply", "echo", "late", "delay", "counters")
+    core = ("checksum", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
 

@@ -24,6 +24,7 @@ struct scene {
     struct md_line line;
     struct md_completion *done; /* there while the exchange is under way, and no longer */
     struct md_drive drives[DRIVES];
+    struct md_history histories[DRIVES];
     struct md_exchange exchange;
     int is_under_way, has_asked, adapter_echoes, is_spoiled;
     int number; /* of the exchange */
@@ -116,15 +117,16 @@ static void check_counters(void)
 {
     for (int i = 0; i < DRIVES; i++) {
         const struct md_counters *counters = &scene.drives[i].counters;
+        const struct md_history *history = &scene.histories[i];
         uint64_t values = counters->values, ended = counters->answered, delays = 0;
-        for (size_t reason = 0; reason < sizeof counters->missed / sizeof *counters->missed; reason++) {
-            values += counters->missed[reason];
-            ended += counters->ended[reason];
+        for (size_t reason = 0; reason < sizeof history->missed / sizeof *history->missed; reason++) {
+            values += history->missed[reason];
+            ended += history->ended[reason];
         }
         for (size_t code = 0; code < 256; code++)
-            values += counters->refused[code];
+            values += history->refused[code];
         for (size_t bucket = 0; bucket < MD_DELAY_BUCKETS; bucket++)
-            delays += counters->delays[bucket];
+            delays += history->delays[bucket];
         must(counters->exchanges == scene.exchanges[i] && values == counters->exchanges && ended == counters->exchanges);
         must(delays == counters->answered && counters->sent <= counters->exchanges);
         must(scene.drives[i].delay_ns >= 0 && scene.drives[i].deviation_ns >= 0);
@@ -196,22 +198,22 @@ static void hear(const uint8_t *bytes, size_t len, int origin)
 /* What it wants, asked again for as long as it wants to look at an empty port; ends exchanges. */
 static int want(void)
 {
-    int wish = MD_DONE;
+    int wanted = MD_DONE;
     if (!scene.is_under_way)
-        return wish;
+        return wanted;
     for (int wants = 0; wants < MOST_WANTS; wants++) {
-        wish = md_line_want(&scene.line, scene.now);
+        wanted = md_line_want(&scene.line, scene.now);
         check_line();
-        if (wish == MD_READ && scene.line.wake_ns <= scene.now)
+        if (wanted == MD_READ && scene.line.wake_ns <= scene.now)
             continue;
-        must(wish == MD_DONE || scene.now < scene.ends || wish == MD_WRITE);
-        must((wish != MD_WAIT && wish != MD_READ) || scene.line.wake_ns > scene.now);
-        if (wish == MD_DONE)
+        must(wanted == MD_DONE || scene.now < scene.ends || wanted == MD_WRITE);
+        must((wanted != MD_WAIT && wanted != MD_READ) || scene.line.wake_ns > scene.now);
+        if (wanted == MD_DONE)
             end();
-        return wish;
+        return wanted;
     }
-    must(wish == MD_DONE); /* it looks at the empty port for ever */
-    return wish;
+    must(wanted == MD_DONE); /* it looks at the empty port for ever */
+    return wanted;
 }
 
 /* The longest that an exchange may last, once its request can leave. */
@@ -231,6 +233,11 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     scene.number++;
     scene.exchange = (struct md_exchange){.framing = bytes[0] % 3, .request = request, .character_ns = 1, .silence_ns = silence,
                                           .turnaround_ns = turnaround, .drive = &scene.drives[drive_of(&request)]};
+    if (scene.number % 2) { /* as its maker does; else the line builds it */
+        uint8_t *frame = scene.exchange.frame;
+        int len = md_build_request(scene.exchange.framing, &request, frame, MD_KEPT_FRAME);
+        scene.exchange.frame_len = (uint8_t)(len > 0 ? len : 0);
+    }
     scene.begun = scene.now;
     scene.has_asked = 0;
     scene.before = scene.after = 0;
@@ -392,7 +399,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     scene.tap = (struct md_tap){.ring = ring, .room = sizeof ring, .put = data[3] * 7919u, .taken = data[3] * 7919u};
     scene.now = scene.last_heard = 1000;
     for (int i = 0; i < DRIVES; i++)
-        scene.drives[i] = (struct md_drive){.least_timeout_ns = 1 + data[1], .most_timeout_ns = 1 + data[1] + 4 * data[2]};
+        scene.drives[i] = (struct md_drive){.least_timeout_ns = 1 + data[1], .most_timeout_ns = 1 + data[1] + 4 * data[2],
+                                           .history = &scene.histories[i]};
     scene.adapter_echoes = data[3] & 1;
     md_line_init(&scene.line, scene.now);
     scene.line.tap = &scene.tap;

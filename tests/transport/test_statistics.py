@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from line_driver import MS, LineDriver
 from lines import line as a_line
 from lines import plant, polled, rows_of, until
-from multidrop._core import ffi, lib
+from multidrop._core import lib
 from test_learning import CHARACTER, READ, SILENCE, WRITE, answer, ask, drive, line, reply
 from toy import Toy
 
@@ -34,7 +34,7 @@ LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these the error is known
 def counters_of(delays_ns: list[int]) -> Counters:
     known = Peer(least_timeout=0.02, most_timeout=1)
     for delay in delays_ns:
-        lib.md_counters_answer(ffi.addressof(known.c.counters), delay, 0)
+        lib.md_counters_answer(known.c, delay, 0)
     return known.counters()
 
 

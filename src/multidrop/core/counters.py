@@ -38,25 +38,26 @@ def delay_edge(bucket: int) -> int:
     return int(lib.md_delay_edge(bucket))
 
 
-def read_counters(c: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
-    """Read a struct md_counters; `unasked` are values that were due and not asked for."""
+def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
+    """Read what a struct md_drive counted; `unasked` are values that were due and not asked for."""
+    c, history = drive.counters, drive.history
     return Counters(
         c.exchanges,
         c.answered,
         c.values,
         c.sent,
-        c.exceptions,
-        c.naks,
-        c.busies,
+        history.exceptions,
+        history.naks,
+        history.busies,
         c.late,
         c.stray_bytes,
         c.ideal_ns,
         c.longest_ns,
         timeout_ns,
-        _by_status(c.ended),
-        _by_status(c.missed) + unasked,
-        _by_place(c.refused, "I") if c.exceptions else Counter(),
-        _by_place(c.delays, "Q"),
+        _by_status(history.ended),
+        _by_status(history.missed) + unasked,
+        _by_place(history.refused, "I") if history.exceptions else Counter(),
+        _by_place(history.delays, "Q"),
     )
 
 

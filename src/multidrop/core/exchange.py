@@ -26,9 +26,14 @@ class Peer:
     """
 
     def __init__(self, *, least_timeout: float, most_timeout: float) -> None:
+        self._history = ffi.new("struct md_history *")
         self.c = ffi.new(
             "struct md_drive *",
-            {"least_timeout_ns": round(least_timeout * 1e9), "most_timeout_ns": round(most_timeout * 1e9)},
+            {
+                "least_timeout_ns": round(least_timeout * 1e9),
+                "most_timeout_ns": round(most_timeout * 1e9),
+                "history": self._history,
+            },
         )
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # values that were due and not asked for
@@ -89,7 +94,7 @@ class Peer:
 
     def counters(self) -> Counters:
         """Count its exchanges so far, and values that were due and not asked for."""
-        return read_counters(self.c.counters, int(lib.md_present_timeout_ns(self.c)), self.unasked)
+        return read_counters(self.c, int(lib.md_present_timeout_ns(self.c)), self.unasked)
 
 
 class Exchange:
