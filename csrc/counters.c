@@ -1,6 +1,6 @@
 /* What became of a drive's exchanges, counted in memory that does not grow.
  *
- * * Numbers only rise, so that a span of time is the difference of two looks. Response delays fall into
+ * Numbers only rise, so that a span of time is the difference of two looks. Response delays fall into
  * buckets, PARTS of them to each doubling. */
 #include "internal.h"
 

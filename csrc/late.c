@@ -1,12 +1,12 @@
 /* Replies that come after their time-out, and how none of them is taken for another request's.
  *
- * * A drive that is a little late may answer in any order: for some time after a time-out, the window, no
+ * A drive that is a little late may answer in any order: for some time after a time-out, the window, no
  * request leaves that such a reply could be taken for. A path that holds everything up (a modem, a gateway, a
  * stalled network) keeps the order: a reply that no outstanding request could have proves that all earlier
  * ones have come, or never will. So outstanding requests are remembered beyond the window, and a proof is
  * sent first: a request whose reply differs from all outstanding ones in function, length or value.
  *
- * * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the
+ * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the
  * earliest request that it fits is accounted for, and so is all that was sent before it. */
 #include "internal.h"
 

@@ -1,7 +1,7 @@
 /* One line as a state machine: silence, request, reply or time-out. Bytes and time come in as arguments; it
  * knows neither descriptor nor clock.
  *
- * * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a
+ * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a
  * damaged frame end the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
 #include "internal.h"
 

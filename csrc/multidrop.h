@@ -195,7 +195,7 @@ struct md_drive {
     uint32_t owed_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
-    struct md_history *history;     /* apart: with thousands of drives, fewer pages are touched at each exchange */
+    struct md_history *history;     /* apart: an exchange touches fewer pages */
     struct md_counters counters;
 };
 
@@ -231,7 +231,7 @@ struct md_exchange {
     struct md_message request;
     int64_t turnaround_ns; /* after a broadcast */
     int64_t period_ns;     /* between its slots in a queue; 0: it has none */
-    const uint32_t *stops; /* of its drive (md_count_stop): sent only while they are stops_seen; NULL: always */
+    const uint32_t *stops; /* of its drive: sent only while they are stops_seen; NULL: always */
     uint32_t stops_seen;
 };
 

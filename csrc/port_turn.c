@@ -2,7 +2,7 @@
  * is repeated. The last two keep a share of the line beside urgent requests without end, but for those that
  * insist.
  *
- * * Before an exchange come, where they are needed, proofs that no late reply is taken for its own, and an
+ * Before an exchange come, where they are needed, proofs that no late reply is taken for its own, and an
  * echo probe. Its caller brings the time, carries the bytes, and guards it: only md_turn_submit() takes no
  * lock. */
 #include "internal.h"

@@ -16,7 +16,7 @@ struct reader {
 };
 
 static const struct md_field fields[] = {{.at = 0, .multiplier = 1, .divisor = 1},
-                                         {.at = 1, .wire = MD_U32, .multiplier = 1, .divisor = 1}};
+                                         {.at = 1, .format = MD_U32, .multiplier = 1, .divisor = 1}};
 static const struct md_block block = {.fields = fields, .count = 2};
 
 static void decode(struct reader *reader, int i)

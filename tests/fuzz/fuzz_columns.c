@@ -63,7 +63,7 @@ static void check_rows(const uint8_t *head, const struct md_block *block,
         for (size_t row = before; row < rows.rows; row++) {
             const struct md_field *field = &block->fields[row - before];
             double value = expected(completion->reply.data, completion->reply.data_len, field->at,
-                                    field->wire);
+                                    field->format);
             int is_value = completion->result >= 0 && !completion->reply.exception;
             must(rows.drive[row] == block->drive && rows.reg[row] == field->reg &&
                  rows.time[row] == rows.sent[row] + 1000);

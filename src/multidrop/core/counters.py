@@ -39,7 +39,7 @@ def delay_edge(bucket: int) -> int:
 
 
 def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Counters:
-    """Return what a struct md_drive counted, with its time-out and the values that were not asked for."""
+    """Read what a struct md_drive counted; `unasked` are values that were due and not asked for."""
     c, history = drive.counters, drive.history
     return Counters(
         c.exchanges,
