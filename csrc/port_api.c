@@ -127,15 +127,16 @@ const struct md_progress *md_port_progress(struct md_port *port)
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion)
 {
+    struct md_engine *engine = port->engine; /* the port may be gone at the end */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
-    md_engine_enter(port->engine);
+    md_engine_enter(engine);
     if (port->is_closing) { /* nobody carries it out any more */
         *completion = (struct md_completion){.result = MD_LINE_LOST};
     } else {
         md_turn_add_urgent(&port->turn, &urgent);
-        md_engine_wake(port->engine);
-        md_engine_await(port->engine, &urgent.is_done);
+        md_engine_wake(engine);
+        md_engine_await(engine, &urgent.is_done);
     }
-    md_engine_leave(port->engine);
+    md_engine_leave(engine);
 }

@@ -290,7 +290,8 @@ def test_nothing_but_a_read_is_sent_again(drive: Peer, asked: Message, times: in
     """Where its reply may have been an earlier one: a write may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
-    urgent = ffi.new("struct md_urgent *", {"exchange": exchange(asked, drive).c, "completion": found})
+    made = exchange(asked, drive)
+    urgent = ffi.new("struct md_urgent *", {"exchange": made.c, "completion": found})
     lib.md_turn_init(turn, slots, 1, 0)
     lib.md_turn_add_urgent(turn, urgent)
     line = ffi.addressof(turn.line)
