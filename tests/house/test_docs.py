@@ -60,9 +60,9 @@ SHORTER = (  # what would take long, and what is enough here
     (r"--addresses 1-4", "--addresses 1-3 --quick"),
     (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
     (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
-    (r"\bevery=0\.1\b", "every=0.05"),
+    (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # of a write, on a busy machine
 )
-NEEDED = {"polars": "polars", "pandas": "pandas", "duckdb": "duckdb"}  # by a page: named in it
+NEEDED = ("polars", "pandas", "duckdb")  # by the page that imports them
 
 
 class Block(NamedTuple):
