@@ -220,7 +220,7 @@ int md_row_queue_await(struct md_row_queue *queue, int64_t timeout_ns, uint32_t 
 {
     int64_t until_ns = md_now_ns() + timeout_ns;
     pthread_mutex_lock(&queue->mutex);
-    while (!queue->calls && wait_until(&queue->called_up, &queue->mutex, until_ns) == 0)
+    while (!queue->calls && timeout_ns > 0 && wait_until(&queue->called_up, &queue->mutex, until_ns) == 0)
         ;
     int n = take_calls(queue, numbers, room);
     pthread_mutex_unlock(&queue->mutex);

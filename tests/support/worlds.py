@@ -53,7 +53,8 @@ class WorldRowQueue(RowQueue):
 
     @property
     def has_called(self) -> bool:
-        self._called_before += super().await_calls(0)
+        if not self._called_before:
+            self._called_before = super().await_calls(0)
         return bool(self._called_before)
 
     def await_calls(self, seconds: float) -> list[int]:
