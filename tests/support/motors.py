@@ -40,15 +40,15 @@ class Heard:
         self.sim = sim
         self.requests: list[Message] = []
         self.loses: Callable[[Message], bool] = lambda request: False
-        self._hear = sim.hear
-        vars(sim)["hear"] = self.hear
+        self._receive = sim.receive
+        vars(sim)["receive"] = self.receive
 
-    def hear(self, frame: Frame) -> Message | None:
+    def receive(self, frame: Frame) -> Message | None:
         request = frame.message
         if request is None or not frame.intact:
-            return self._hear(frame)
+            return self._receive(frame)
         self.requests.append(request)
-        reply = self._hear(frame)
+        reply = self._receive(frame)
         return None if self.loses(request) else reply
 
     @property
