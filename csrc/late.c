@@ -17,6 +17,11 @@ static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anythin
 
 /* ---- what could be taken for what ---- */
 
+static uint8_t data_kept(const struct md_message *request)
+{
+    return (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT);
+}
+
 static struct md_owed outstanding(const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -24,7 +29,7 @@ static struct md_owed outstanding(const struct md_exchange *exchange)
                            .function = request->function, .start = request->start, .count = request->count,
                            .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
                            .least = exchange->least, .most = exchange->most,
-                           .data_len = (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT)};
+                           .data_len = data_kept(request)};
     memcpy(owed.data, request->data, owed.data_len);
     return owed;
 }
@@ -32,10 +37,10 @@ static struct md_owed outstanding(const struct md_exchange *exchange)
 static int is_same_request(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
-    size_t kept = request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT;
-    return owed->framing == exchange->framing && owed->function == request->function && owed->start == request->start &&
-           owed->count == request->count && owed->least == exchange->least && owed->most == exchange->most &&
-           memcmp(owed->data, request->data, kept) == 0;
+    return owed->framing == exchange->framing && owed->function == request->function &&
+           owed->start == request->start && owed->count == request->count &&
+           owed->least == exchange->least && owed->most == exchange->most &&
+           memcmp(owed->data, request->data, data_kept(request)) == 0;
 }
 
 /* Find the same request among the drive's outstanding ones. */
@@ -77,7 +82,8 @@ static int is_mistakable(const struct md_owed *owed, const struct md_exchange *e
         return 0;
     if (exchange->framing == MD_DELIXI)
         return owed->start == request->start || owed->function == MD_DELIXI_STATE_QUERY;
-    return owed->reply_len == md_reply_length(exchange->framing, request) && may_hold_the_same(owed, exchange);
+    return owed->reply_len == md_reply_length(exchange->framing, request) &&
+           may_hold_the_same(owed, exchange);
 }
 
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most)
@@ -186,7 +192,8 @@ static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
     struct md_owed own = outstanding(exchange);
-    return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) && (!last || !is_mistakable(&own, last));
+    return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) &&
+           (!last || !is_mistakable(&own, last));
 }
 
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)

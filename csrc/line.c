@@ -189,7 +189,8 @@ int md_line_want(struct md_line *line, int64_t now_ns)
     case CHECK:
         go(line, MD_NOTHING_CAME);
         line->rx_len = line->rx_from = 0;
-        line->wake_ns = now_ns + line->exchange->drive->most_timeout_ns + line->tx_len * line->exchange->character_ns;
+        line->wake_ns =
+            now_ns + line->exchange->drive->most_timeout_ns + line->tx_len * line->exchange->character_ns;
         return MD_WRITE;
     case READY:
     case WRITING: /* a port that takes nothing is a broken port */

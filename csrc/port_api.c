@@ -101,7 +101,8 @@ void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32
     md_engine_leave(port->engine);
 }
 
-int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges, const int64_t *not_before_ns,
+int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns,
                    int n)
 {
     int taken = md_turn_submit(&port->turn, exchanges, not_before_ns, n);

@@ -99,7 +99,8 @@ static int is_sent(const struct md_port *port)
  * exchange. A look at a reply may be early, and is not spun for. */
 static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
 {
-    if (until_ns - *now_ns > MD_MOST_LATENESS || port->engine->count > MOST_SPINNING || port->turn.progress.lost)
+    if (until_ns - *now_ns > MD_MOST_LATENESS || port->engine->count > MOST_SPINNING ||
+        port->turn.progress.lost)
         return 0;
     if (!port->is_empty) /* what came meanwhile is looked for now, not when the request must leave */
         *now_ns = md_port_receive(port);

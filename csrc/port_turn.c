@@ -42,7 +42,8 @@ void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, in
     md_line_init(&turn->line, now_ns);
 }
 
-int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges, const int64_t *not_before_ns,
+int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges,
+                   const int64_t *not_before_ns,
                    int n)
 {
     uint32_t submitted = turn->progress.submitted;
@@ -71,7 +72,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
     if (*at && turn->whose == MD_URGENT) /* it is under way */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* that one came first, and goes first */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* the first one goes first */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;
@@ -98,7 +99,8 @@ static uint64_t replies(const struct md_drive *drive)
 }
 
 /* Return what to send before the exchange; NULL: it is its turn. */
-static const struct md_exchange *find_first(struct md_before *before, const struct md_exchange *exchange, int echo,
+static const struct md_exchange *find_first(struct md_before *before, const struct md_exchange *exchange,
+                                            int echo,
                                             int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;

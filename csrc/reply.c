@@ -93,7 +93,8 @@ static void measure(struct md_line *line, int reply_len)
 /* A reply of which little was seen first tells that the adapter does not keep it until it is whole. */
 static void learn_burst(struct md_line *line, size_t at, int reply_len)
 {
-    if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST && line->sight > line->burst)
+    if (line->sight_at == at && line->sight < reply_len && line->sight <= MOST_BURST &&
+        line->sight > line->burst)
         line->burst = line->sight;
 }
 
@@ -132,7 +133,8 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
 /* It answers this request or an earlier one, and the other's reply may still come. A row may have it, with
  * a time that leaves that open. A value that was asked for by hand must be the present one: it is read
  * again. */
-static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used, const struct md_message *reply,
+static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
+                                     const struct md_message *reply,
                                      int64_t now_ns, int64_t since_ns)
 {
     struct md_completion *completion = line->completion;
@@ -156,7 +158,8 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used, 
 enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again, or behind an echo */
 
 /* The bytes there could be the reply: decide whether they are its echo or a late reply instead. */
-static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply, int64_t now_ns,
+static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply,
+                        int64_t now_ns,
                         struct md_ending *ending)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -166,13 +169,15 @@ static enum found judge(struct md_line *line, size_t *at, int used, const struct
         *at += line->tx_len;
         return SKIPPED;
     }
-    int is_late = !exchange->insists && exchange->drive->owed_count && md_late_take(line, *at, now_ns, &since_ns) > 0;
+    int is_late = !exchange->insists && exchange->drive->owed_count &&
+        md_late_take(line, *at, now_ns, &since_ns) > 0;
     if (!is_late) {
         accept(line, *at, used, reply);
         *ending = (struct md_ending){used, *at, (size_t)used};
         return ENDED;
     }
-    md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0); /* whichever it answers, it took that long */
+    /* Whichever request it answers, it took that long. */
+    md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
     extend(line);
     if (md_is_read(exchange->framing, exchange->request.function)) {
         *ending = end_in_doubt(line, *at, used, reply, now_ns, since_ns);
@@ -224,7 +229,8 @@ static int is_damaged_answer(const struct md_line *line, size_t begin, int found
     if (begin == 0 && line->echo == MD_ECHO)
         return 0;
     if (found == MD_BAD_CHARACTER) /* of which the framing looks at no address */
-        return line->rx_len >= begin + 5 && md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
+        return line->rx_len >= begin + 5 &&
+            md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
                md_hex_byte(line->rx + begin + 3) >= 0;
     return found == MD_BAD_CHECKSUM;
 }
@@ -237,7 +243,8 @@ struct md_ending md_reply_missed(struct md_line *line)
     int is_alone = begin > 0 && begin == line->rx_len;
     int is_doubtful = is_alone && md_echo_learn_alone(line, parse_at(line, 0, &reply) > 0);
     int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
-    if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first)) /* it may be an earlier one's */
+    /* With others outstanding it may be the answer to one of them. */
+    if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)
         md_learn_silence(exchange->drive);

@@ -10,7 +10,8 @@
 
 enum { EVENTS = 256 }; /* taken at a time */
 
-typedef int wait_function(int epoll, struct epoll_event *events, int most, const struct timespec *span, const sigset_t *signals);
+typedef int wait_function(int epoll, struct epoll_event *events, int most, const struct timespec *span,
+                          const sigset_t *signals);
 
 struct md_waiter {
     int epoll;
@@ -18,7 +19,8 @@ struct md_waiter {
 };
 
 /* epoll_pwait2() where the system has none: before Linux 5.11, and where a container forbids it. */
-static int poll_first(int epoll, struct epoll_event *events, int most, const struct timespec *span, const sigset_t *signals)
+static int poll_first(int epoll, struct epoll_event *events, int most, const struct timespec *span,
+                      const sigset_t *signals)
 {
     struct pollfd any = {.fd = epoll, .events = POLLIN};
     int n = ppoll(&any, 1, span, signals);

@@ -56,7 +56,8 @@ static void ask(struct line *line)
 int main(int argc, char **argv)
 {
     if (argc < 3) {
-        fprintf(stderr, "usage: bare_lines SECONDS LINE... (a line is an inherited descriptor or a pty's path)\n");
+        fprintf(stderr,
+                "usage: bare_lines SECONDS LINE... (a line is an inherited descriptor or a pty's path)\n");
         return 2;
     }
     int count = argc - 2, epoll = epoll_create1(0);
@@ -93,7 +94,8 @@ int main(int argc, char **argv)
             }
         }
     }
-    printf("{\"exchanges\": %ld, \"failures\": 0, \"cpu_seconds\": %.6f, \"seconds\": %.6f}\n", good, cpu_seconds() - cpu,
+    printf("{\"exchanges\": %ld, \"failures\": 0, \"cpu_seconds\": %.6f, \"seconds\": %.6f}\n", good,
+           cpu_seconds() - cpu,
            (double)(now - begun) / 1e9);
     return 0;
 }

@@ -131,7 +131,8 @@ int main(int argc, char **argv)
         }
     }
     if (optind >= argc || drives < 1 || drives > MOST_DRIVES || registers < 1 || registers > 125) {
-        fprintf(stderr, "usage: bare_master [--seconds S] [--drives N] [--registers N] [--silence-us N (0: unpaced)]"
+        fprintf(stderr,
+                "usage: bare_master [--seconds S] [--drives N] [--registers N] [--silence-us N (0: unpaced)]"
                         " [--spin-us N] [--asleep-us N (after a request)] PORT\n");
         return 2;
     }

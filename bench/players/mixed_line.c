@@ -85,11 +85,13 @@ static struct drive *asked(int fd, const uint8_t *bytes, size_t len, struct md_m
 
 static int make_reply(const struct drive *drive, const struct md_message *request, uint8_t *out, size_t room)
 {
-    struct md_message reply = {.address = request->address, .function = request->function, .start = request->start};
+    struct md_message reply = {.address = request->address, .function = request->function,
+                               .start = request->start};
     int bits = request->function == 1 || request->function == 2;
     if (drive->framing == MD_DELIXI && request->function == 3)
         reply.start = 1; /* no drive is in state 0 */
-    reply.data_len = (uint16_t)(drive->framing == MD_DELIXI ? 4 : bits ? (request->count + 7) / 8 : 2 * request->count);
+    reply.data_len = (uint16_t)(drive->framing == MD_DELIXI ? 4 : bits ? (request->count + 7) / 8
+                                : 2 * request->count);
     return md_build_reply(drive->framing, &reply, out, room);
 }
 
@@ -184,9 +186,11 @@ int main(int argc, char **argv)
     for (int i = 1; i < argc && count < MOST_DRIVES; i++) {
         struct drive *drive = &drives[count++];
         long long character_ns, delay_ns, silence_ns;
-        if (sscanf(argv[i], "%d:%d:%u:%lld:%lld:%lld", &drive->address, &drive->framing, &drive->baudrate, &character_ns,
+        if (sscanf(argv[i], "%d:%d:%u:%lld:%lld:%lld", &drive->address, &drive->framing, &drive->baudrate,
+                   &character_ns,
                    &delay_ns, &silence_ns) != 6) {
-            fprintf(stderr, "usage: mixed_line ADDRESS:FRAMING:BAUDRATE:CHARACTER_NS:DELAY_NS:SILENCE_NS ...\n");
+            fprintf(stderr,
+                    "usage: mixed_line ADDRESS:FRAMING:BAUDRATE:CHARACTER_NS:DELAY_NS:SILENCE_NS ...\n");
             return 2;
         }
         drive->character_ns = character_ns;
@@ -197,7 +201,8 @@ int main(int argc, char **argv)
     play(open_pty());
     double span_ns = (double)(seen.last_ns - seen.first_ns);
     printf("{\"requests\": %ld, \"early\": %ld, \"refused\": %ld, \"utilisation\": %.5f, \"cycles\": %ld, \"cycle_ms\": %.4f, ",
-           seen.requests, seen.early, seen.refused, span_ns > 0 ? (double)seen.ideal_ns / span_ns : 0, seen.cycles,
+           seen.requests, seen.early, seen.refused, span_ns > 0 ? (double)seen.ideal_ns / span_ns : 0,
+               seen.cycles,
            seen.cycles ? (double)seen.cycles_ns / (double)seen.cycles / 1e6 : 0);
     printf("\"answered\": {");
     for (int i = 0; i < count; i++)

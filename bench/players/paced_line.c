@@ -92,7 +92,8 @@ static void print_report(void)
         }
     double span = (double)(last_ns - first_ns), ideal = (double)ideal_ns;
     double cycles = drives ? (double)counted / (double)drives : 1;
-    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, \"early\": %ld, \"refused\": %ld, ", span / 1e9,
+    printf("}, \"seconds\": %.3f, \"answered\": %ld, \"unanswered\": %ld, \"early\": %ld, \"refused\": %ld, ",
+           span / 1e9,
            answered, unanswered, early, refused);
     printf("\"ideal_cycle_ms\": %.4f, \"cycle_ms\": %.4f, \"utilisation\": %.5f, ", ideal / cycles / 1e6,
            span / cycles / 1e6, span > 0 ? ideal / span : 0);
@@ -143,7 +144,8 @@ static uint16_t crc16(const uint8_t *bytes, size_t len)
 /* The reply to FC03: register r of address a holds 256 * a + r. An exception where there is none. */
 static size_t make_reply(const uint8_t *request, uint8_t *out)
 {
-    unsigned start = (unsigned)(request[2] << 8 | request[3]), count = (unsigned)(request[4] << 8 | request[5]);
+    unsigned start = (unsigned)(request[2] << 8 | request[3]),
+        count = (unsigned)(request[4] << 8 | request[5]);
     size_t len = 0;
     if (options.stray)
         *out++ = 0x00;
@@ -294,8 +296,10 @@ static void play(int fd)
 static void read_options(int argc, char **argv)
 {
     static const struct option known[] = {
-        {"baudrate", 1, NULL, 'b'}, {"bits", 1, NULL, 'c'}, {"drives", 1, NULL, 'n'}, {"registers", 1, NULL, 'r'},
-        {"delay-us", 1, NULL, 'd'}, {"silent", 1, NULL, 's'}, {"settle-ms", 1, NULL, 'w'}, {"stray", 0, NULL, 'y'},
+        {"baudrate", 1, NULL, 'b'}, {"bits", 1, NULL, 'c'}, {"drives", 1, NULL, 'n'}, {"registers", 1, NULL,
+                                                            'r'},
+        {"delay-us", 1, NULL, 'd'}, {"silent", 1, NULL, 's'}, {"settle-ms", 1, NULL, 'w'}, {"stray", 0, NULL,
+                                                            'y'},
         {"whole", 0, NULL, 'o'}, {"bytewise", 0, NULL, 'e'}, {"tcp", 0, NULL, 't'}, {NULL, 0, NULL, 0}};
     int key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
@@ -325,9 +329,11 @@ static void read_options(int argc, char **argv)
             exit(2);
         }
     }
-    if (options.drives < 1 || options.drives > MOST_DRIVES || options.registers < 1 || options.registers > 256 ||
+    if (options.drives < 1 || options.drives > MOST_DRIVES || options.registers < 1 ||
+        options.registers > 256 ||
         options.baudrate < 0) {
-        fprintf(stderr, "paced_line: 1 to %d drives, 1 to 256 registers, a baud rate of 0 or more\n", MOST_DRIVES);
+        fprintf(stderr, "paced_line: 1 to %d drives, 1 to 256 registers, a baud rate of 0 or more\n",
+                MOST_DRIVES);
         exit(2);
     }
 }
@@ -337,7 +343,8 @@ int main(int argc, char **argv)
     read_options(argc, argv);
     if (options.baudrate) {
         character_ns = options.bits * 1000000000 / options.baudrate;
-        silence_ns = options.baudrate > 19200 ? 1750000 : character_ns * 7 / 2; /* serial-line guide 2.5.1.1 */
+        /* serial-line guide 2.5.1.1 */
+        silence_ns = options.baudrate > 19200 ? 1750000 : character_ns * 7 / 2;
         delay_ns = options.delay_us * 1000;
     }
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL);

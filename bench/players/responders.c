@@ -4,7 +4,8 @@
  * Every address holds 256 * address + register, and for function 04 the register 128 further on. A
  * reply comes at once, or when it would have been whole on a wire of --baudrate. Some of them come
  * later by up to --late-us and never by more, are lost, or come twice. All of a line come --path-us later,
- * in order, and what comes in the first --stall-us of each --stall-every-us at the end of that. Lines are descriptors that were inherited, or
+ * in order, and what comes in the first --stall-us of each --stall-every-us at the end of that. Lines are
+  * descriptors that were inherited, or
  * new ptys, whose paths are printed. Runs until standard input ends, then prints JSON. */
 #define _GNU_SOURCE
 #include "multidrop.h"
@@ -24,7 +25,8 @@
 enum { REQUEST = 8, MOST_REPLY = 256, EVENTS = 256, CHARACTER_BITS = 10 };
 
 static struct {
-    long baudrate, delay_us, late_us, late_permille, lost_permille, twice_permille, ptys, path_us, stall_us, stall_every_us;
+    long baudrate, delay_us, late_us, late_permille, lost_permille, twice_permille, ptys, path_us, stall_us,
+        stall_every_us;
 } options;
 
 struct line {
@@ -233,8 +235,10 @@ static void play(int epoll)
 static void read_options(int argc, char **argv)
 {
     static const struct option known[] = {
-        {"baudrate", 1, NULL, 'b'}, {"delay-us", 1, NULL, 'd'}, {"late-us", 1, NULL, 'l'}, {"late-permille", 1, NULL, 'm'},
-        {"lost-permille", 1, NULL, 'o'}, {"twice-permille", 1, NULL, 't'}, {"ptys", 1, NULL, 'p'}, {"path-us", 1, NULL, 'P'},
+        {"baudrate", 1, NULL, 'b'}, {"delay-us", 1, NULL, 'd'}, {"late-us", 1, NULL, 'l'}, {"late-permille",
+                                                            1, NULL, 'm'},
+        {"lost-permille", 1, NULL, 'o'}, {"twice-permille", 1, NULL, 't'}, {"ptys", 1, NULL, 'p'}, {"path-us",
+                                                            1, NULL, 'P'},
         {"stall-us", 1, NULL, 's'}, {"stall-every-us", 1, NULL, 'e'}, {NULL, 0, NULL, 0}};
     int key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
@@ -251,7 +255,8 @@ static void read_options(int argc, char **argv)
         case 's': options.stall_us = number; break;
         case 'e': options.stall_every_us = number; break;
         default:
-            fprintf(stderr, "usage: responders [--baudrate N (0: no waits)] [--delay-us N] [--late-us N] [--late-permille N]\n"
+            fprintf(stderr,
+                    "usage: responders [--baudrate N (0: no waits)] [--delay-us N] [--late-us N] [--late-permille N]\n"
                             "       [--lost-permille N] [--twice-permille N] [--ptys N] [--path-us N]\n"
                             "       [--stall-us N --stall-every-us N] [DESCRIPTOR ...]\n");
             exit(2);
@@ -280,7 +285,8 @@ int main(int argc, char **argv)
     fflush(stdout);
     watch(epoll, 0, NULL);
     play(epoll);
-    printf("{\"requests\": %ld, \"refused\": %ld, \"late\": %ld, \"lost\": %ld, \"twice\": %ld}\n", requests, refused, late,
+    printf("{\"requests\": %ld, \"refused\": %ld, \"late\": %ld, \"lost\": %ld, \"twice\": %ld}\n", requests,
+           refused, late,
            lost, twice);
     return 0;
 }

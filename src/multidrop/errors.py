@@ -109,7 +109,7 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """What the sentence of a refusal tells a program to do, and what to type instead on the command line."""
+    """The advice in a refusal's sentence: for a program, and for the command line instead."""
 
     program: str
     command: str

@@ -1,7 +1,8 @@
 /* The C core against the documents' frames and against hostile lengths, without any framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
- *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c csrc/reply.c \
+ *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c
+  * csrc/reply.c \
  *      csrc/echo.c csrc/late.c csrc/delay.c csrc/counters.c csrc/columns.c -lm -o test_core
  *   ./test_core tests/data/frames.csv
  *
@@ -17,7 +18,8 @@
 #include <unistd.h>
 
 #define COUNT(table) (sizeof(table) / sizeof *(table))
-#define CHECK(truth) (checks++, (truth) ? 1 : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
+#define CHECK(truth) (checks++, (truth) ? 1 \
+                      : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
 
 static int checks, failures;
 static const char *row = ""; /* what is being checked, for the report */
@@ -50,7 +52,8 @@ struct frame {
     size_t len;
 };
 
-static int parse(const struct frame *frame, const uint8_t *bytes, size_t len, const struct md_message *request)
+static int parse(const struct frame *frame, const uint8_t *bytes, size_t len,
+                 const struct md_message *request)
 {
     struct md_message found;
     const uint8_t *edge = at_the_edge(bytes, len);
@@ -150,10 +153,12 @@ static void check_documents(const char *path)
         exit(2);
     for (; fgets(text, sizeof text, file); rows++) {
         row = text;
-        if (sscanf(text, "%31[^,],%15[^,],%15[^,],%255[^,],%31[^,]", model, framing, direction, bytes, verdict) != 5)
+        if (sscanf(text, "%31[^,],%15[^,],%15[^,],%255[^,],%31[^,]", model, framing, direction, bytes,
+                   verdict) != 5)
             exit(2);
         struct frame frame = {.is_reply = strcmp(direction, "reply") == 0};
-        frame.framing = strcmp(framing, "rtu") == 0 ? MD_RTU : strcmp(framing, "ascii") == 0 ? MD_ASCII : MD_DELIXI;
+        frame.framing = strcmp(framing, "rtu") == 0 ? MD_RTU : strcmp(framing, "ascii") == 0 ? MD_ASCII
+            : MD_DELIXI;
         frame.len = read_bytes(bytes, frame.bytes);
         frame.result = strcmp(verdict, "bad checksum") == 0 ? MD_BAD_CHECKSUM : (int)frame.len;
         if (strcmp(verdict, "bad content") == 0 && frame.is_reply && frame.bytes[1] == 0x04)
@@ -260,7 +265,8 @@ static void check_builders(void)
         int framing = is_reply ? replies[at].framing : requests[at].framing;
         int length = is_reply ? replies[at].length : requests[at].length;
         const struct md_message *message = is_reply ? &replies[at].message : &requests[at].message;
-        int (*build)(int, const struct md_message *, uint8_t *, size_t) = is_reply ? md_build_reply : md_build_request;
+        int (*build)(int, const struct md_message *, uint8_t *, size_t) = is_reply ? md_build_reply
+            : md_build_request;
         row = is_reply ? replies[at].name : requests[at].name;
         for (size_t room = 0; room <= MD_MOST_FRAME; room++)
             CHECK(build(framing, message, page_end() - room, room) ==
@@ -292,20 +298,26 @@ static const struct {
     {"no carriage return", ":010600101234A3\\n", MD_ASCII, MD_BAD_CHARACTER, {0}},
     {"no line feed", ":010600101234A3\\r\\r", MD_ASCII, MD_BAD_CHARACTER, {0}},
     {"another drive", "02", MD_RTU, MD_BAD_ADDRESS, {.address = 1, .function = 3, .count = 2}},
-    {"another drive, as text", ":02", MD_DELIXI, MD_BAD_ADDRESS, {.address = 1, .function = 7, .data_len = 4}},
+    {"another drive, as text", ":02", MD_DELIXI, MD_BAD_ADDRESS, {.address = 1, .function = 7,
+                                                            .data_len = 4}},
     {"an answer to a broadcast", "00", MD_RTU, MD_BAD_ADDRESS, {.function = 6, .data_len = 2}},
     {"another function", "01 04", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
-    {"another function's exception", "01 84", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
-    {"an exception without a code", "01 83 00", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3, .count = 2}},
+    {"another function's exception", "01 84", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3,
+                                                            .count = 2}},
+    {"an exception without a code", "01 83 00", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 3,
+                                                            .count = 2}},
     {"another byte count", "01 03 02", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 3, .count = 2}},
     {"125 registers begin", "01 03 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 3, .count = 125}},
     {"2000 bits begin", "01 01 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 1, .count = 2000}},
     {"an answer to no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
     {"another command", ":0106", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
-    {"no state", ":010300000000000004\\r\\n", MD_DELIXI, MD_BAD_ECHO, {.address = 1, .function = 3, .data_len = 4}},
+    {"no state", ":010300000000000004\\r\\n", MD_DELIXI, MD_BAD_ECHO, {.address = 1, .function = 3,
+                                                            .data_len = 4}},
     {"a state", ":010300010000000005\\r\\n", MD_DELIXI, 21, {.address = 1, .function = 3, .data_len = 4}},
-    {"a state of two bytes", ":010301000000000005\\r\\n", MD_DELIXI, 21, {.address = 1, .function = 3, .data_len = 4}},
-    {"a refusal below the refusals", ":01FB", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
+    {"a state of two bytes", ":010301000000000005\\r\\n", MD_DELIXI, 21, {.address = 1, .function = 3,
+                                                            .data_len = 4}},
+    {"a refusal below the refusals", ":01FB", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7,
+                                                            .data_len = 4}},
 };
 
 static void check_verdicts(void)
@@ -330,7 +342,8 @@ static void check_impossible_counts(void)
     for (size_t i = 0; i < sizeof functions; i++)
         for (unsigned count = 0; count < 2100; count++)
             for (unsigned bytes = 248; bytes < 256; bytes++) {
-                struct md_message request = {.address = 1, .function = functions[i], .count = (uint16_t)count};
+                struct md_message request = {.address = 1, .function = functions[i],
+                                             .count = (uint16_t)count};
                 size_t len = 3 + bytes < 255 ? 3 + bytes : 255;
                 reply[1] = functions[i];
                 reply[2] = (uint8_t)bytes;
@@ -378,7 +391,8 @@ static void check_values(void)
 {
     for (size_t i = 0; i < COUNT(values); i++) {
         row = values[i].name;
-        double value = md_value(at_the_edge(values[i].data, values[i].len), values[i].len, values[i].at, values[i].format);
+        double value = md_value(at_the_edge(values[i].data, values[i].len), values[i].len, values[i].at,
+                                values[i].format);
         CHECK(isnan(values[i].value) ? isnan(value) : value == values[i].value);
     }
 }
@@ -396,15 +410,19 @@ static void check_columns(void)
         .result = 7, .sent_ns = 100, .first_ns = 130, .reply = {.data_len = 2, .data = {0, 3}}};
     row = "columns";
     *valid = 0xFF;
-    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion, 1000) == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion,
+                         1000) == 2);
     CHECK(time[0] == 1100 && sent[0] == 100 && uncertainty[0] == 30 && drive[0] == 7 && reg[1] == 9);
     CHECK(status[0] == 0 && value[0] == 0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
     CHECK((*valid & 3) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion, 1000) == 0 && columns.rows == 2);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion,
+                         1000) == 0 && columns.rows == 2);
     completion = (struct md_completion){.result = MD_LINE_LOST, .begun_ns = 90};
-    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion, 1000) == 1);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion,
+                         1000) == 1);
     CHECK(sent[2] == 90 && status[2] == -MD_LINE_LOST && (*valid & 7) == 1);
-    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion, 1000) == 0 && columns.rows == ROOM);
+    CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 1, .drive = 7}, &completion,
+                         1000) == 0 && columns.rows == ROOM);
 }
 
 static void check_spelling(void)
@@ -434,7 +452,8 @@ static void check_tap(void)
         'H', 'H', 'H', 'a', 'b', 'c', 'd', 'e', 'T', 'T', 'T', 'T', SIZE, 0, 0, 0,
     };
     static const struct md_wrapping wrappings[2 * MD_SIDES] = {
-        [2 * MD_ANSWERING] = {.head = (const uint8_t *)"HHH", .head_len = 3, .tail = (const uint8_t *)"TTTT", .tail_len = 4},
+        [2 * MD_ANSWERING] = {.head = (const uint8_t *)"HHH", .head_len = 3, .tail = (const uint8_t *)"TTTT",
+                              .tail_len = 4},
     };
     uint8_t ring[ROOM];
     struct md_tap tap = {.ring = ring, .room = ROOM};

@@ -26,12 +26,14 @@ int main(void)
     assert(row_queue);
     for (int64_t n = 0; n < ROWS; n++) {
         ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* somebody sets the time of day */
-        md_row_queue_add(row_queue, &block, &(struct md_completion){.result = MD_NO_REPLY, .begun_ns = (n + 1) * every_ns});
+        md_row_queue_add(row_queue, &block, &(struct md_completion){.result = MD_NO_REPLY,
+                                                            .begun_ns = (n + 1) * every_ns});
     }
     struct md_columns *columns = md_row_queue_take(row_queue);
     assert(columns && columns->rows == ROWS);
     assert(columns->time[ROWS / 2 - 1] - columns->sent[ROWS / 2 - 1] == 1000);
-    assert(columns->time[ROWS / 2 + 10] - columns->sent[ROWS / 2 + 10] == 7000); /* within a tenth of a second */
+    /* within a tenth of a second */
+    assert(columns->time[ROWS / 2 + 10] - columns->sent[ROWS / 2 + 10] == 7000);
     assert(columns->time[ROWS - 1] - columns->sent[ROWS - 1] == 7000);
     md_row_queue_give_back(row_queue, columns);
     md_row_queue_free(row_queue);

@@ -17,7 +17,8 @@ static void note(const struct timespec *span)
     asked_ns = span ? span->tv_sec * INT64_C(1000000000) + span->tv_nsec : -1;
 }
 
-int epoll_pwait2(int fd, struct epoll_event *events, int most, const struct timespec *span, const sigset_t *signals)
+int epoll_pwait2(int fd, struct epoll_event *events, int most, const struct timespec *span,
+                 const sigset_t *signals)
 {
     (void)fd, (void)events, (void)most, (void)signals;
     errno = ENOSYS;
@@ -36,7 +37,8 @@ int ppoll(struct pollfd *fds, nfds_t count, const struct timespec *span, const s
 
 int main(void)
 {
-    static const int64_t spans_ns[] = {-1, 0, 1, 999, 1000, 499999, 1000001, 999999999, 1000000000, INT64_C(90000000001)};
+    static const int64_t spans_ns[] = {-1, 0, 1, 999, 1000, 499999, 1000001, 999999999, 1000000000,
+                                       INT64_C(90000000001)};
     void *ready[1];
     for (has_pwait2 = 0; has_pwait2 < 2; has_pwait2++) {
         struct md_waiter *waiter = md_waiter_new();

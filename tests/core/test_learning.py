@@ -287,7 +287,7 @@ def test_a_value_that_may_answer_an_earlier_question_has_its_time(
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
 def test_nothing_but_a_read_is_sent_again(drive: Peer, asked: Message, times: int) -> None:
-    """Where its reply may have been an earlier one: a write may have started a motor."""
+    """Its reply may have been an earlier one; but a write may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
     made = exchange(asked, drive)

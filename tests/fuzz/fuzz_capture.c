@@ -4,7 +4,8 @@
  * the file's packets: pcap without its header, or pcapng. */
 #include "fuzz.h"
 
-enum { HEADER = 2, MOST = 4096, ROWS = 64, PLACES = 16, CHANNELS = 2, PCAP_RECORD = 16, PCAPNG_HEAD = 28, PCAPNG_BLOCK = 32, RTAC_HEAD = 12 };
+enum { HEADER = 2, MOST = 4096, ROWS = 64, PLACES = 16, CHANNELS = 2, PCAP_RECORD = 16, PCAPNG_HEAD = 28,
+      PCAPNG_BLOCK = 32, RTAC_HEAD = 12 };
 
 struct reader {
     struct md_capture capture;
@@ -24,7 +25,8 @@ static void decode(struct reader *reader, int i)
     static uint16_t drive[ROWS], reg[ROWS], status[ROWS];
     static double value[ROWS];
     static uint8_t valid[ROWS / 8];
-    struct md_columns rows = {.time = time, .sent = sent, .uncertainty = uncertainty, .drive = drive, .reg = reg,
+    struct md_columns rows = {.time = time, .sent = sent, .uncertainty = uncertainty, .drive = drive,
+                              .reg = reg,
                               .status = status, .value = value, .valid = valid, .room = ROWS};
     struct md_decoder *decoder = &reader->decoders[i];
     for (int state; (state = md_decode(decoder, &reader->channels[i].stream, &rows)) != MD_ALL_DECODED;) {
@@ -44,7 +46,8 @@ static void decode(struct reader *reader, int i)
     }
     reader->rows += rows.rows;
     for (size_t row = 0; row < rows.rows; row++)
-        must((valid[row / 8] >> row % 8 & 1) == (status[row] == 0) && (status[row] == 0 || uncertainty[row] == 0));
+        must((valid[row / 8] >> row % 8 & 1) == (status[row] == 0) &&
+             (status[row] == 0 || uncertainty[row] == 0));
 }
 
 /* Every byte is part of a frame or counted as junk, and rows come of exchanges alone. */
@@ -86,7 +89,8 @@ static void read_all(struct reader *reader)
             return; /* a packet longer than the room, which is larger but for here */
     }
     must((state == MD_UNPACKED) == (capture->at == capture->len));
-    must(state == MD_UNPACKED || state == MD_CUT || state == MD_NONSENSE || (state == MD_OTHER_BLOCK && capture->is_pcapng));
+    must(state == MD_UNPACKED || state == MD_CUT || state == MD_NONSENSE ||
+         (state == MD_OTHER_BLOCK && capture->is_pcapng));
     check_counts(reader);
 }
 
@@ -96,15 +100,19 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     static struct reader reader;
     if (size < HEADER || size > MOST)
         return 0;
-    reader = (struct reader){.capture = {.len = size - HEADER, .is_pcapng = data[0] & 1, .is_big_endian = data[0] >> 1 & 1,
+    reader = (struct reader){.capture = {.len = size - HEADER, .is_pcapng = data[0] & 1,
+                                         .is_big_endian = data[0] >> 1 & 1,
                                          .channels = reader.channels, .count = data[0] & 1 ? CHANNELS : 1}};
     uint8_t *file = exact_copy(data + HEADER, size - HEADER);
     reader.capture.bytes = file;
     size_t room = MD_MOST_FRAME + 512 + 16u * data[1];
     for (int i = 0; i < CHANNELS; i++) {
-        struct md_stream stream = {.bytes = malloc(room), .pieces = malloc(room * sizeof(struct md_piece)), .room = room, .most = room};
-        reader.channels[i] = (struct md_channel){.link = links[data[0] >> 2 & 3], .has_sides = data[0] >> 4 & 1,
-                                                 .ticks_per_s = data[0] & 0x20 ? 1u << 20 : 1000000000u, .stream = stream};
+        struct md_stream stream = {.bytes = malloc(room), .pieces = malloc(room * sizeof(struct md_piece)),
+                                   .room = room, .most = room};
+        reader.channels[i] = (struct md_channel){.link = links[data[0] >> 2 & 3],
+                                                 .has_sides = data[0] >> 4 & 1,
+                                                 .ticks_per_s = data[0] & 0x20 ? 1u << 20 : 1000000000u,
+                                                     .stream = stream};
         reader.decoders[i] = (struct md_decoder){.known = reader.known[i], .places = PLACES};
     }
     read_all(&reader);
@@ -129,7 +137,8 @@ static size_t frame_in(const uint8_t *packet, size_t len, int link)
         return len < RTAC_HEAD ? len : RTAC_HEAD;
     size_t at = 0;
     while (link == 1 && at + 4 <= len) { /* tags */
-        size_t tag = (size_t)(packet[at] << 8 | packet[at + 1]), size = (size_t)(packet[at + 2] << 8 | packet[at + 3]);
+        size_t tag = (size_t)(packet[at] << 8 | packet[at + 1]),
+            size = (size_t)(packet[at + 2] << 8 | packet[at + 3]);
         at += 4 + (tag ? size : 0);
         if (tag == 0)
             break;
@@ -143,10 +152,12 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
     if (size < HEADER)
         return 0;
     int is_pcapng = data[0] & 1, is_big_endian = data[0] >> 1 & 1;
-    size_t at = HEADER, least = is_pcapng ? PCAPNG_BLOCK : PCAP_RECORD, head = is_pcapng ? PCAPNG_HEAD : PCAP_RECORD, found = 0;
+    size_t at = HEADER, least = is_pcapng ? PCAPNG_BLOCK : PCAP_RECORD, head = is_pcapng ? PCAPNG_HEAD
+        : PCAP_RECORD, found = 0;
     while (size - at >= least) {
         uint8_t *record = data + at;
-        size_t left = size - at - least, len = record[is_big_endian ? (is_pcapng ? 23 : 11) : (is_pcapng ? 20 : 8)];
+        size_t left = size - at - least,
+            len = record[is_big_endian ? (is_pcapng ? 23 : 11) : (is_pcapng ? 20 : 8)];
         if (len > left)
             len = left;
         size_t padded = is_pcapng ? (len + 3) / 4 * 4 : len;

@@ -22,7 +22,8 @@ static double expected(const uint8_t *data, size_t len, size_t at, int wire)
     const uint8_t *first = data + 2 * at;
     int64_t value = 0;
     for (size_t i = 0; i < bytes; i++)
-        value = 256 * value + first[bytes == 4 && wire != MD_U32_EITHER ? (size_t)(orders[wire][i] - '0') : i];
+        value = 256 * value + first[bytes == 4 && wire != MD_U32_EITHER ? (size_t)(orders[wire][i] - '0')
+                                    : i];
     if (wire == MD_U32_EITHER)
         return (double)((value >> 16) | (value & 0xFFFF));
     if (wire == MD_F32 || wire == MD_F32_SWAPPED) {
@@ -41,7 +42,8 @@ static int is_same(double a, double b)
     return isnan(a) ? isnan(b) : a == b;
 }
 
-static void check_rows(const uint8_t *head, const struct md_block *block, const struct md_completion *completion)
+static void check_rows(const uint8_t *head, const struct md_block *block,
+                       const struct md_completion *completion)
 {
     size_t room = head[1] % 12;
     struct md_columns rows = {.room = room};
@@ -56,19 +58,23 @@ static void check_rows(const uint8_t *head, const struct md_block *block, const 
     for (int round = 0; round < 4; round++) {
         size_t before = rows.rows;
         int added = md_columns_add(&rows, block, completion, 1000);
-        must(added == (room - before >= (size_t)block->count ? block->count : 0) && rows.rows == before + (size_t)added);
+        must(added == (room - before >= (size_t)block->count ? block->count : 0) &&
+             rows.rows == before + (size_t)added);
         for (size_t row = before; row < rows.rows; row++) {
             const struct md_field *field = &block->fields[row - before];
             double value = expected(completion->reply.data, completion->reply.data_len, field->at,
                                     field->format);
             int is_value = completion->result >= 0 && !completion->reply.exception;
-            must(rows.drive[row] == block->drive && rows.reg[row] == field->reg && rows.time[row] == rows.sent[row] + 1000);
+            must(rows.drive[row] == block->drive && rows.reg[row] == field->reg &&
+                 rows.time[row] == rows.sent[row] + 1000);
             must((rows.valid[row / 8] >> row % 8 & 1) == (rows.status[row] == 0));
             if (completion->result < 0)
                 must(rows.status[row] == -completion->result);
             else if (completion->reply.exception)
                 must(rows.status[row] == 256 + completion->reply.exception);
-            must(!is_value || is_same(rows.status[row] ? (double)NAN : rows.value[row], value * field->multiplier / field->divisor));
+            must(!is_value ||
+                 is_same(rows.status[row] ? (double)NAN : rows.value[row],
+                         value * field->multiplier / field->divisor));
             must(rows.status[row] == 0 || (rows.value[row] == 0 && rows.uncertainty[row] == 0));
         }
     }
@@ -125,7 +131,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
                                        .first_ns = data[7] + 3, .reply = {.data_len = (uint16_t)len}};
     completion.reply.exception = data[0] & 0x40 ? data[6] : 0;
     memcpy(completion.reply.data, bytes, len);
-    check_rows(data, &(struct md_block){.fields = fields, .count = data[0] % 5 % (FIELDS + 1), .drive = data[5]}, &completion);
+    check_rows(data,
+               &(struct md_block){.fields = fields, .count = data[0] % 5 % (FIELDS + 1), .drive = data[5]},
+                   &completion);
     check_spelling(data, exact, len);
     free(exact);
     return 0;

@@ -8,7 +8,8 @@
 
 #include <errno.h>
 
-enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_WANTS = 6, NOISE = -1, ECHO = -2, FLOOD = 700 };
+enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_WANTS = 6, NOISE = -1,
+      ECHO = -2, FLOOD = 700 };
 
 enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, PORT_FAILS, STEPS };
 
@@ -30,13 +31,15 @@ struct scene {
     int number; /* of the exchange */
     int64_t now, begun, ends; /* by then it must be over */
     int64_t last_heard, silence; /* the line's last activity, and the silence demanded after it */
-    size_t left_over, before, after; /* bytes heard: before the exchange, before its request was sent, and after */
+    /* bytes heard: before the exchange, before its request was sent, and after */
+    size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
     int16_t origin[HEARD]; /* of each byte after the request: the number of the exchange that it answers */
     uint8_t heard[HEARD];
     struct md_tap tap;
-    uint32_t told[256], passed[256]; /* how often each byte went over the line, as the tap has it, and indeed */
+    /* how often each byte went over the line, as the tap has it, and indeed */
+    uint32_t told[256], passed[256];
 };
 
 static struct scene scene;
@@ -80,7 +83,8 @@ static void check_origin(const uint8_t *raw, size_t len)
 
 static int is_same(const struct md_message *one, const struct md_message *other)
 {
-    return one->address == other->address && one->function == other->function && one->exception == other->exception &&
+    return one->address == other->address && one->function == other->function &&
+        one->exception == other->exception &&
            one->start == other->start && one->count == other->count && one->data_len == other->data_len &&
            memcmp(one->data, other->data, one->data_len) == 0;
 }
@@ -95,13 +99,15 @@ static void check_completion(void)
     must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
     must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
     must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
-    must((scene.after > 0) == (done->last_ns > 0) && done->first_ns <= done->last_ns && done->last_ns <= scene.now);
+    must((scene.after > 0) == (done->last_ns > 0) && done->first_ns <= done->last_ns &&
+         done->last_ns <= scene.now);
     must(done->first_ns == 0 || done->sent_ns <= done->first_ns);
     must(done->sent_ns == 0 || done->begun_ns <= done->sent_ns);
     if (done->result > 0) {
         struct md_message again;
         must(scene.has_asked && done->raw_len == used);
-        must(md_parse_reply(exchange->framing, done->raw, done->raw_len, &exchange->request, &again) == done->result);
+        must(md_parse_reply(exchange->framing, done->raw, done->raw_len, &exchange->request,
+                            &again) == done->result);
         must(is_same(&again, &done->reply));
         if (!scene.is_spoiled)
             check_origin(done->raw, done->raw_len);
@@ -127,7 +133,8 @@ static void check_counters(void)
             values += history->refused[code];
         for (size_t bucket = 0; bucket < MD_DELAY_BUCKETS; bucket++)
             delays += history->delays[bucket];
-        must(counters->exchanges == scene.exchanges[i] && values == counters->exchanges && ended == counters->exchanges);
+        must(counters->exchanges == scene.exchanges[i] && values == counters->exchanges &&
+             ended == counters->exchanges);
         must(delays == counters->answered && counters->sent <= counters->exchanges);
         must(scene.drives[i].delay_ns >= 0 && scene.drives[i].deviation_ns >= 0);
     }
@@ -221,7 +228,8 @@ static int64_t longest(void)
 {
     const struct md_exchange *exchange = &scene.exchange;
     int64_t most = exchange->drive->most_timeout_ns;
-    return 3 * most + (2 * MD_MOST_FRAME + md_reply_length(exchange->framing, &exchange->request)) * exchange->character_ns;
+    return 3 * most + (2 * MD_MOST_FRAME + md_reply_length(exchange->framing,
+                                                           &exchange->request)) * exchange->character_ns;
 }
 
 static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
@@ -231,8 +239,10 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
         return;
     request.address %= 8;
     scene.number++;
-    scene.exchange = (struct md_exchange){.framing = bytes[0] % 3, .request = request, .character_ns = 1, .silence_ns = silence,
-                                          .turnaround_ns = turnaround, .drive = &scene.drives[drive_of(&request)]};
+    scene.exchange = (struct md_exchange){.framing = bytes[0] % 3, .request = request, .character_ns = 1,
+                                          .silence_ns = silence,
+                                          .turnaround_ns = turnaround,
+                                              .drive = &scene.drives[drive_of(&request)]};
     if (scene.number % 2) { /* as its maker does; else the line builds it */
         uint8_t *frame = scene.exchange.frame;
         int len = md_build_request(scene.exchange.framing, &request, frame, MD_KEPT_FRAME);
@@ -245,7 +255,8 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     scene.is_under_way = 1;
     if (scene.silence < silence)
         scene.silence = silence;
-    int64_t free_from = scene.last_heard + scene.silence > scene.now ? scene.last_heard + scene.silence : scene.now;
+    int64_t free_from = scene.last_heard + scene.silence > scene.now ? scene.last_heard + scene.silence
+        : scene.now;
     scene.ends = free_from + longest();
     must((scene.done = malloc(sizeof *scene.done)) != NULL);
     md_line_begin(&scene.line, &scene.exchange, scene.done, scene.now);
@@ -381,7 +392,8 @@ static size_t act(const uint8_t *step, size_t left)
     case PIECE_COMES:
         if (left < 3)
             return 0;
-        let_answer(step[1], step[0] % STEPS == PIECE_COMES ? step[2] : MD_MOST_FRAME, step[0] & 0x80 ? step[2] : 0);
+        let_answer(step[1], step[0] % STEPS == PIECE_COMES ? step[2] : MD_MOST_FRAME, step[0] & 0x80
+                   ? step[2] : 0);
         want();
         return 3;
     default:
@@ -396,10 +408,12 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         return 0;
     static uint8_t ring[1 << 16];
     memset(&scene, 0, sizeof scene);
-    scene.tap = (struct md_tap){.ring = ring, .room = sizeof ring, .put = data[3] * 7919u, .taken = data[3] * 7919u};
+    scene.tap = (struct md_tap){.ring = ring, .room = sizeof ring, .put = data[3] * 7919u,
+                                .taken = data[3] * 7919u};
     scene.now = scene.last_heard = 1000;
     for (int i = 0; i < DRIVES; i++)
-        scene.drives[i] = (struct md_drive){.least_timeout_ns = 1 + data[1], .most_timeout_ns = 1 + data[1] + 4 * data[2],
+        scene.drives[i] = (struct md_drive){.least_timeout_ns = 1 + data[1],
+                                            .most_timeout_ns = 1 + data[1] + 4 * data[2],
                                            .history = &scene.histories[i]};
     scene.adapter_echoes = data[3] & 1;
     md_line_init(&scene.line, scene.now);
@@ -426,7 +440,8 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
     int framing = -1;
     for (; at < size; at += used) {
         int step = data[at] % STEPS;
-        used = step == BEGIN ? 3 + REQUEST_BYTES : step == PASS || step == TAKE ? 2 : step == ANSWER_COMES || step == PIECE_COMES ? 3 : 1;
+        used = step == BEGIN ? 3 + REQUEST_BYTES : step == PASS || step == TAKE ? 2 : step == ANSWER_COMES ||
+            step == PIECE_COMES ? 3 : 1;
         if (step == BEGIN && at + used <= size) {
             framing = data[at + 3] % 3;
             request = request_of(data + at + 3);

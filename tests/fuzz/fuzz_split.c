@@ -35,7 +35,8 @@ static int next(struct ear *ear, struct md_span *span)
         must(!ear->stream.is_all || at == ear->stream.len);
         return 0;
     }
-    must(span->len > 0 && span->at == at && ear->splitter.at == at + span->len && at + span->len <= ear->stream.len);
+    must(span->len > 0 && span->at == at && ear->splitter.at == at + span->len &&
+         at + span->len <= ear->stream.len);
     ear->passed += span->len;
     uint8_t *exact = exact_copy(ear->stream.bytes + at, span->len);
     if (span->kind == MD_REQUEST || span->kind == MD_EITHER) {
@@ -68,7 +69,8 @@ static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, siz
                                     MD_ASKING, MD_ANSWERING, MD_FAILED, MD_NOISE};
     size_t left = size - at - HEAD;
     *len = data[at + 1] < left ? data[at + 1] : left;
-    return (struct md_piece){.time_ns = (int64_t)at, .side = sides[data[at] & 7], .is_after_pause = data[at] >> 3 & 1};
+    return (struct md_piece){.time_ns = (int64_t)at, .side = sides[data[at] & 7],
+                             .is_after_pause = data[at] >> 3 & 1};
 }
 
 /* However much is forgotten on the way, the frames are those that are found when all is there. */

@@ -1,4 +1,4 @@
-"""What became of exchanges, as the core's own memory has it, and rows made of it."""
+"""Completions in the core's own memory, and the rows made of them."""
 
 from __future__ import annotations
 

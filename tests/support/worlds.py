@@ -169,7 +169,7 @@ class WorldPort:
 
 
 class WorldLine:
-    """What the bus sees of a line (line.Line)."""
+    """A line as the bus sees it (line.Line)."""
 
     def __init__(self, world: World) -> None:
         self.port = "world"
@@ -306,7 +306,7 @@ class World:
         return wake if at is None else min(wake, -int(-at * S // 1))
 
     def send(self, request: bytes, baudrate: int) -> None:
-        """What the client sends, to the drives; the port may be gone with it."""
+        """Hand what the client sends to the drives; the port may be gone by then."""
         self.wire.receive(request, self.now / S, baudrate)
         if self.wire.port is None and self.port:
             self.port.hang_up()
