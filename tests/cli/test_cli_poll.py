@@ -125,7 +125,7 @@ def test_poll_tells_a_person_the_same(plant: Path) -> None:
     lines = done.stdout.splitlines()
     assert lines[0].startswith("hall-1: ")
     assert lines[1].split() == ["DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES"]
-    living, dead = (next(line for line in lines if line.startswith(name)) for name in ("pump-1", "pump-9"))
+    living, dead = (next(line for line in lines if line.split()[0] == name) for name in ("pump-1", "pump-9"))
     assert any(reason in living for reason in {"none", *LATE_OR_SILENT})
     assert dead.split()[:3] == ["pump-9", "0.0", "0.0"]
     assert any(reason in dead for reason in LATE_OR_SILENT)
