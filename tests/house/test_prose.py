@@ -1,0 +1,72 @@
+"""The house's rules of words: what a name, a docstring and a line may be."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+
+import pytest
+from sources import ROOMS, ROOT, comments, docstrings, files, loop_variables, parsed, place
+
+import multidrop
+
+MOST_CHARACTERS = 110
+QUESTIONS = re.compile(r"(What|Whether|Of|As|How|Who|If|Where|When)\b")
+TEXT = (".py", ".c", ".h", ".md", ".toml")
+PAGES = [path for path in ROOT.glob("*") if path.suffix in TEXT]
+
+
+def test_no_class_name_stands_for_two_things() -> None:
+    places: dict[str, list[str]] = defaultdict(list)
+    for path in files("src"):
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(place(path, node.lineno))
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize("room", ["src", "tests", "bench"])
+def test_no_docstring_begins_with_a_question(room: str) -> None:
+    found = [
+        f"{place(path, line)}: {text.splitlines()[0]}"
+        for path in files(room)
+        for line, text in docstrings(path)
+        if QUESTIONS.match(text)
+    ]
+    assert found == []
+
+
+def test_no_comment_of_a_header_begins_with_a_question() -> None:
+    found = [
+        f"{place(path, line)}: {text.splitlines()[0]}"
+        for path in files("csrc", suffixes=(".h",))
+        for line, text in comments(path)
+        if QUESTIONS.match(text)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("room", [*ROOMS, "."])
+def test_no_line_is_too_long(room: str) -> None:
+    """A row of a Markdown table may be longer, because Markdown cannot break it."""
+    found = [
+        f"{place(path, number)}: {len(line)} characters"
+        for path in (PAGES if room == "." else files(room, suffixes=TEXT))
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1)
+        if len(line) > MOST_CHARACTERS and not (path.suffix == ".md" and line.startswith("|"))
+    ]
+    assert found == []
+
+
+def test_no_loop_variable_is_called_it() -> None:
+    found = [
+        place(path, line) for path in files("src") for line, name in loop_variables(path) if name == "it"
+    ]
+    assert found == []
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    reference = (ROOT / "docs" / "reference" / "api.md").read_text("utf-8")
+    missing = [name for name in multidrop.__all__ if not re.search(rf"\b{name}\b", reference)]
+    assert missing == []
