@@ -240,11 +240,13 @@ def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> N
         assert run("start", *words, "--frequency", 20)[0] == 0
 
 
+@patient
 def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
     assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
     assert [it.name for it in toy.counters.writes] == ["frequency", "control"]
 
 
+@patient
 @pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
 def test_a_person_at_a_terminal_is_asked(
     run: Run,

@@ -66,9 +66,9 @@ def resident_kb() -> int:
     return pages * os.sysconf("SC_PAGESIZE") // 1024
 
 
-# Two lines for each fault, and three faults or more for each line; the rest takes long.
+# One line for each fault, and one fault or two for each line; the rest takes long.
 EACH_ON_EACH = [
-    pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 4 else ())
+    pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 8 else ())
     for number, name in enumerate(LINES)
     for nth, kind in enumerate(KINDS)
 ]

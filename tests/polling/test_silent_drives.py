@@ -63,7 +63,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 @pytest.mark.slow
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead"), usually((16, 5), (16, 1), (31, 10)))
-@pytest.mark.parametrize("every", [None, 0.5], ids=["in turn", "at a rate"])
+@pytest.mark.parametrize("every", usually(None, 0.5), ids=["in turn", "at a rate"])
 def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
     count: int, dead: int, every: float | None
 ) -> None:

@@ -145,7 +145,7 @@ for at in count():
 @growing
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
-    for until in (1, 40, 150):
+    for until in (1, 40, examples(240)):
         path = tmp_path / f"{until}{suffix}"
         command = [
             sys.executable,
