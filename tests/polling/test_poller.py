@@ -32,7 +32,7 @@ from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire,
 from multidrop.transport import clock
 
 # What a machine that has much else to do may add to what a test is about.
-NOT_SENT = {str(Result.NOT_ASKED), str(Result.LATE_ANSWER_DUE)}
+NOT_SENT = {str(Status.NOT_ASKED), str(Status.LATE_ANSWER_DUE)}
 HOST_LATE = {
     str(it)
     for it in (
