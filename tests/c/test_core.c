@@ -216,6 +216,7 @@ static const struct {
     {"123 words as text", MD_ASCII, 511, {.address = 1, .function = 0x10, .count = 123, .data_len = 246}},
     {"124 words", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 124, .data_len = 248}},
     {"a byte too few", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 2, .data_len = 3}},
+    {"a word too few", MD_RTU, 0, {.address = 1, .function = 0x10, .count = 2, .data_len = 2}},
     {"1968 coils", MD_RTU, 255, {.address = 1, .function = 0x0F, .count = 1968, .data_len = 246}},
     {"1969 coils", MD_RTU, 0, {.address = 1, .function = 0x0F, .count = 1969, .data_len = 247}},
     {"a coil that is on", MD_RTU, 8, {.address = 1, .function = 5, .data_len = 2, .data = {0xFF}}},
