@@ -133,8 +133,7 @@ struct md_turn {
 void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, int64_t now_ns);
 /* The same as md_port_submit() and its like. */
 int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges,
-                   const int64_t *not_before_ns,
-                   int n);
+                   const int64_t *not_before_ns, int n);
 uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *exchanges, uint32_t n);
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent);
 void md_turn_tell_echo(struct md_turn *turn, int echo);

@@ -102,8 +102,7 @@ void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32
 }
 
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
-                   const int64_t *not_before_ns,
-                   int n)
+                   const int64_t *not_before_ns, int n)
 {
     int taken = md_turn_submit(&port->turn, exchanges, not_before_ns, n);
     if (taken && __atomic_exchange_n(&port->turn.is_idle, 0, __ATOMIC_SEQ_CST))

@@ -43,8 +43,7 @@ void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, in
 }
 
 int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges,
-                   const int64_t *not_before_ns,
-                   int n)
+                   const int64_t *not_before_ns, int n)
 {
     uint32_t submitted = turn->progress.submitted;
     uint32_t free_slots = turn->room - (submitted - get(&turn->progress.done));
@@ -100,8 +99,7 @@ static uint64_t replies(const struct md_drive *drive)
 
 /* Return what to send before the exchange; NULL: it is its turn. */
 static const struct md_exchange *find_first(struct md_before *before, const struct md_exchange *exchange,
-                                            int echo,
-                                            int64_t now_ns)
+                                            int echo, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
     if (before->then != exchange)

@@ -134,8 +134,7 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
  * a time that leaves that open. A value that was asked for by hand must be the present one: it is read
  * again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
-                                     const struct md_message *reply,
-                                     int64_t now_ns, int64_t since_ns)
+                                     const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {
     struct md_completion *completion = line->completion;
     const struct md_block *block = line->exchange->block;
@@ -159,8 +158,7 @@ enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again
 
 /* The bytes there could be the reply: decide whether they are its echo or a late reply instead. */
 static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply,
-                        int64_t now_ns,
-                        struct md_ending *ending)
+                        int64_t now_ns, struct md_ending *ending)
 {
     const struct md_exchange *exchange = line->exchange;
     int64_t since_ns;
