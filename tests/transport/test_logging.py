@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 import tty
 from pathlib import Path
 from typing import Any
 
 import checksums
 import pytest
+from lines import PATIENCE
 from simulated_bus import one
 from toy import PatientToy
 
 from multidrop import Bus, LineError, Refused
 from multidrop.drives import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.transport.aside_log import flush
 
 pytestmark = pytest.mark.usefixtures("_patient")
 
@@ -56,6 +59,7 @@ def test_a_port_that_is_lost_and_regained(caplog: pytest.LogCaptureFixture, tmp_
                 bus.read(drive, drive.output_current)
         ends = plugged_in()
         bus.line.regain()
+        flush(PATIENCE)
         for end in ends:
             os.close(end)
     levels = [
@@ -75,6 +79,7 @@ def test_frames_are_logged_at_debug_alone(caplog: pytest.LogCaptureFixture) -> N
         assert messages(caplog, "multidrop.line") == []
         with caplog.at_level(logging.DEBUG, "multidrop"):
             bus.read(drive, drive.output_current)
+            flush(PATIENCE)
     (_, request), (_, reply) = messages(caplog, "multidrop.line")[:2]
     assert request.startswith(f"{bus.line.port} > ")
     frame = checksums.rtu("01 03 00 02 00 01").hex(" ").upper()
@@ -97,3 +102,34 @@ def test_writes_refusals_and_stops_are_logged(
     told = [text for _, text in messages(caplog, "multidrop.control")]
     assert any(text.startswith("pump-1: ") and text.endswith(": done") for text in told)
     assert any(text.startswith("pump-1: stopped after ") for text in told)
+
+
+class Hanging(logging.Handler):
+    """A handler whose disk hangs until it is released."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.has_begun, self.released = threading.Event(), threading.Event()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.has_begun.set()
+        self.released.wait(PATIENCE)
+
+
+def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    handler, logger = Hanging(), logging.getLogger("multidrop.control")
+    hall.answers = lambda request: b"" if len(hall.frames) < 6 else None
+    logger.addHandler(handler)
+    stop = threading.Thread(target=drive.stop)
+    try:
+        stop.start()
+        assert handler.has_begun.wait(PATIENCE)
+        stop.join(PATIENCE)
+        assert not stop.is_alive()
+    finally:
+        handler.released.set()
+        logger.removeHandler(handler)
+        stop.join(PATIENCE)

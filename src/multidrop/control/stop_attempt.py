@@ -23,6 +23,7 @@ from multidrop.errors import (
     Unconfirmed,
     Unsupported,
 )
+from multidrop.transport.aside_log import log_aside
 
 LEAST_S = 30.0  # for which a stop is repeated where its caller gives no time
 PAUSE_S = 0.2  # before it is repeated
@@ -124,7 +125,7 @@ class StopAttempt:
             return False
         if not self._has_warned:
             self._has_warned = True
-            _log.warning("the stop is repeated for %g s at least: %s", limit, failure)
+            log_aside(_log, logging.WARNING, "the stop is repeated for %g s at least: %s", limit, failure)
         self._begin()
         self.due = now + PAUSE_S
         return True

@@ -11,6 +11,7 @@ from multidrop.drive.family import Drive
 from multidrop.planning.blocks import Block
 from multidrop.planning.schedule import Schedule
 from multidrop.polling.jobs import JobMaker, PolledJob
+from multidrop.transport.aside_log import log_aside
 
 REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
 SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
@@ -53,7 +54,8 @@ class Refusals:
         rare.rows.refusals, job.rows.refusals = job.rows.refusals, 0
         self._set_aside[rare] = job
         self._schedule.replace([job], [rare], now_ns)
-        _log.info("%s is refused (code %02XH), and asked rarely from now on", job.name, job.rows.refusal)
+        said = "%s is refused (code %02XH), and asked rarely from now on"
+        log_aside(_log, logging.INFO, said, job.name, job.rows.refusal)
 
     def forget(self, drive: Drive) -> None:
         """Set nothing of this drive aside any more: it leaves."""

@@ -27,6 +27,7 @@ from multidrop.core import (
 from multidrop.core.fork import register_at_fork
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush, log_aside
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
 
@@ -38,6 +39,7 @@ _ICOUNTER = struct.Struct("20i")
 _OVERRUN, _BUF_OVERRUN = 7, 10
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
+LOGGING_S = 1.0  # that closing waits for loggers
 _log = logging.getLogger("multidrop.line")
 
 
@@ -104,7 +106,8 @@ class Line:
         except PORT_FAILURES as failure:
             self._let_go()
             raise LineError(self.port, reason_of(failure)) from failure
-        _log.info("%s: opened%s (%s)", self.port, " again" if self._is_loss_logged else "", self.identity)
+        again = " again" if self._is_loss_logged else ""
+        log_aside(_log, logging.INFO, "%s: opened%s (%s)", self.port, again, self.identity)
         self._is_loss_logged = False
 
     def _drive(self, port: serial.SerialBase) -> Port:
@@ -144,9 +147,10 @@ class Line:
         """Drop the port and close it; no `regain` opens it any more."""
         with self._lock:
             if not self._is_over:
-                _log.info("%s: closed", self.port)
+                log_aside(_log, logging.INFO, "%s: closed", self.port)
             self._is_over = True
             self._let_go()
+        flush(LOGGING_S)
 
     def _let_go(self) -> None:
         with self._lock:
@@ -245,10 +249,12 @@ class Line:
         """Log both frames: direction, CLOCK_MONOTONIC in s, bytes, meaning."""
         if found.sent_ns:
             frame = build_request(exchange.framing, exchange.request).hex(" ").upper()
-            _log.debug("%s > %.6f %s %s", self.port, found.sent_ns / 1e9, frame, exchange.request)
+            at = found.sent_ns / 1e9
+            log_aside(_log, logging.DEBUG, "%s > %.6f %s %s", self.port, at, frame, exchange.request)
         meaning = found.reply if found.result > 0 else STATUSES[-found.result]
         at = (found.first_ns or found.begun_ns) / 1e9
-        _log.debug("%s < %.6f %s %s", self.port, at, found.raw.hex(" ").upper() or "nothing", meaning)
+        came = found.raw.hex(" ").upper() or "nothing"
+        log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self.port, at, came, meaning)
 
     def _failure(self, result: int, error: int) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
@@ -264,7 +270,7 @@ class Line:
     def _log_loss(self, why: str) -> None:
         if not self._is_loss_logged:
             self._is_loss_logged = True
-            _log.warning("%s: lost (%s)", self.port, why)
+            log_aside(_log, logging.WARNING, "%s: lost (%s)", self.port, why)
 
     def _closed(self) -> LineError:
         return (LineError if self._is_over else PortLost)(self.port, self._why_closed)
