@@ -61,7 +61,7 @@ def test_asyncio(tmp_path: Path) -> None:
 
 
 def test_two_lines(tmp_path: Path) -> None:
-    printed = run(tmp_path, "two_lines.py", "1.5")
+    printed = run(tmp_path, "two_lines.py", "4")
     for name in ("pump-1: ", "pump-2: ", "fan-1: ", "hall-1: ", "hall-2: "):
         assert name in printed
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lines import until
+from lines import PATIENCE, until
 from serial import SerialException, rfc2217
 from servers.network_server import END, manager
 from toy import Status, Toy
@@ -345,7 +345,7 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 
 @pyserials_own
 def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: FarNetwork) -> None:
-    with Bus(far_network.url, echo="off") as bus:
+    with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
     heard = far_network.all_heard()
     assert "010600140002" in heard
@@ -356,7 +356,7 @@ def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: Far
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
 def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:
     """Although the network is joined again as soon as the caller was told."""
-    with Bus(far_network.url, echo="off") as bus:
+    with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
         far_network.join()
         until(lambda: not waits_to_arrive(far_network.port))  # it arrived, or was given up
