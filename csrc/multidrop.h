@@ -71,7 +71,7 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
 /* Return the length of the good reply to `request`; 0 after a broadcast. */
 int md_reply_length(int framing, const struct md_message *request);
 
-/* ---- port.c: return 0, -errno, or a mask of enum md_refusal ---- */
+/* ---- termios.c: return 0, -errno, or a mask of enum md_refusal ---- */
 
 struct md_settings {
     uint32_t baudrate;
