@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 import threading
 import time
@@ -96,6 +97,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
 
 
 def main() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     given = json.loads(sys.argv[1])
     drives = [
         [FAMILIES[kind](at, name=f"{kind}-{number}-{at}", **KINDS[kind].makes) for kind, at in found]
