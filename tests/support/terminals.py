@@ -32,8 +32,11 @@ class Terminal:
         self.written = b""
 
     def wait_for(self, text: str, seconds: float = 60) -> None:
+        self.wait_for_match(re.escape(text), seconds)
+
+    def wait_for_match(self, pattern: str, seconds: float = 60) -> None:
         end = time.monotonic() + seconds
-        while text not in self.text:
+        while not re.search(pattern, self.text):
             assert time.monotonic() < end, self.text[-3000:]
             if select.select([self.fd], [], [], 0.1)[0]:
                 self.written += os.read(self.fd, 65536)
