@@ -18,6 +18,7 @@ from toy import PatientToy
 from multidrop import Bus, LineError, Refused
 from multidrop.drives import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.transport import aside_log
 from multidrop.transport.aside_log import flush
 
 pytestmark = pytest.mark.usefixtures("_patient")
@@ -133,3 +134,18 @@ def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
         handler.released.set()
         logger.removeHandler(handler)
         stop.join(PATIENCE)
+
+
+def test_what_waits_for_a_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    aside = aside_log._AsideLog()
+    monkeypatch.setattr(aside_log, "_aside", aside)
+    handler, logger = Hanging(), logging.getLogger("multidrop.line")
+    logger.addHandler(handler)
+    try:
+        for number in range(2 * aside_log.MOST_WAITING):
+            aside_log.log_aside(logger, logging.WARNING, "%d", number)
+        assert handler.has_begun.wait(PATIENCE)
+        assert aside._entries.qsize() <= aside_log.MOST_WAITING
+    finally:
+        handler.released.set()
+        logger.removeHandler(handler)

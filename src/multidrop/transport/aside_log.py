@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from contextlib import suppress
-from queue import SimpleQueue
+from queue import Full, Queue
 
 from multidrop.core.fork import register_at_fork
 
-Message = tuple[logging.Logger, int, str, tuple[object, ...]]
+MOST_WAITING = 10_000  # entries for a handler that hangs; what comes then is dropped
+
+Entry = tuple[logging.Logger, int, str, tuple[object, ...]]
 
 
 class _AsideLog:
@@ -18,30 +20,26 @@ class _AsideLog:
         register_at_fork(self)
 
     def forked(self) -> None:
-        self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._entries: Queue[Entry | threading.Event] = Queue(MOST_WAITING)
+        self._starting = threading.Lock()
+        self.has_begun = False
 
-    @property
-    def has_begun(self) -> bool:
-        return self._thread is not None
+    def put(self, entry: Entry | threading.Event) -> None:
+        with suppress(Full):
+            self._entries.put_nowait(entry)
+        with self._starting:
+            if not self.has_begun:
+                with suppress(RuntimeError):  # the interpreter is ending: nothing is logged any more
+                    threading.Thread(target=self._run, name="multidrop log", daemon=True).start()
+                    self.has_begun = True
 
-    def put(self, message: Message | threading.Event) -> None:
-        self._queue.put(message)
-        if self._thread is None:
-            self._thread = threading.Thread(
-                target=self._run, args=(self._queue,), name="multidrop log", daemon=True
-            )
-            with suppress(RuntimeError):  # the interpreter is ending: nothing is logged any more
-                self._thread.start()
-
-    @staticmethod
-    def _run(queue: SimpleQueue[Message | threading.Event]) -> None:
+    def _run(self) -> None:
         while True:
-            message = queue.get()
-            if isinstance(message, threading.Event):
-                message.set()
+            entry = self._entries.get()
+            if isinstance(entry, threading.Event):
+                entry.set()
                 continue
-            logger, level, text, details = message
+            logger, level, text, details = entry
             with suppress(Exception):  # a handler's own failure
                 logger.log(level, text, *details)
 
