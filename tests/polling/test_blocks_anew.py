@@ -80,7 +80,7 @@ def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
         for _ in range(6):
             for sim.response_delay in (SOON, LATE):
                 world.run(6.0)
-                seen.add(len(line._maker))
+                seen.add(len(line._maker._made))
     assert seen == {2, 3}
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import gc
 import os
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from leftovers import descriptors, threads
 from lines import polled, rows_of
 from stories import HEALTHY, Story
 from variants import LINES, VARIANTS, of_all_variants, of_one_variant
@@ -56,10 +56,6 @@ NOT_TOLD = {
 }
 
 
-def descriptors() -> int:
-    return len(list(Path("/dev/fd").iterdir()))
-
-
 def resident_kb() -> int:
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -79,10 +75,10 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     number = LINES[name]
     if VARIANTS[number][1] in NOT_TOLD.get(kind, ()):
         pytest.skip("no client can tell this yet")
-    before = descriptors(), threading.active_count()
+    before = descriptors(), threads()
     story = Story(of_one_variant(number))
     story.tell(KINDS[kind])
-    assert (descriptors(), threading.active_count()) == before
+    assert (descriptors(), threads()) == before
     assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
 
 
@@ -137,7 +133,7 @@ def test_nothing_grows_for_hours() -> None:
                     Story(drives, seed=len(seen)).tell(KINDS[kind])
         else:
             Story(of_all_variants(), seed=len(seen)).tell(KINDS["all"])
-        seen.append((resident_kb(), descriptors(), threading.active_count()))
+        seen.append((resident_kb(), descriptors(), threads()))
         print(f"pass {len(seen)}: %d kB, %d descriptors, %d threads" % seen[-1], flush=True)
     assert seen[-1][0] - seen[0][0] <= MOST_GROWTH_KB
     assert seen[-1][1:] == seen[0][1:]

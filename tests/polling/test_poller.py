@@ -17,6 +17,7 @@ from typing import Any
 
 import checksums
 import pytest
+from leftovers import descriptors, threads
 from lines import PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
 from serial import Serial
 from toy import Toy
@@ -122,10 +123,6 @@ class Polling:
 
 def drive(address: int = 1, name: str = "pump-1") -> Quick:
     return Quick(address, name=name)
-
-
-def descriptors() -> int:
-    return len(list(Path("/dev/fd").iterdir()))
 
 
 @pytest.fixture
@@ -252,9 +249,9 @@ def test_many_lines_at_once() -> None:
     with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
         drives = [polled(Quick(at, name=f"drive-{at}"), READINGS) for at in range(1, 17)]
         lines = [line(wire.path, it, name=it.drive.name) for wire, it in zip(sim.wires, drives, strict=True)]
-        threads = threading.active_count()
+        before = threads()
         with Polling(*lines) as polling:
-            assert threading.active_count() == threads + 1
+            assert threads() == before + 1
             for it in drives:
                 polling.until("ok", 3 * len(READINGS), it.drive.name)
     truth = proofs(*drives)
@@ -475,7 +472,7 @@ def test_a_plant_without_lines_is_polled_in_peace() -> None:
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
 def test_nothing_is_left_behind(port: str, end: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()  # what the process has once is there now
-    before = descriptors(), threading.active_count()
+    before = descriptors(), threads()
     if end == "never entered":
         Poller(plant(line(port, polled(drive(), ONE)))).close()
     elif end == "polled":
@@ -487,7 +484,7 @@ def test_nothing_is_left_behind(port: str, end: str) -> None:
             os.close(slave)
             os.close(master)
             polling.until("port lost")
-    assert (descriptors(), threading.active_count()) == before
+    assert (descriptors(), threads()) == before
 
 
 class Patient(Toy):
@@ -578,7 +575,7 @@ def test_motors_are_stopped_before_the_port_is_closed(port: str, pump: Simulated
 
 def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()
-    before = descriptors(), threading.active_count()
+    before = descriptors(), threads()
     good, bad = (
         line(port, polled(drive(), ONE)),
         line("/dev/null", polled(drive(1, "fan-1"), ONE), name="hall-2"),
@@ -586,7 +583,7 @@ def test_a_line_that_cannot_be_opened_is_an_error_and_leaves_nothing(port: str) 
     for _ in range(2):
         with pytest.raises(LineError, match=r"^/dev/null: it is not a serial port$"):
             Poller(plant(good, bad))
-    assert (descriptors(), threading.active_count()) == before
+    assert (descriptors(), threads()) == before
 
 
 def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import socket
 import struct
-import threading
 import time
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import checksums
 import pytest
+from leftovers import descriptors, threads
 from raw_client import PATIENCE, opened, receive
 
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
@@ -44,10 +44,6 @@ def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Messa
     return reply
 
 
-def descriptors() -> int:
-    return len(list(Path("/dev/fd").iterdir()))
-
-
 @pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"])
 @pytest.mark.parametrize("unpaced", [True, False], ids=["unpaced", "paced"])
 def test_a_line_is_read_and_opened_again(port: str, unpaced: bool) -> None:
@@ -59,20 +55,20 @@ def test_a_line_is_read_and_opened_again(port: str, unpaced: bool) -> None:
 
 
 def test_nothing_is_left_behind() -> None:
-    before = descriptors(), threading.active_count()
+    before = descriptors(), threads()
     for port in ("pty", "socket://127.0.0.1:0"):
         with Simulator([wire(port=port), wire()]) as sim:
             with opened(sim.wires[0].path) as fd:
                 exchange(fd, READ)
-            assert threading.active_count() == before[1] + 1
-    assert (descriptors(), threading.active_count()) == before
+            assert threads() == before[1] + 1
+    assert (descriptors(), threads()) == before
 
 
 def test_many_lines_are_one_thread() -> None:
     wires = [Wire([EncodedDrive(InvtCHE(at))], unpaced=True) for at in range(1, 65)]
-    before = threading.active_count()
+    before = threads()
     with Simulator(wires) as sim:
-        assert threading.active_count() == before + 1
+        assert threads() == before + 1
         for at, it in enumerate(sim.wires, 1):
             with opened(it.path) as fd:
                 assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from leftovers import descriptors, threads
 from lines import line, plant, polled, rows_of, until
 from serial import Serial
 from serial_server import SerialServer, pyserials_own, vanishing_pty
@@ -29,10 +30,6 @@ def wire(port: str = "pty") -> Wire:
     drive = simulated(Toy(1))
     drive["output_current"] = 3.25
     return Wire([drive], unpaced=True, port=port)
-
-
-def descriptors() -> int:
-    return len(list(Path("/dev/fd").iterdir()))
 
 
 def read_and_write(bus: Bus) -> None:
@@ -205,7 +202,7 @@ def test_a_port_is_opened_by_one_at_a_time() -> None:
 def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
         Line(sim.wires[0].path).close()  # what the process has once is there now
-        before = descriptors(), threading.active_count()
+        before = descriptors(), threads()
         for it in sim.wires:
             for _ in range(3):
                 Line(it.path).close()
@@ -213,7 +210,7 @@ def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path)
             Line("loop://").close()
             with pytest.raises(LineError):
                 Line("/dev/null")
-        assert (descriptors(), threading.active_count()) == before
+        assert (descriptors(), threads()) == before
 
 
 # ---- ports that fail later ----
