@@ -168,7 +168,7 @@ static enum found judge(struct md_line *line, size_t *at, int used, const struct
         return SKIPPED;
     }
     int is_late = !exchange->insists && exchange->drive->owed_count &&
-        md_late_take(line, *at, now_ns, &since_ns) > 0;
+                  md_late_take(line, *at, now_ns, &since_ns) > 0;
     if (!is_late) {
         accept(line, *at, used, reply);
         *ending = (struct md_ending){used, *at, (size_t)used};
@@ -228,7 +228,7 @@ static int is_damaged_answer(const struct md_line *line, size_t begin, int found
         return 0;
     if (found == MD_BAD_CHARACTER) /* of which the framing looks at no address */
         return line->rx_len >= begin + 5 &&
-            md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
+               md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
                md_hex_byte(line->rx + begin + 3) >= 0;
     return found == MD_BAD_CHECKSUM;
 }

@@ -109,6 +109,3 @@ class JobMaker:
     def skipped(self) -> int:
         """Slots that were left out because the line was busy."""
         return sum(job.skipped for job in self._made.values())
-
-    def __len__(self) -> int:
-        return len(self._made)
