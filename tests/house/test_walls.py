@@ -16,8 +16,10 @@ OUTSIDE = {
 # from the ground up: a room imports from itself and from those below it
 FLOORS = [
     {"errors", "printable", "iso_time", "interpreter"},
+    {"toml_check"},
     {"core"},
     {"drive"},
+    {"family_file"},
     {"drives"},
     {"planning"},
     {"transport", "plant"},

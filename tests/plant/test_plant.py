@@ -11,8 +11,9 @@ import pytest
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
-from multidrop.plant.loader import PlantError, load_plant, parse_duration
+from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
+from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing, Option
