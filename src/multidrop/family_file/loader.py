@@ -18,9 +18,10 @@ from multidrop.family_file.facts import FAMILY_KEYS, facts_of
 from multidrop.family_file.names import unusable
 from multidrop.family_file.register_keys import shown
 from multidrop.family_file.registers import MOST_REGISTERS, Declared, defaults_of
+from multidrop.family_file.verbs import SECTIONS as VERB_SECTIONS
+from multidrop.family_file.verbs import add_verbs
 from multidrop.toml_check import Key, TomlPlace, parse_document
 
-VERB_SECTIONS = ("look", "state", "set_frequency", "identify", "verb", "shows")
 SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", *VERB_SECTIONS)
 MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
@@ -136,17 +137,16 @@ def _family(
     if len(declared.places) > MOST_REGISTERS:
         place.wrong(f"declares more than {MOST_REGISTERS} registers; leave out those that nobody reads")
         return None
-    names = dict(declared.registers)
     namespace: dict[str, Any] = {
         "__module__": __name__,
         "model": path.name,
         "declared_in": path.name,
         "options": options,
-        "broadcasts": any(register.broadcast for register in names.values()),
+        "broadcasts": any(register.broadcast for register in declared.registers.values()),
         **facts,
-        **names,
+        **declared.registers,
     }
-    _add_verbs(namespace, document, names, place)
+    _add_verbs(namespace, document, declared, place)
     return _made(namespace, declared, place)
 
 
@@ -217,14 +217,18 @@ def _is_number(value: Any) -> bool:
 
 
 def _add_verbs(
-    namespace: dict[str, Any], document: Mapping[str, Any], registers: Mapping[str, Any], place: TomlPlace
+    namespace: dict[str, Any], document: Mapping[str, Any], declared: Declared, place: TomlPlace
 ) -> None:
-    """Add the verbs of the document, which this version cannot yet."""
-    for section in VERB_SECTIONS:
-        if section in document:
-            place.wrong(
-                f"[{section}] cannot be used in this version: a family's file has no verbs yet; leave it out"
-            )
+    """Add the verbs of the document. Mistakes that follow from those of a register are left out."""
+    if not document.keys() & set(VERB_SECTIONS):
+        return
+    own = TomlPlace(place.path)
+    add_verbs(namespace, document, declared.registers, own)
+    broken = [re.escape(name) for name in declared.places.keys() - declared.registers.keys()]
+    follows = re.compile(rf"\b({'|'.join(broken)})\b" if broken else "(?!)")
+    place.config_errors.extend(mistake for mistake in own.config_errors if not follows.search(mistake))
+    if own.config_errors and not place.config_errors:
+        place.config_errors.extend(own.config_errors)
 
 
 # ---- the class ----

@@ -12,6 +12,7 @@ from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
 from multidrop.sim.che import SimulatedCHE
+from multidrop.sim.declared import SimulatedDeclared
 from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.erman import SimulatedERMAN
@@ -29,6 +30,7 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Simulate a drive as its family's document says, or as a class of one's own declares."""
+    """Simulate a drive as its family's document says, or as a class or file of one's own declares."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
-    return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)
+    own = SimulatedDeclared if hasattr(type(drive), "declared_verbs") else SimulatedDrive
+    return next(kinds, own)(drive, response_delay=response_delay)
