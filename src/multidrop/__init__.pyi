@@ -28,6 +28,7 @@ from multidrop.drive.declaration_check import DeclarationError as DeclarationErr
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
 from multidrop.drive.register import HOLDING as HOLDING
+from multidrop.drive.register import HOLDING_MULTIPLE as HOLDING_MULTIPLE
 from multidrop.drive.register import INPUT as INPUT
 from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Carrier as Carrier

@@ -9,8 +9,6 @@ from typing import Any
 
 from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Table
 
-HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # written by 10H even where it is one word
-
 TABLES: Mapping[str, Table] = {"holding": HOLDING, "input": INPUT, "coil": COIL, "discrete": DISCRETE}
 _TABLE_OF_DIGIT = {"0": "coil", "1": "discrete", "3": "input", "4": "holding"}
 _DIGIT_OF_TABLE = {table: digit for digit, table in _TABLE_OF_DIGIT.items()}

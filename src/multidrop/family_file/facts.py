@@ -6,9 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from multidrop.core import Framing
+from multidrop.drive.family import LONGEST_SILENCE
+from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.register import Table
 from multidrop.drive.timing import Settings
-from multidrop.family_file.addresses import HOLDING_MULTIPLE, TABLES, Counting
+from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.register_keys import WRITES, shown
 from multidrop.toml_check import Key, TomlPlace, duration_of
 
@@ -40,9 +42,9 @@ FAMILY_KEYS = {
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
 _TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
-MOST_TOGETHER = {"holding": 125, "input": 125, "coil": 2000, "discrete": 2000}  # V1.1b3, section 6
-LONGEST_SILENCE = 1.0  # s
+MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
 LONGEST_WAIT = 60.0  # s
+_LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
 
 def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
@@ -50,7 +52,7 @@ def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> 
     facts: dict[str, Any] = {_TEXTS[key]: given[key] for key in _TEXTS if key in given}
     for key in _DURATIONS:
         seconds = duration_of(given, key, place)
-        most = LONGEST_SILENCE if key == "silence" else LONGEST_WAIT
+        most = _LONGEST.get(key, LONGEST_WAIT)
         if seconds is not None and seconds > most:
             place.wrong(f"{key} = {given[key]!r} is more than {most:g} s; write {FAMILY_KEYS[key].example}")
         elif seconds is not None:
@@ -174,11 +176,6 @@ def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) ->
                     place.wrong(f"together: {table} = {shown(value)} is not {most_of} registers in one read")
             elif (span := place.attempt(_gap, table, value, counting)) is not None:
                 gaps[TABLES[table]] = span
-    holding = TABLES["holding"]
-    if holding in most:
-        most[HOLDING_MULTIPLE] = most[holding]
-    if holding in gaps:
-        gaps[HOLDING_MULTIPLE] = gaps[holding]
     named: dict[str, Any] = {"most_registers": most, "readable_gaps": gaps}
     return {key: value for key, value in named.items() if value}
 

@@ -252,7 +252,10 @@ def _tell(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
     """Report mistakes of declarations at the places of their registers."""
     for mistake in mistakes:
         name, _, sentence = mistake.partition(": ")
-        declared.places.get(name, place).wrong(sentence)
+        if name in declared.places:
+            declared.places[name].wrong(sentence)
+        else:
+            place.within("[family]").wrong(mistake)
 
 
 def _class_name(path: Path) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from multidrop.drive.register import Access, Carrier, Register, command, reading, setting
-from multidrop.family_file.addresses import HOLDING_MULTIPLE, TABLES, Counting
+from multidrop.drive.register import HOLDING_MULTIPLE, Access, Carrier, Register, command, reading, setting
+from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.names import enumeration, flags, unusable
 from multidrop.family_file.register_keys import DEFAULT_KEYS, NOT_DETAILS, REGISTER_KEYS, converted, shown
 from multidrop.toml_check import TomlPlace
