@@ -21,9 +21,16 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
     A byte order mark before the text is skipped: some editors write one.
     """
     try:
-        document = tomllib.loads(path.read_text("utf-8-sig"))
+        data = path.read_bytes()
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
+    return parse_document(data)
+
+
+def parse_document(data: bytes) -> dict[str, Any]:
+    """Return the tables of a TOML file's bytes; ValueError where they are none."""
+    try:
+        document = tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as failure:
         raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
     except RecursionError as failure:
@@ -52,6 +59,12 @@ class Key:
     example: str
     needed: bool = False
 
+    def takes(self, value: Any) -> bool:
+        """Return True for a value of its type that says something; true and false are no numbers."""
+        if isinstance(value, bool):
+            return self.kind is bool
+        return isinstance(value, self.kind) and value not in ("", [])
+
 
 @dataclass(frozen=True)
 class TomlPlace:
@@ -68,6 +81,14 @@ class TomlPlace:
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
             yield table, TomlPlace(self.path, (*self.labels, label), self.config_errors, self.seen)
+
+    def within(self, *labels: str) -> TomlPlace:
+        """Return a place inside this one."""
+        return TomlPlace(self.path, (*self.labels, *labels), self.config_errors, self.seen)
+
+    def of_file(self, path: Path, *labels: str) -> TomlPlace:
+        """Return a place in another file that belongs to this one."""
+        return TomlPlace(path, labels, self.config_errors, self.seen)
 
     def wrong(self, sentence: object) -> None:
         """Add an error. What a terminal would not print as it stands is spelt out."""
@@ -93,14 +114,14 @@ class TomlPlace:
         if not isinstance(table, dict):
             self.wrong(f"{table!r} is not a table with {', '.join(keys)}")
             return {}
-        meant = self._unknown(table, keys)
+        meant = self.unknown(table, keys)
         good = {}
         for name, key in keys.items():
             value = table.get(name)
             if value is None:
                 if key.needed and name not in meant:
                     self.wrong(f"{name!r} is missing; add {key.example}")
-            elif isinstance(value, bool) or not isinstance(value, key.kind) or value in ("", []):
+            elif not key.takes(value):
                 self.wrong(f"{name} = {value!r} is not right; write {key.example}")
             elif isinstance(value, str) and not value.isprintable():
                 self.wrong(f"{name} = {value!r} has characters that do not print; leave them out")
@@ -108,7 +129,7 @@ class TomlPlace:
                 good[name] = value
         return good
 
-    def _unknown(self, table: Mapping[str, Any], keys: Mapping[str, Key]) -> set[str]:
+    def unknown(self, table: Mapping[str, Any], keys: Mapping[str, object]) -> set[str]:
         """Add an error for each unknown key; return the known ones that they probably mean."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:

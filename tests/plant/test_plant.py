@@ -290,7 +290,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
             'line "L", drive "D": there is no model \'innovert-ibt\'; '
-            "did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "did you mean innovert-ibd? (or write path/to/file.toml or file.py:Class)",
         ),
         (
             HEAD + TOY + 'poll = ["control"]',

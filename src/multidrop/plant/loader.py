@@ -12,6 +12,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
+from multidrop.family_file.loader import FamilyError
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
@@ -116,7 +117,17 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
     text = table.get("model") if isinstance(table, dict) else None
     if not text or not isinstance(text, str):
         return None
-    return place.attempt(find_model, text, place.path.parent)
+    try:
+        return find_model(text, place.path.parent)
+    except FamilyError as wrong:
+        once = ("family", text)
+        if once not in place.seen:  # else all of its mistakes are there already
+            for mistake in wrong.mistakes:
+                place.wrong(mistake)
+        place.seen.setdefault(once, "")
+    except ValueError as mistake:
+        place.wrong(mistake)
+    return None
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
