@@ -229,10 +229,6 @@ EDITS: dict[str, tuple[Change, str]] = {
         "only 0",
     ),
     "100 % of nothing": (section("set_frequency", of="nothing"), "neither an option nor"),
-    "an option that confirms the file": (
-        lambda document: document["option"].update(confirmed={"unit": "", "span": [1, 1], "meaning": "yes"}),
-        "leave it out",
-    ),
 }
 
 

@@ -14,7 +14,6 @@ from multidrop.drive.verbs import STOPPING
 from multidrop.family_file.declared import TURNING, DeclaredVerbs
 from multidrop.family_file.hazards import STARTING
 from multidrop.family_file.looks import Criterion, Look, limits_of
-from multidrop.family_file.places import under
 from multidrop.family_file.sections import FAULT, RUNNING, STANDING
 from multidrop.toml_check import TomlPlace
 
@@ -38,14 +37,14 @@ def check_looks(declared: DeclaredVerbs, registers: Registers, place: TomlPlace)
     for wrong in _missing(declared):
         place.wrong(wrong)
     for wrong in _order(declared):
-        under(place, "[state]").wrong(wrong)
+        place.within("[state]").wrong(wrong)
     for look in declared.looks_of(Condition.STOPPED):
         for wrong in _standstill(look, declared, registers):
-            under(place, f"[look] {look}").wrong(wrong)
+            place.within(f"[look] {look}").wrong(wrong)
     for wrong in _identity(declared):
-        under(place, "[identify]").wrong(wrong)
+        place.within("[identify]").wrong(wrong)
     for wrong in _shown(declared, registers):
-        under(place, "[shows]").wrong(wrong)
+        place.within("[shows]").wrong(wrong)
 
 
 def _missing(declared: DeclaredVerbs) -> Iterator[str]:
