@@ -350,7 +350,7 @@ def test_what_is_no_file(tmp_path: Path) -> None:
 def test_mistakes_are_bounded(tmp_path: Path) -> None:
     text = HEAD + "[reading]\n" + "".join(f"a{number} = 5\n" for number in range(300))
     found = mistakes(tmp_path, text)
-    assert (len(found), found[-1]) == (201, "and 100 more mistakes")
+    assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not told; mend these first")
 
 
 def test_every_key_is_in_the_reference() -> None:

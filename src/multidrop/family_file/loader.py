@@ -77,7 +77,7 @@ def load_family(path: Path | str) -> type[Drive]:
     files[whole] = data
     family = _family(document, path, place, files)
     if family is None:
-        raise FamilyError(_at_most(place.config_errors))
+        raise FamilyError(_at_most(place))
     _loaded[whole] = _Loaded(files, family)
     return family
 
@@ -103,9 +103,12 @@ def _bytes(path: Path, what: str) -> bytes:
     return data
 
 
-def _at_most(mistakes: list[str]) -> tuple[str, ...]:
-    left = len(mistakes) - MOST_MISTAKES
-    return (*mistakes[:MOST_MISTAKES], *([f"and {left} more mistakes"] if left > 0 else []))
+def _at_most(place: TomlPlace) -> tuple[str, ...]:
+    left = len(place.config_errors) - MOST_MISTAKES
+    if left > 0:
+        del place.config_errors[MOST_MISTAKES:]
+        place.wrong(f"{left} more mistakes are not told; mend these first")
+    return tuple(place.config_errors)
 
 
 # ---- the document ----
