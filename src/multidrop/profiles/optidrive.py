@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from multidrop.drive import Refused
 from multidrop.drive.register import Access
+from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
 from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
 from multidrop.profiles.role import Role
@@ -81,6 +82,11 @@ class Optidrive(Profile):
 
     def _is_tripped(self, status: int) -> bool:
         return bool(status & OptidriveStatus.TRIPPED)
+
+    def _fault(self) -> Script[str]:
+        """Return the trip's code, of the high byte, which the family may name in a register `fault`."""
+        named = yield from super()._fault()
+        return named or f"code {(yield from self._status()) >> 8}"
 
     def _turns(self, status: int) -> bool:
         return bool(status & OptidriveStatus.RUNNING)

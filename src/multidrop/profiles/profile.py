@@ -297,7 +297,7 @@ class Profile(Drive):
         if (yield from self._tripped(status)):
             return State(Condition.FAULT, fault=(yield from self._fault()) or "it shows a fault")
         condition = self._condition(status)
-        if condition is Condition.STOPPED and (yield from read(self.output_frequency)) > 0:
+        if condition is Condition.STOPPED and (yield from read(self.output_frequency)) != 0:
             return State(Condition.DECELERATING, direction)
         if condition is Condition.STOPPED:
             return State(condition, note=self._not_ready(status))
