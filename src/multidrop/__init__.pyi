@@ -28,6 +28,7 @@ from multidrop.drive.declaration_check import DeclarationError as DeclarationErr
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
 from multidrop.drive.register import HOLDING as HOLDING
+from multidrop.drive.register import HOLDING_MULTIPLE as HOLDING_MULTIPLE
 from multidrop.drive.register import INPUT as INPUT
 from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Carrier as Carrier
@@ -57,6 +58,8 @@ from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
+from multidrop.family_file.loader import FamilyError as FamilyError
+from multidrop.family_file.loader import load_family as load_family
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant
 from multidrop.plant.model import Plant as Plant

@@ -115,7 +115,8 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
         (
             ["models", "innovert-ibt"],
-            "there is no model 'innovert-ibt'; did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "there is no model 'innovert-ibt'; did you mean innovert-ibd? "
+            "(or write path/to/file.toml or file.py:Class)",
         ),
     ],
 )

@@ -11,8 +11,9 @@ import pytest
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
-from multidrop.plant.loader import PlantError, load_plant, parse_duration
+from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
+from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing, Option
@@ -289,7 +290,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
             'line "L", drive "D": there is no model \'innovert-ibt\'; '
-            "did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "did you mean innovert-ibd? (or write path/to/file.toml or file.py:Class)",
         ),
         (
             HEAD + TOY + 'poll = ["control"]',

@@ -56,8 +56,14 @@ class Table:
     carrier: Carrier = Carrier.WORD
     kept: Kept = Kept.UNKNOWN  # where the function code alone decides it
 
+    @property
+    def read_space(self) -> tuple[Carrier, int | None]:
+        """Key of the tables that are read alike: their registers may share a request."""
+        return self.carrier, self.read
+
 
 HOLDING = Table("holding register", 0x03, 0x06)
+HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # also one register is written by 10H
 INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)

@@ -6,7 +6,6 @@ file with `profile = "…"`.
 
 from collections.abc import Mapping
 
-from multidrop.drive import Drive
 from multidrop.profiles.cia402 import CiA402
 from multidrop.profiles.danfoss_fc import DanfossFC
 from multidrop.profiles.delta import Delta
@@ -28,7 +27,7 @@ __all__ = [
     "Role",
 ]
 
-PROFILES: Mapping[str, type[Drive]] = {
+PROFILES: Mapping[str, type[Profile]] = {
     "profidrive": Profidrive,
     "cia402": CiA402,
     "danfoss-fc": DanfossFC,

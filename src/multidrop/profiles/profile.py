@@ -62,10 +62,7 @@ class Profile(Drive):
     def __init_subclass__(cls) -> None:
         """Complete the roles by the profile. Raises DeclarationError with all that is wrong with them."""
         own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
-        wrong = [sentence for name, one in own.items() for sentence in cls._errors_of(name, one)]
-        if own:
-            wrong += cls._errors_together()
-        if wrong:
+        if own and (wrong := cls.role_mistakes(own)):
             raise DeclarationError(cls.__name__, wrong)
         for name, register in own.items():
             if name in cls.roles:
@@ -74,6 +71,13 @@ class Profile(Drive):
                 setattr(cls, name, whole)
         cls.options = {**Profile.options, **cls.options}
         super().__init_subclass__()
+
+    @classmethod
+    def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
+        """Return a sentence for each mistake in a family's own registers, and in them together with ours."""
+        wrong = [sentence for name, one in own.items() for sentence in cls._errors_of(name, one)]
+        found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
+        return wrong + list(cls._errors_together(found))
 
     @classmethod
     def _errors_of(cls, name: str, register: Register[Any]) -> Iterator[str]:
@@ -85,8 +89,7 @@ class Profile(Drive):
             yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
 
     @classmethod
-    def _errors_together(cls) -> Iterator[str]:
-        found = {name: getattr(cls, name, None) for name in cls.roles}
+    def _errors_together(cls, found: Mapping[str, Any]) -> Iterator[str]:
         for name, role in cls.roles.items():
             if role.needed and not isinstance(found[name], Register):
                 yield f"{name}: this profile needs a register of this name, which is not declared"
@@ -96,6 +99,11 @@ class Profile(Drive):
         signature = found.get("signature")
         if signature is not None and signature.values is None:
             yield "signature: it needs names for the values that tell the family"
+
+    @classmethod
+    def readings(cls) -> tuple[Register[Any], ...]:
+        """Return the registers that are polled by default: not those that only tell the family."""
+        return tuple(one for one in super().readings() if one.name not in ("station", "signature"))
 
     # ---- for each profile ----
 

@@ -45,7 +45,7 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[Table, int], MemoryCell] = {}
+        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables that are read alike share them
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
@@ -54,7 +54,7 @@ class Memory:
             self._declare(register)
 
     def _cell(self, table: Table, address: int) -> MemoryCell:
-        return self._cells.setdefault((table, address), MemoryCell(table, address))
+        return self._cells.setdefault((_space(table), address), MemoryCell(table, address))
 
     def _declare(self, register: Register[Any]) -> None:
         table = register.table
@@ -129,7 +129,13 @@ class Memory:
 
     def of(self, register: Register[Any]) -> list[MemoryCell]:
         """Return the register's cells, in the order of their addresses."""
-        return [self._cells[register.table, register.address + at] for at in range(register.words)]
+        space = _space(register.table)
+        return [self._cells[space, register.address + at] for at in range(register.words)]
+
+
+@cache
+def _space(table: Table) -> object:
+    return table if table.read is None else table.read_space
 
 
 @cache  # needed at every request
