@@ -7,20 +7,21 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from profile_families import MAKE, STARTS
+from profile_families import ALL, MAKE, SHIPPED_AS, STARTS
 from simulated_bus import SimulatedBus, is_write, one
 
+from multidrop.control.ramp import ramp
 from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive
 from multidrop.drives import YD1000, InnovertIBD, InvtCHE
 from multidrop.errors import DriveRefused, NoReply, NotDone, Refused, Unconfirmed
 from multidrop.sim import simulated
 
-every_family = pytest.mark.parametrize("model", MAKE)
 FAULT = 4
+KIND = {**{name: name for name in MAKE}, **{f"shipped {name}": kind for name, kind in SHIPPED_AS.items()}}
 
 
-@pytest.fixture(params=MAKE)
+@pytest.fixture(params=ALL)
 def model(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -34,8 +35,8 @@ class Line:
     """A simulated bus with one drive; `starts` are the requests that turn its motor."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-        self.is_start = STARTS[model]
-        self.bus, self.drive, self.sim = one(monkeypatch, MAKE[model](1))
+        self.is_start = STARTS[KIND[model]]
+        self.bus, self.drive, self.sim = one(monkeypatch, ALL[model](1))
         self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
 
     @property
@@ -218,7 +219,7 @@ def test_a_power_cycle_forgets_the_setpoint(line: Line, model: str) -> None:
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
     begun = len(line.writes)
-    if model == "danfoss-fc51":  # whose reference cannot be read
+    if KIND[model] == "danfoss-fc51":  # whose reference cannot be read
         line.drive.start()
         return
     with pytest.raises(Refused, match="set_frequency"):
@@ -260,11 +261,11 @@ OTHERS: dict[str, Callable[[int], Drive]] = {
 def test_a_drive_of_another_make_is_not_written_to(
     model: str, other: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if other == model:
+    if other == KIND[model]:
         pytest.skip("this is its own make")
     there = simulated(OTHERS[other](1))
     bus = SimulatedBus(monkeypatch, there)
-    drive: Any = bus.attach(MAKE[model](1))
+    drive: Any = bus.attach(ALL[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
         with pytest.raises((Refused, NoReply, DriveRefused)):
             call()
@@ -277,7 +278,7 @@ NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 
 def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
-    if model in NO_DIRECTION:
+    if KIND[model] in NO_DIRECTION:
         with pytest.raises(Refused, match="direction"):
             line.drive.start(Direction.REVERSE)
         assert not line.starts
@@ -286,7 +287,7 @@ def test_a_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.bus.sleep(2)
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
-    if model in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
+    if KIND[model] in ("danfoss-fc51", "schneider-atv320"):  # whose status shows no direction
         with pytest.raises(Refused, match="cannot say which way"):
             line.drive.start()
     else:
@@ -326,3 +327,12 @@ def test_a_frequency_out_of_range_is_refused(line: Line) -> None:
         with pytest.raises(ValueError, match="Hz"):
             line.drive.set_frequency(hz)
     assert line.writes == []
+
+
+def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
+    """In Hz, also where the reference is a percentage that cannot be read."""
+    line.drive.set_frequency(20)
+    begun = len(line.writes)
+    ramp(line.drive, 22, rate=1, every=1)
+    assert len(line.writes) - begun == 2
+    assert line.sim.motor.target == pytest.approx(22, abs=0.01)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum, IntFlag
+from functools import partial
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.register import Kept, command, reading, setting
+from multidrop.drives.registry import shipped_family
 from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
 
 
@@ -143,4 +145,25 @@ STARTS: dict[str, Callable[[Message], bool]] = {
     "delta-vfd-el": lambda it: it.start == 0x2000 and bool(_word(it) & 0x02),
     "invt-goodrive": lambda it: it.start == 0x2000 and _word(it) in (1, 2, 3, 4),
     "optidrive-e3": lambda it: it.start == 0 and bool(_word(it) & 0x01),
+}
+
+# The families that ship as files, with the one above whose words they share.
+SHIPPED_AS = {
+    "abb-acs355": "abb-acs355",
+    "danfoss-fc51": "danfoss-fc51",
+    "delta-ms300": "delta-vfd-el",
+    "delta-vfd-el": "delta-vfd-el",
+    "optidrive-e3": "optidrive-e3",
+}
+
+
+def shipped(name: str, address: int) -> Drive:
+    """Return a drive of a shipped family as its owner declares it."""
+    of_percent = {"maximum_frequency": 50} if name in ("abb-acs355", "danfoss-fc51") else {}
+    return shipped_family(name)(address, confirmed=1, **of_percent)
+
+
+ALL = {
+    **MAKE,
+    **{f"shipped {name}": partial(shipped, name) for name in SHIPPED_AS},
 }
