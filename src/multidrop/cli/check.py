@@ -19,6 +19,7 @@ from multidrop.drive.register import Access, Kept, Register
 from multidrop.drive.verbs import MOVING
 from multidrop.drives.registry import SHIPPED, shipped_family
 from multidrop.family_file.loader import FamilyError, load_family
+from multidrop.family_file.step_words import declared_in_words
 
 Remark = tuple[str, str]  # a register or a key, and the sentence about it
 
@@ -42,10 +43,18 @@ def run(arguments: argparse.Namespace) -> int:
         return 1
     unknown, refused = list(_unknown(family)), list(_refused(family))
     if arguments.json:
-        more = {"mistakes": [], "not_known": unknown, "will_be_refused": refused}
+        more = {
+            "mistakes": [],
+            "steps": list(_verbs(family)),
+            "not_known": unknown,
+            "will_be_refused": refused,
+        }
         print_text(json.dumps(facts(family) | more, indent=2))
         return 0
+    verbs = list(_verbs(family))
     lines = [sheet(family)]
+    if verbs:
+        lines += ["", "verbs", *_lines(verbs)]
     for heading, remarks in (("not known", unknown), ("will be refused", refused)):
         lines += ["", heading, *_lines(remarks)]
     print_text("\n".join([*lines, "", _verdict(family, arguments.file)]))
@@ -53,7 +62,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _lines(remarks: list[Remark]) -> Iterator[str]:
-    for name, sentence in remarks or [("nothing", "")]:
+    if not remarks:
+        yield "  nothing"
+    for name, sentence in remarks:
         yield from wrapped(sentence, f"  {name:<{INDENT}}", " " * (INDENT + 2))
 
 
@@ -64,6 +75,12 @@ def _verdict(family: type[Drive], file: Path) -> str:
         f"No mistake found in {file}. It can move a motor, and nobody has tested it: compare every line with "
         "the\nmanual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
     )
+
+
+def _verbs(family: type[Drive]) -> Iterator[Remark]:
+    declared = getattr(family, "declared_verbs", None)
+    if declared is not None:
+        yield from declared_in_words(declared, family.registers)
 
 
 # ---- what the file leaves open ----
