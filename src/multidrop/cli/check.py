@@ -17,6 +17,7 @@ from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register
 from multidrop.drive.verbs import MOVING
+from multidrop.drives.registry import SHIPPED, shipped_family
 from multidrop.family_file.loader import FamilyError, load_family
 from multidrop.family_file.step_words import declared_in_words
 
@@ -24,13 +25,16 @@ Remark = tuple[str, str]  # a register or a key, and the sentence about it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE.toml", type=Path, help="a family's file")
+    parser.add_argument(
+        "file", metavar="FILE.toml", type=Path, help="a family's file, or a shipped family's name"
+    )
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     try:
-        family = load_family(arguments.file)
+        name = str(arguments.file)
+        family = shipped_family(name) if name in SHIPPED else load_family(arguments.file)
     except FamilyError as wrong:
         if arguments.json:
             print_text(json.dumps({"mistakes": wrong.mistakes}, indent=2))

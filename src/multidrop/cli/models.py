@@ -16,7 +16,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
+from multidrop.drives.registry import SHIPPED, find_model, shipped_family
 
 INDENT = 16  # of a family's facts
 
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
-        families = list(MODELS.values())
+        families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -149,8 +150,25 @@ def _family(
         **facts,
         **declared.registers,
     }
-    _add_verbs(namespace, document, declared, place)
-    return _made(namespace, declared, place)
+    base = _base(given.get("profile"), document, of_family)
+    if base is Drive:
+        _add_verbs(namespace, document, declared, place)
+    return _made(base, namespace, declared, place)
+
+
+def _base(profile: str | None, document: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
+    """Return the class that the family derives from: a profile's, which then has all of its verbs."""
+    if profile is None:
+        return Drive
+    from multidrop.profiles import PROFILES  # few files name one
+
+    if profile not in PROFILES:
+        near = difflib.get_close_matches(profile, PROFILES, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(PROFILES)}"
+        place.wrong(f"profile = {shown(profile)} is not known; {hint}")
+    for section in [section for section in VERB_SECTIONS if section in document]:
+        place.wrong(f"[{section}] says what the profile says already; leave it out, or the profile")
+    return PROFILES.get(profile, Drive)
 
 
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
@@ -237,15 +255,20 @@ def _add_verbs(
 # ---- the class ----
 
 
-def _made(namespace: dict[str, Any], declared: Declared, place: TomlPlace) -> type[Drive] | None:
+def _made(
+    base: type[Drive], namespace: dict[str, Any], declared: Declared, place: TomlPlace
+) -> type[Drive] | None:
     """Return the class of this namespace; None where anything in the file is wrong."""
     broken = declared.places.keys() - declared.registers.keys()
     if place.config_errors:
         bounds = {*namespace["options"], *broken}
         _tell(declaration_errors(declared.registers, TAKEN_NAMES, bounds), declared, place)
+        roles = getattr(base, "role_mistakes", None)
+        mistakes = roles(declared.registers) if roles else []
+        _tell([one for one in mistakes if one.partition(":")[0] not in broken], declared, place)
         return None
     try:
-        return type(_class_name(place.path), (Drive,), namespace)
+        return type(_class_name(place.path), (base,), namespace)
     except DeclarationError as wrong:
         _tell(wrong.mistakes, declared, place)
         return None
