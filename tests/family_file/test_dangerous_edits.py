@@ -158,6 +158,20 @@ EDITS: dict[str, tuple[Change, str]] = {
         lambda document: document["verb"].update(jog={"steps": [WRITE_047F, {"started": True}]}),
         "does not refuse on tripped",
     ),
+    "start writes only when": (
+        lambda document: [step.update(when="inhibited") for step in steps("start")(document) if "write" in step],
+        "without `when`",
+    ),
+    "start asks for its direction where no state tells one": (
+        step("start", 8, value={"forward": 0x047F, "reverse": 0x047D, "without": "as it turns"}),
+        "cannot tell how it turns",
+    ),
+    "reset writes nothing": (without("reset_fault", 1), "writes nothing"),
+    "reset awaits that it runs": (inserted("reset_fault", 3, {"started": True}), "belongs to a start"),
+    "reset has directions": (
+        step("reset_fault", 1, value={"forward": 0x04F6, "reverse": 0x04F4, "without": "refuse"}),
+        "turns nothing",
+    ),
     # ---- looks ----
     "a stop look that always holds": (
         section("look", stands={"register": "status", "lacks": []}),
