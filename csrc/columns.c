@@ -34,13 +34,15 @@ static int is_inside(size_t len, size_t at, int format)
 
 static uint64_t bits_of(const uint8_t *first, int format)
 {
-    int words = words_of[format & FORMAT];
-    uint64_t bits = 0;
-    for (int i = 0; i < words; i++) {
-        const uint8_t *word = first + 2 * (format & MD_LOW_WORD_FIRST ? words - 1 - i : i);
-        unsigned value = md_get16(word);
-        bits = bits << 16 | (format & MD_LOW_BYTE_FIRST ? (value & 0xFF) << 8 | value >> 8 : value);
+    int words = words_of[format & FORMAT], step = 2;
+    if (format & MD_LOW_WORD_FIRST) {
+        first += 2 * (words - 1);
+        step = -2;
     }
+    int high = format & MD_LOW_BYTE_FIRST ? 1 : 0;
+    uint64_t bits = 0;
+    for (int i = 0; i < words; i++, first += step)
+        bits = bits << 16 | (uint64_t)(first[high] << 8 | first[1 - high]);
     return bits;
 }
 
@@ -208,6 +210,38 @@ static void set_bit(uint8_t *bits, size_t at, int on)
     bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
 }
 
+/* The formats that most registers have, in bytes. */
+static const uint8_t common_bytes[UINT8_MAX + 1] = {
+    [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_F32] = 4, [MD_F32 | MD_LOW_WORD_FIRST] = 4,
+};
+
+static inline double common_number(const uint8_t *first, int format)
+{
+    uint32_t one = md_get16(first), two = common_bytes[format] == 4 ? md_get16(first + 2) : 0;
+    switch (format) {
+    case MD_I16: return (int16_t)one;
+    case MD_U32: return one << 16 | two;
+    case MD_I32: return (int32_t)(one << 16 | two);
+    case MD_F32: return of_float(one << 16 | two);
+    case MD_F32 | MD_LOW_WORD_FIRST: return of_float(two << 16 | one);
+    default: return one;
+    }
+}
+
+/* The same as find_value, in half the time for a field that has nothing but a common format. */
+static inline uint16_t find_common_value(const struct md_message *reply, const struct md_block *block,
+                                         const struct md_field *field, double *value)
+{
+    size_t at = 2 * (size_t)field->at, bytes = common_bytes[field->format];
+    if (bytes == 0 || field->extra || at + bytes > reply->data_len)
+        return find_value(reply, block, field, value);
+    double found = common_number(reply->data + at, field->format) * field->multiplier / field->divisor;
+    if (isnan(found))
+        return MD_NO_VALUE;
+    *value = found + 0.0;
+    return MD_OK;
+}
+
 /* Return why none of the fields has a value; MD_OK: each has its own status. */
 static uint16_t status_of(const struct md_completion *completion)
 {
@@ -227,7 +261,7 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
         const struct md_field *field = &block->fields[i];
         size_t row = columns->rows++;
         double value = 0;
-        uint16_t status = common ? common : find_value(&completion->reply, block, field, &value);
+        uint16_t status = common ? common : find_common_value(&completion->reply, block, field, &value);
         columns->time[row] = sent_ns + utc_minus_monotonic_ns;
         columns->sent[row] = sent_ns;
         columns->uncertainty[row] = status ? 0 : completion->first_ns - sent_ns;

@@ -213,9 +213,12 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     const uint8_t *bytes = data + HEADER + FIELDS * FIELD;
     size_t len = size - HEADER - FIELDS * FIELD;
     uint8_t *exact = exact_copy(bytes, len);
-    for (int wire = -1; wire <= 256; wire++)
+    for (int wire = -1; wire <= 256; wire++) {
+        if (wire > 0 && (wire & 0x3F) > MD_BCD32 + 1)
+            continue; /* no such format, like the one before */
         for (size_t at = 0; at <= 8 * len + 1; at++)
             must(is_same(md_value(exact, len, at, wire), expected(exact, len, at, wire)));
+    }
     for (int i = 0; i < FIELDS; i++)
         must(isnan(md_value(exact, len, SIZE_MAX - data[6 + i % 2], fields[i].format)));
     struct md_completion completion = {.result = data[0] & 0x80 ? -(1 + data[0] % 15) : 5, .begun_ns = 7,
