@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 from multidrop.core import Framing
@@ -129,7 +130,9 @@ class Memory:
             multiplier, addend, divisor = coding.factors
             power = self._power(register)
             multiplier, divisor = multiplier * 10 ** max(power, 0), divisor * 10 ** max(-power, 0)
-            self.set_raw(register, _placed(register, round((value * divisor - addend) / multiplier)))
+            count = value * divisor - addend
+            exact = Fraction(count, multiplier) if isinstance(count, int) else count / multiplier
+            self.set_raw(register, _placed(register, round(exact)))
 
     def _power(self, register: Register[Any]) -> int:
         return 0 if register.scaled_by is None else int(self.get(register.scaled_by) or 0)
