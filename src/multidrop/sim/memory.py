@@ -120,7 +120,7 @@ class Memory:
         """
         coding = register.coding
         if value is None:
-            self.set_raw(register, _no_value(register))
+            self._put(register, *_no_value(register))
         elif register.values is not None:
             self.set_raw(register, _placed(register, int(value)))
         elif register.is_float:
@@ -139,11 +139,13 @@ class Memory:
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
         """Hold these bits, of a register that is a part of its words beside those of the others."""
+        self._put(register, raw, register.coding.mask)
+
+    def _put(self, register: Register[Any], raw: int, mask: int) -> None:
         cells = self.of(register)
         size = _BYTES[register.table.carrier]
         order = "AB" if register.table.carrier is Carrier.BIT else register.coding.order
         before = arranged(b"".join(pack(cell.table, cell.raw) for cell in cells), order)
-        mask = register.coding.mask
         bits = (int.from_bytes(before) & ~mask) | (raw & mask)
         data = arranged(bits.to_bytes(len(before)), order)
         for at, cell in enumerate(cells):
@@ -183,11 +185,12 @@ def _placed(register: Register[Any], raw: int) -> int:
     return raw << register.part[0] & register.coding.mask
 
 
-def _no_value(register: Register[Any]) -> int:
-    for _, pattern in register.coding.invalid_patterns:
-        return pattern
+def _no_value(register: Register[Any]) -> tuple[int, int]:
+    """Return bits that mean no value, and the mask of those that matter."""
+    for mask, pattern in register.coding.invalid_patterns:
+        return pattern, mask
     if register.is_float:
-        return bits_of(math.nan, register.number_format)
+        return bits_of(math.nan, register.number_format), register.coding.mask
     raise ValueError(f"{register.name} has no count that means no value")
 
 
