@@ -20,6 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from examples import usually
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -347,7 +348,7 @@ class Stops(RuleBasedStateMachine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", usually(*KINDS))
 def test_nothing_moves_after_a_stop(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(

@@ -121,6 +121,7 @@ def lines_that_tell(kind: str) -> Iterator[list[Drive]]:
         yield of_all_variants()
 
 
+@pytest.mark.long
 def test_nothing_grows_for_hours() -> None:
     """All families on one line; where there are hours, each alone too, with all kinds of faults in turn."""
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))
