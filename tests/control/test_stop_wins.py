@@ -3,7 +3,7 @@
 Real ports and threads, and responders of our own that note every frame. Order is judged on the wire alone:
 a line delivers in order, so what comes after a stop's first frame has left after the stop was called.
 Threads that start motors are held in the middle of their looks until the stop is called. More of it:
-`STOP_EXAMPLES=100 pytest tests/control/test_stop_wins.py`.
+`STOP_EXAMPLES=100 pytest -m '' tests/control/test_stop_wins.py`.
 """
 
 from __future__ import annotations
