@@ -14,7 +14,6 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 
-
 ANSWERED = ("ok", "no valid value")  # a machine that others load may miss an answer
 
 

@@ -12,6 +12,7 @@ from multidrop.drive.row_field import row_field
 from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import kind, sending, silence
 from multidrop.planning.schedule import Job
+from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.exchange import make_read
 
@@ -43,6 +44,7 @@ class PolledJob(Job):
     exchange: Exchange
     rows: RowLayout
     own_ns: int  # of silence and characters, to which the response delay comes
+    may_be_too_long: bool  # for the drive
 
     @property
     def name(self) -> str:
@@ -84,9 +86,9 @@ class JobMaker:
             self._made[key] = self.make(drive, block, period_ns)
         return self._made[key]
 
-    def make(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
+    def make(self, drive: Drive, block: Block, period_ns: int | None, *, has_rows: bool = True) -> PolledJob:
         """Make a job of its own."""
-        rows = self._names.layout(drive, block)
+        rows = self._names.layout(drive, block) if has_rows else RowLayout(0, [])
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(
             drive=drive.address,
@@ -98,6 +100,7 @@ class JobMaker:
             exchange=make_read(drive, block, self._bus.peer(drive), rows, period=(period_ns or 0) / 1e9),
             rows=rows,
             own_ns=own_ns,
+            may_be_too_long=may_be_too_long(drive, block),
         )
 
     @property

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 from multidrop.core import Framing
@@ -45,7 +46,7 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[object, int], MemoryCell] = {}
+        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables that are read alike share them
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
@@ -56,7 +57,7 @@ class Memory:
             self.make_readable(text.table, self._addresses(text))
 
     def _cell(self, table: Table, address: int) -> MemoryCell:
-        return self._cells.setdefault((table.space, address), MemoryCell(table, address))
+        return self._cells.setdefault((_space(table), address), MemoryCell(table, address))
 
     def _declare(self, register: Register[Any]) -> None:
         table = register.table
@@ -169,6 +170,11 @@ class Memory:
     def of(self, register: Register[Any]) -> list[MemoryCell]:
         """Return the register's cells, in the order of their addresses."""
         return [self._cell(register.table, register.address + at) for at in range(register.words)]
+
+
+@cache
+def _space(table: Table) -> object:
+    return table if table.read is None else table.read_space
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
