@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from enum import IntEnum, IntFlag
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -244,6 +245,29 @@ def test_a_part_of_a_word(case: Bits) -> None:
     sim["field"] = 0
     sim["field"] = exact  # the other bits stay
     assert sim.read(4, 7, size // 2) == list(words_of(data))
+
+
+class Phase(IntEnum):
+    IDLE = 0
+    HEATING = 5
+
+
+class Alarm(IntFlag):
+    DOOR = 1
+    SENSOR = 2
+
+
+def test_a_field_may_have_names() -> None:
+    family = declared(
+        phase=reading(7, Phase, part=(4, 7), table=INPUT), alarms=reading(7, Alarm, part=(8, 9), table=INPUT)
+    )
+    data = bytes.fromhex("0252")
+    assert family.registers["phase"].value_in(data, 0) is Phase.HEATING
+    assert family.registers["alarms"].value_in(data, 0) is Alarm.SENSOR
+    assert row_of(family, "phase", data).value == 5
+    sim = SimulatedDrive(family(1))
+    sim["phase"], sim["alarms"] = Phase.HEATING, Alarm.SENSOR
+    assert sim.read(4, 7, 1) == [0x0250]
 
 
 # ---- no value ----
