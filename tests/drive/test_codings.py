@@ -106,7 +106,8 @@ def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
 def is_near(found: float, exact: Fraction, parts: list[Fraction]) -> bool:
     """Return True within the rounding of float64 arithmetic with these parts."""
     try:
-        return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts]))
+        least = Fraction(2) ** -1074  # of float64; below 2^-1022 it has fewer digits
+        return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts])) + least
     except OverflowError:  # beyond the largest float64
         return max(map(abs, [exact, *parts])) > Fraction(2) ** 1020
 
@@ -128,6 +129,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 1))
 @example((NumberFormat.I64, "DCBA", 0.001, 0, -(2**63)))
 @example((NumberFormat.I16, "ABCD", -0.1, 0, 0))
+@example((NumberFormat.F64, "AB", 0.01, 0, 2.225073858507203e-309))
 def test_a_number_of_any_format_order_step_and_offset(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:

@@ -21,7 +21,9 @@ def add_plant_argument(parser: argparse.ArgumentParser) -> None:
 def add_target_arguments(parser: argparse.ArgumentParser) -> None:
     """Add PORT MODEL ADDRESS, and options for a drive that differs from the family's defaults."""
     add_port_argument(parser)
-    parser.add_argument("model", metavar="MODEL", help="see `multidrop models`; or file.py:Class")
+    parser.add_argument(
+        "model", metavar="MODEL", help="see `multidrop models`; or file.toml, or file.py:Class"
+    )
     parser.add_argument("address", metavar="ADDRESS", type=_address, help="the drive's address on the line")
     parser.add_argument("--baudrate", type=int, metavar="N", help="where it is not the family's default")
     parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits")
