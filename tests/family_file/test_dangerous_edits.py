@@ -188,6 +188,17 @@ EDITS: dict[str, tuple[Change, str]] = {
         section("look", tripped={"register": "status", "has": ["alarm"]}),
         "shows.fault",
     ),
+    "a fault look that needs an alarm too": (
+        lambda document: (
+            section("look", tripped={"register": "status", "has": ["tripped", "alarm"]})(document),
+            document["shows"]["fault"]["status"].append("alarm"),
+        ),
+        "would not be seen",
+    ),
+    "a fault look that needs remote too": (
+        section("look", tripped={"register": "status", "has": ["tripped", "remote"]}),
+        "would not be seen",
+    ),
     "an identify that always holds": (section("identify", has=[]), "always true"),
     "an identify that a running drive fails": (
         section("identify", has=["remote"], lacks=["rdy_ref"]),
@@ -289,6 +300,8 @@ def _options(family: type[Drive]) -> dict[str, float]:
 
 
 Begin = Callable[[], Trial]
+# Status words with the bit of a fault, and that by which the drive is known, beside none and all others.
+OTHER_FAULTS = {"abb": (0x0208, 0x0230 | 0x0008, 0x07FF, 0x0288), "fc": (0x0009, 0x0209, 0x0BFF, 0x0289)}
 
 
 def stops_fail(begin: Begin, family: type[Drive]) -> Iterator[str]:
@@ -328,6 +341,13 @@ def starts_fail(begin: Begin, family: type[Drive]) -> Iterator[str]:
         trial.call(verb)
         if trial.sim.started or trial.has_reset:
             yield f"a {verb} is sent in a fault"
+        for status in OTHER_FAULTS.get(trial.name, ()):
+            trial = begin()
+            trial.call("set_frequency", 20)
+            trial.sim["status"] = status
+            trial.call(verb)
+            if trial.sim.started or trial.has_reset:
+                yield f"a {verb} is sent in a fault that shows {status:04X}H"
         trial = begin()
         trial.call(verb)
         if verb == "start" and trial.sim.started:

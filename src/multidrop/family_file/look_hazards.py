@@ -41,6 +41,9 @@ def check_looks(declared: DeclaredVerbs, registers: Registers, place: TomlPlace)
     for look in declared.looks_of(Condition.STOPPED):
         for wrong in _standstill(look, declared, registers):
             place.within(f"[look] {look}").wrong(wrong)
+    for look in declared.looks_of(Condition.FAULT):
+        for wrong in _narrow(look, declared, registers):
+            place.within(f"[look] {look}").wrong(wrong)
     for wrong in _identity(declared):
         place.within("[identify]").wrong(wrong)
     for wrong in _shown(declared, registers):
@@ -103,15 +106,27 @@ def _identity(declared: DeclaredVerbs) -> Iterator[str]:
             yield f"cannot hold while {look} does: a drive that is {state.condition.value} would not be known"
 
 
+def _narrow(look: Look, declared: DeclaredVerbs, registers: Registers) -> Iterator[str]:
+    """Find conditions of a fault's look that tell it from nothing: a fault without them would not be seen."""
+    others = [_values(kind, declared, registers) for kind in (STANDING, RUNNING) if kind in declared.shows]
+    for without, what in look.looser():
+        if others and not any(without.holds(values) for values in others):
+            yield f"needs {what} too, which tells nothing: a fault without it would not be seen"
+
+
+def _values(kind: str, declared: DeclaredVerbs, registers: Registers) -> dict[str, float]:
+    """Return what a drive of this kind shows: 0 where the file does not say."""
+    zeros: dict[str, float] = {name: 0 for name, register in registers.items() if register.readable}
+    return zeros | dict(declared.shows.get(STANDING, {})) | dict(declared.shows.get(kind, {}))
+
+
 def _shown(declared: DeclaredVerbs, registers: Registers) -> Iterator[str]:
     if not declared.steps:
         return
-    zeros: dict[str, float] = {name: 0 for name, register in registers.items() if register.readable}
-    base = zeros | dict(declared.shows.get(STANDING, {}))
     for kind, (label, conditions) in _MEANT.items():
         if kind not in declared.shows:
             continue
-        values = base | dict(declared.shows[kind])
+        values = _values(kind, declared, registers)
         state = declared.state_of(values)
         if state.condition not in conditions:
             yield f"{label} is {state.condition.value} by [state], and is to be {conditions[0].value}"

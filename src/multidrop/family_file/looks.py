@@ -7,7 +7,7 @@ contradict each other, or one may imply the other; the checks of hazards are mad
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -106,6 +106,19 @@ class Look:
     def implies(self, other: Look) -> bool:
         """Return True where a drive that shows this shows the other too."""
         return all(any(own.implies(criterion) for own in self.criteria) for criterion in other.criteria)
+
+    def looser(self) -> Iterator[tuple[Look, str]]:
+        """Yield the look without each of its conditions, and the condition in words."""
+        for at, criterion in enumerate(self.criteria):
+            rest = (*self.criteria[:at], *self.criteria[at + 1 :])
+            yield Look(self.name, rest), criterion.register
+            for bit in (1 << place for place in range(64)):
+                if (criterion.has | criterion.lacks) & bit:
+                    less = replace(criterion, has=criterion.has & ~bit, lacks=criterion.lacks & ~bit)
+                    yield (
+                        Look(self.name, (*rest, less)),
+                        f"bit {bit.bit_length() - 1} of {criterion.register}",
+                    )
 
     def registers(self) -> list[str]:
         """Return the names of the registers it reads, each once."""

@@ -7,8 +7,9 @@ and nothing about the drive that the file describes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from multidrop.drive.register import Register
 from multidrop.drive.state import Condition, Direction
 from multidrop.family_file.declared import TURNING, DeclaredVerbs
 from multidrop.family_file.looks import Look, shown_by
@@ -41,6 +42,12 @@ class SimulatedDeclared(MotorDrive):
         self._ready: Look | None = None  # shown while it stands
         for name, value in self.declared.shows.get(STANDING, {}).items():
             self.memory.set(self.drive.register(name), value)
+        self._following: dict[MemoryCell, list[Register[Any]]] = {}  # that show what the motor does
+        for name in self._shown():
+            register = self.drive.register(name)
+            if name not in MONITORS and not register.writable:
+                for cell in self.memory.of(register):  # parts of one word share their cell
+                    self._following.setdefault(cell, []).append(register)
 
     # ---- commands ----
 
@@ -104,12 +111,10 @@ class SimulatedDeclared(MotorDrive):
 
     def refresh(self, cell: MemoryCell) -> None:
         super().refresh(cell)
-        register = cell.register
-        if register is None or register in self._held or register.name in MONITORS:
-            return
-        if register.readable and not register.writable:
+        shown = [register for register in self._following.get(cell, ()) if register not in self._held]
+        if shown:
             values = self._shown()
-            if register.name in values:
+            for register in shown:
                 self.memory.set(register, values[register.name])
 
     def _shown(self) -> dict[str, float]:
@@ -124,8 +129,10 @@ class SimulatedDeclared(MotorDrive):
         return _after(standing, [self._ready] if self._ready else [])
 
     def _zeros(self) -> dict[str, float]:
-        """Return 0 for each register that a look of a state reads."""
-        return {name: 0 for look, _ in self.declared.states for name in look.registers()}
+        """Return 0 for each register that a look reads, or that shows anything."""
+        looked = [name for look in self.declared.looks.values() for name in look.registers()]
+        shown = [name for values in self.declared.shows.values() for name in values]
+        return dict.fromkeys((*looked, *shown), 0)
 
     def _turning(self) -> list[Look]:
         """Return the look of a motor that turns as this one does: its direction counts, then its phase."""
