@@ -14,6 +14,8 @@ from multidrop.printable import printable
 
 T = TypeVar("T")
 
+MOST_PARTS = 100  # of a dotted key
+
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
     """Return a TOML file's tables; ValueError, without the path, where it cannot be read.
@@ -30,16 +32,27 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
 def parse_document(data: bytes) -> dict[str, Any]:
     """Return the tables of a TOML file's bytes; ValueError where they are none."""
     try:
-        document = tomllib.loads(data.decode("utf-8-sig"))
+        text = data.decode("utf-8-sig")
+        _check_keys(text)
+        document = tomllib.loads(text)
+        fits = _fits(document)
     except UnicodeDecodeError as failure:
         raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
     except RecursionError as failure:
         raise ValueError("is not TOML of ours: it is nested too deeply") from failure
     except ValueError as failure:
         raise ValueError(f"is not TOML: {failure}") from failure
-    if not _fits(document):
+    if not fits:
         raise ValueError("is not TOML: a number does not fit into 64 bits")
     return document
+
+
+def _check_keys(text: str) -> None:
+    """Refuse keys of very many parts, for which tomllib takes memory and time with their square."""
+    if text.count(".") > MOST_PARTS:
+        pieces = re.split(r"[=,{}\[\]\n]+", text)
+        if any(piece.count(".") > MOST_PARTS for piece in pieces):
+            raise ValueError(f"a key or a text has more than {MOST_PARTS} points")
 
 
 def _fits(value: Any) -> bool:

@@ -114,6 +114,16 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
     return mistakes
 
 
+@pytest.mark.parametrize(
+    "text", ["a." * 300 + "b = 1", "a = " + "[" * 300 + "]" * 300, "a." * 100_000 + "b=1"]
+)
+def test_what_is_nested_too_deeply_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(text)
+    with pytest.raises(PlantError):
+        load_plant(path)
+
+
 def test_lines_drives_and_polls_are_read(load: Load) -> None:
     plant = load(GOOD)
     hall_1, hall_2 = plant.lines

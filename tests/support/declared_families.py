@@ -76,6 +76,7 @@ def _namespace(document: Mapping[str, Any]) -> dict[str, Any]:
     }
     return {
         "title": family["title"],
+        "declared_in": "file.toml",
         "options": options,
         "most_registers": {HOLDING: family["together"]["holding"]} if "together" in family else {},
         "remote": family.get("remote", ""),

@@ -77,8 +77,8 @@ def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
     columns = [name.lower().replace(" ", "_") for name in header]
     while columns and not columns[-1]:  # of a spreadsheet with an empty column
         columns.pop()
-    meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
     before = len(place.config_errors)
+    meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
     for name in {name for name in columns if columns.count(name) > 1}:
         place.wrong(f"two columns are called {name!r}; each has a name of its own")
     for name in NEEDED:
@@ -86,7 +86,7 @@ def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
             place.wrong(
                 f"no column is called {name!r}; the first line names the columns: {', '.join(COLUMNS)}"
             )
-    return None if meant or len(place.config_errors) > before else columns
+    return None if len(place.config_errors) > before else columns
 
 
 def _declare(columns: list[str], row: list[str], declared: Declared, place: TomlPlace) -> None:

@@ -16,7 +16,6 @@ from multidrop.drive.state import Condition
 from multidrop.drive.verbs import STOPPING
 from multidrop.family_file.declared import TURNING, DeclaredVerbs
 from multidrop.family_file.looks import Look
-from multidrop.family_file.places import under
 from multidrop.family_file.steps import (
     Awaits,
     AwaitsRunning,
@@ -60,7 +59,7 @@ def check_verbs(declared: DeclaredVerbs, registers: Registers, place: TomlPlace)
         checks = _OF_STOPS if name in STOPPING else _OF_STARTS if name in STARTING else _OF_RESETS
         for check in (*_OF_ALL, *checks):
             for wrong in check(declared, registers, name, steps):
-                under(place, f"[verb.{name}]").wrong(wrong)
+                place.within(f"[verb.{name}]").wrong(wrong)
 
 
 def _sends(steps: Sequence[VerbStep], kind: type[Writes] = Writes) -> list[Writes]:

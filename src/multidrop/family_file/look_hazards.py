@@ -14,7 +14,6 @@ from multidrop.drive.verbs import STOPPING
 from multidrop.family_file.declared import TURNING, DeclaredVerbs
 from multidrop.family_file.hazards import STARTING
 from multidrop.family_file.looks import Criterion, Look, limits_of
-from multidrop.family_file.places import under
 from multidrop.family_file.sections import FAULT, RUNNING, STANDING
 from multidrop.toml_check import TomlPlace
 
@@ -26,20 +25,26 @@ NEARLY_ZERO = {"Hz": 1.0, "rpm": 60.0, "%": 2.0}  # the most, in a look that say
 
 Registers = Mapping[str, Register[Any]]
 
+_MEANT = {
+    STANDING: ("[shows]", (Condition.STOPPED,)),
+    RUNNING: ("[shows.running]", TURNING),
+    FAULT: ("[shows.fault]", (Condition.FAULT,)),
+}
+
 
 def check_looks(declared: DeclaredVerbs, registers: Registers, place: TomlPlace) -> None:
     """Tell each hazard in [state], [identify] and [shows], and what is missing there."""
     for wrong in _missing(declared):
         place.wrong(wrong)
     for wrong in _order(declared):
-        under(place, "[state]").wrong(wrong)
+        place.within("[state]").wrong(wrong)
     for look in declared.looks_of(Condition.STOPPED):
         for wrong in _standstill(look, declared, registers):
-            under(place, f"[look] {look}").wrong(wrong)
+            place.within(f"[look] {look}").wrong(wrong)
     for wrong in _identity(declared):
-        under(place, "[identify]").wrong(wrong)
+        place.within("[identify]").wrong(wrong)
     for wrong in _shown(declared, registers):
-        under(place, "[shows]").wrong(wrong)
+        place.within("[shows]").wrong(wrong)
 
 
 def _missing(declared: DeclaredVerbs) -> Iterator[str]:
@@ -52,8 +57,9 @@ def _missing(declared: DeclaredVerbs) -> Iterator[str]:
     watches = moving or any(name in verbs for name in STOPPING)
     if watches and not declared.looks_of(Condition.STOPPED):
         yield '[state] calls no look "stopped": a stop is watched until the motor stands'
-    if moving and STANDING not in declared.shows:
-        yield "[shows] is missing: say what a drive shows that stands, so that its looks can be tried"
+    for kind, (label, _) in _MEANT.items():
+        if moving and kind not in declared.shows:
+            yield f"{label} is missing: say what a drive shows then, so that the looks can be tried on it"
 
 
 def _order(declared: DeclaredVerbs) -> Iterator[str]:
@@ -95,13 +101,6 @@ def _identity(declared: DeclaredVerbs) -> Iterator[str]:
     for look, state in declared.states:
         if declared.identity is not None and declared.identity.contradicts(look):
             yield f"cannot hold while {look} does: a drive that is {state.condition.value} would not be known"
-
-
-_MEANT = {
-    STANDING: ("[shows]", (Condition.STOPPED,)),
-    RUNNING: ("[shows.running]", TURNING),
-    FAULT: ("[shows.fault]", (Condition.FAULT,)),
-}
 
 
 def _shown(declared: DeclaredVerbs, registers: Registers) -> Iterator[str]:

@@ -16,7 +16,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.number_format import raw_span
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, read
-from multidrop.family_file.places import number, under
+from multidrop.family_file.places import number
 from multidrop.family_file.words import bits_of, is_flags
 from multidrop.toml_check import TomlPlace
 
@@ -135,7 +135,7 @@ def parse_looks(
         place.wrong(f"look = {tables!r} is not right; write [look], and under it stands = {_RIGHT}")
         return found
     for name, table in tables.items():
-        look = parse_look(name, table, registers, under(place, f"[look] {name}"))
+        look = parse_look(name, table, registers, place.within(f"[look] {name}"))
         if look is not None:
             found[name] = look
     return found

@@ -3,15 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
-
-from multidrop.toml_check import TomlPlace
-
-
-def under(place: TomlPlace, label: str) -> TomlPlace:
-    """Return the place within this one that has this label."""
-    return replace(place, labels=(*place.labels, label))
 
 
 def number(value: Any) -> bool:

@@ -9,7 +9,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.family_file.declared import DeclaredSetpoint
 from multidrop.family_file.looks import Look, parse_look
-from multidrop.family_file.places import number, under, whole
+from multidrop.family_file.places import number, whole
 from multidrop.family_file.words import word_of
 from multidrop.toml_check import TomlPlace
 
@@ -26,7 +26,7 @@ def parse_states(
     if not isinstance(table, Mapping):
         place.wrong(f'state = {table!r} is not right; write [state], and under it tripped = "fault"')
         return ()
-    place = under(place, "[state]")
+    place = place.within("[state]")
     found = []
     for name, given in table.items():
         state = _state(given)
@@ -58,7 +58,7 @@ def parse_identity(
     """Return the look by which a drive of the family is known; None where there is none."""
     if "identify" not in document:
         return None
-    return parse_look("identify", document["identify"], registers, under(place, "[identify]"))
+    return parse_look("identify", document["identify"], registers, place.within("[identify]"))
 
 
 def parse_setpoint(
@@ -70,7 +70,7 @@ def parse_setpoint(
     """Return the setpoint of [set_frequency]; `options` are the units of the file's options by name."""
     if "set_frequency" not in document:
         return None
-    table, place = document["set_frequency"], under(place, "[set_frequency]")
+    table, place = document["set_frequency"], place.within("[set_frequency]")
     if not isinstance(table, Mapping) or not {*table} <= {"register", "of"} or "register" not in table:
         place.wrong(
             f'{table!r} is not right; write register = "reference", and of = "reference_maximum" for %'
@@ -133,7 +133,7 @@ def parse_shows(
     if not isinstance(table, Mapping):
         place.wrong(f'shows = {table!r} is not right; write [shows], and under it status = ["ready"]')
         return {}
-    place = under(place, "[shows]")
+    place = place.within("[shows]")
     standing = {name: given for name, given in table.items() if not isinstance(given, Mapping)}
     found = {STANDING: _shown(standing, registers, place)} if standing else {}
     for name, given in table.items():
@@ -142,7 +142,7 @@ def parse_shows(
         if name not in (RUNNING, FAULT):
             place.wrong(f"{name} is none of [shows.{RUNNING}] and [shows.{FAULT}]")
             continue
-        found[name] = _shown(given, registers, under(place, name))
+        found[name] = _shown(given, registers, place.within(name))
     return found
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from multidrop.drive.register import Register
 from multidrop.family_file.looks import Look
-from multidrop.family_file.places import sentence, under
+from multidrop.family_file.places import sentence
 from multidrop.family_file.words import Words, parse_words
 from multidrop.toml_check import TomlPlace, parse_duration
 
@@ -111,7 +111,7 @@ class StepParser:
                 f"{'else' if is_else else 'steps'} is not a list of 1 to {MOST_STEPS} steps; {_EXAMPLE}"
             )
             return None
-        found = [self._step(table, under(place, f"step {at}"), is_else) for at, table in enumerate(given, 1)]
+        found = [self._step(table, place.within(f"step {at}"), is_else) for at, table in enumerate(given, 1)]
         good = tuple(step for step in found if step is not None)
         return good if len(good) == len(given) else None
 
@@ -171,7 +171,7 @@ class StepParser:
     def awaits(self, table: Any, when: Look | None, place: TomlPlace) -> VerbStep | None:
         look = self._look("await", table["await"], place)
         limit = _seconds("limit", table["limit"], SHORTEST_AWAIT, LONGEST_AWAIT, place)
-        otherwise = self.steps(table["else"], under(place, "else"), is_else=True) if "else" in table else ()
+        otherwise = self.steps(table["else"], place.within("else"), is_else=True) if "else" in table else ()
         if look is None or limit is None or otherwise is None:
             return None
         return Awaits(when, look, limit, otherwise)

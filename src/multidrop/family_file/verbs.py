@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.verbs import MOVING, Option
-from multidrop.errors import Advice, Refused
 from multidrop.family_file.declared import DeclaredVerbs
 from multidrop.family_file.hazards import NAMES, check_verbs
 from multidrop.family_file.look_hazards import check_looks
 from multidrop.family_file.looks import Look, parse_looks
-from multidrop.family_file.places import under
 from multidrop.family_file.scripts import verbs_of
 from multidrop.family_file.sections import (
     option_units,
@@ -27,7 +23,6 @@ from multidrop.family_file.word_hazards import check_words
 from multidrop.toml_check import TomlPlace
 
 SECTIONS = ("look", "state", "set_frequency", "identify", "verb", "shows")
-CONFIRMED = Option("", (0, 1), "1: `multidrop check` of its file was read, and compared with its manual")
 _TAKEN = ("declared_verbs", "is_jogged")  # names that the class has besides those of every drive
 
 
@@ -39,8 +34,7 @@ def add_verbs(
 ) -> None:
     """Put the verbs that the file declares into the class's namespace, and tell all that is wrong with them.
 
-    Where anything is wrong nothing is put in: such a file makes no class. A class that can move a motor has
-    the option `confirmed`, without which it moves none.
+    Where anything is wrong nothing is put in: such a file makes no class.
     """
     before = len(place.config_errors)
     declared = _declared(namespace, document, registers, place)
@@ -53,9 +47,6 @@ def add_verbs(
         check_looks(declared, registers, place)
         check_verbs(declared, registers, place)
         check_words(declared, registers, place)
-    moves = declared.setpoint is not None or any(name in declared.steps for name in MOVING)
-    if moves and "confirmed" in option_units(namespace, document):
-        place.wrong("[option] confirmed is one that every file with a motor has: leave it out")
     if len(place.config_errors) > before:
         return
     namespace.update(verbs_of(declared))
@@ -63,9 +54,6 @@ def add_verbs(
     namespace["identity_is_inferred"] = True  # a file's `identify` is too weak to keep a stop back
     if declared.setpoint is not None:
         namespace["setpoint_name"] = declared.setpoint.register
-    if moves:
-        namespace["check_confirmed"] = _check_confirmed
-        namespace["options"] = {"confirmed": CONFIRMED, **(namespace.get("options") or {})}
 
 
 def _declared(
@@ -97,7 +85,7 @@ def _steps(
         return {}
     parser, found = StepParser(registers, looks), {}
     for name, table in tables.items():
-        at = under(place, f"[verb.{name}]")
+        at = place.within(f"[verb.{name}]")
         if name not in NAMES:
             at.wrong(f"{name} is no verb that a file declares; there are {', '.join(NAMES)}")
         elif not isinstance(table, Mapping) or {*table} != {"steps"}:
@@ -107,15 +95,3 @@ def _steps(
             if steps is not None:
                 found[name] = steps
     return found
-
-
-def _check_confirmed(drive: Drive, what: str) -> None:
-    """Raise Refused unless the owner has confirmed the file, which nobody has tried on hardware."""
-    if not drive.option.get("confirmed"):
-        kind = drive.title or type(drive).__name__
-        raise Refused(
-            f"{what} is not sent to {drive.name}: its family, {kind}, is a file, and a wrong word in it may "
-            "start the motor; compare `multidrop check FILE` with the manual, and declare confirmed = 1",
-            rule="nobody has confirmed its file",
-            advice=Advice.declare("confirmed", 1),
-        )

@@ -15,7 +15,6 @@ from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 from multidrop.drive.verbs import STOPPING
 from multidrop.family_file.declared import DeclaredVerbs
 from multidrop.family_file.hazards import STARTING
-from multidrop.family_file.places import under
 from multidrop.family_file.steps import Insists, Writes, every_step
 from multidrop.family_file.words import is_bits, shown
 from multidrop.toml_check import TomlPlace
@@ -29,16 +28,16 @@ def check_words(declared: DeclaredVerbs, registers: Registers, place: TomlPlace)
     """Tell each hazard in the registers that verbs write, and in what is said to be harmless."""
     controls = [name for name in registers if name in _controls(declared)]
     for name in controls:
-        at = under(place, name)
+        at = place.within(name)
         for wrong in chain(
             _kind(name, registers[name]), _aliases(name, registers), _words(declared, registers, name)
         ):
             at.wrong(wrong)
     for name, register in registers.items():
         for wrong in _said_to_be_harmless(declared, name, register):
-            under(place, name).wrong(wrong)
+            place.within(name).wrong(wrong)
     if declared.setpoint is not None and declared.setpoint.register in controls:
-        under(place, "[set_frequency]").wrong(
+        place.within("[set_frequency]").wrong(
             f"{declared.setpoint.register} also runs and stops the motor: a setpoint is another register"
         )
 
