@@ -133,7 +133,7 @@ class Drive:
         different makes, and may start their motor; and one from a file, which nobody has tested.
         """
         family = type(self)
-        if self.option.get("confirmed"):
+        if "confirmed" not in self.options or self.option.get("confirmed"):
             return
         if family.declared_in:
             reason = (
