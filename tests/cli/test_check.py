@@ -88,6 +88,12 @@ def test_every_step_has_its_words(run: Run, name: str) -> None:
     assert "no words for" not in out
 
 
+def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
+    status, out, _ = run("check", "abb-acs355")
+    assert status == 0
+    assert "No mistake found in abb-acs355" in words(out)
+
+
 def test_check_prints_json(run: Run, fan: Path) -> None:
     status, out, _ = run("check", fan, "--json")
     found = json.loads(out)

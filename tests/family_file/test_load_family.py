@@ -358,3 +358,28 @@ def test_every_key_is_in_the_reference() -> None:
     missing = [key for key in (*FAMILY_KEYS, *REGISTER_KEYS) if f"`{key}`" not in page]
     assert missing == []
     assert [section for section in SECTIONS if f"`[{section}" not in page] == []
+
+
+def test_texts(tmp_path: Path) -> None:
+    pytest.importorskip("multidrop.drive.text")
+    entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
+    loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
+    assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
+    assert (loaded.kind.table, loaded.kind.address) == (INPUT, 10)
+    assert list(loaded.texts) == ["serial", "kind"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "told"),
+    [
+        ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
+        ("a = { at = 1, length = 126 }", "a text of 126 registers: one request reads 1 to 125"),
+        ("a = { at = 1, length = 2, order = 'CDAB' }", "order = 'CDAB' of a text"),
+        ("a = { at = '00001', length = 2 }", "a text is in HOLDING or INPUT registers"),
+        ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
+    ],
+)
+def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:
+    pytest.importorskip("multidrop.drive.text")
+    found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
+    assert any(told in mistake for mistake in found), found

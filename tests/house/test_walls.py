@@ -28,7 +28,7 @@ FLOORS = [
     {"bus"},
     {"polling"},
     {"poller"},
-    {"recording", "sim", "scan"},
+    {"recording", "sim", "scan", "importers"},
     {"capture", "report"},
     {"cli"},
     {"__init__", "__main__"},

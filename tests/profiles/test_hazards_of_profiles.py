@@ -336,3 +336,71 @@ def test_a_ramp_goes_on_from_the_setpoint_in_force(line: Line) -> None:
     ramp(line.drive, 22, rate=1, every=1)
     assert len(line.writes) - begun == 2
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
+
+
+def test_a_jog_that_goes_on_through_a_stop_is_stopped_on_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    line.sim.jog_needs_own_stop = True
+    line.drive.option["stop_time"] = 3.0
+    line.drive.jog()
+    assert line.sim.motor.energised
+    line.drive.stop()
+    assert not line.sim.motor.energised
+    line.drive.set_frequency(20)
+    line.drive.start()
+    assert len(line.starts) == 2
+
+
+def test_a_cia402_drive_without_mains_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "schneider-atv320")
+    line.drive.set_frequency(20)
+    line.sim.stays_off = True
+    with pytest.raises(NotDone, match="not switched on"):
+        line.drive.start()
+    assert line.starts == []
+
+
+@pytest.mark.parametrize("name", ["off2", "off3"])
+def test_a_profidrive_is_not_started_through_an_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "abb-acs355")
+    line.drive.set_frequency(20)
+    setattr(line.sim, name, True)
+    with pytest.raises(Refused, match=f"{name.upper()}.* is active from elsewhere"):
+        line.drive.start()
+    assert line.starts == []
+    setattr(line.sim, name, False)
+    line.drive.start()
+    assert line.sim.motor.energised
+
+
+def test_an_off2_in_a_run_is_told_and_not_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "siemens-v20")
+    line.runs()
+    line.bus.bus.write(line.drive, line.drive.control, line.drive.control.decode(0x047C))
+    assert not line.sim.motor.energised
+    assert line.drive.state().condition is Condition.STOPPED
+
+
+def test_a_locked_trip_is_not_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "danfoss-fc51")
+    line.sim.trip(FAULT)
+    line.sim.is_locked = True
+    with pytest.raises(Refused, match="take its mains away"):
+        line.drive.reset_fault()
+    assert line.writes == []
+    line.sim.power_cycle()
+    line.runs()
+
+
+def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "optidrive-e3")
+    line.sim.is_first_reading = True
+    line.drive.set_frequency(20)
+    with pytest.raises(Refused, match="not ready to run"):
+        line.drive.start()
+    line.sim.motor.run(1)  # at its keypad
+    line.bus.sleep(2)
+    assert line.drive.state().condition is not Condition.STOPPED
+    line.drive.stop()
+    assert not line.sim.motor.energised
+    assert line.starts == []

@@ -107,6 +107,20 @@ def test_a_control_word_that_is_a_coil_is_refused() -> None:
             output_frequency = reading(5, "Hz")
 
 
+def test_a_reference_that_counts_backwards_is_refused() -> None:
+    with pytest.raises(DeclarationError, match="reference: a greater count is more of it"):
+
+        class Backwards(Acs355):
+            reference = setting(1, "%", step=-0.005, span=(0, 100), number_format=NumberFormat.I16)
+
+
+def test_a_signed_status_is_no_word_of_bits() -> None:
+    with pytest.raises(DeclarationError, match="status: it is one word of bits"):
+
+        class Signed(Acs355):
+            status = reading(3, number_format=NumberFormat.I16)
+
+
 def test_a_percentage_needs_to_know_of_what() -> None:
     drive = Fc51(1)
     wire = Wire(drive)

@@ -10,7 +10,16 @@ import pytest
 from profile_families import MAKE
 from scripts import Wire
 
-from multidrop.drive import Condition, Direction, Drive, Refused, State, Unsupported
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Drive,
+    NotDone,
+    Refused,
+    State,
+    Unconfirmed,
+    Unsupported,
+)
 
 # Each without its checksum: address 1, function 06, where the manual has the word.
 ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
@@ -247,3 +256,77 @@ STATES = [
 @pytest.mark.parametrize(("model", "status", "says", "condition"), STATES)
 def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condition) -> None:
     assert wire(model, status, **says).drive.state().condition is condition
+
+
+# ---- what only one profile has ----
+
+
+@pytest.mark.parametrize(
+    ("model", "running"),
+    [
+        ("abb-acs355", ABB_RUNS),
+        ("danfoss-fc51", FC_RUNS),
+        ("delta-vfd-el", 0x0502),
+        ("optidrive-e3", E3_RUNS),
+    ],
+)
+def test_a_drive_that_runs_at_0_hz_does_not_stand(model: str, running: int) -> None:
+    found = wire(model, running, output_frequency=0.0)
+    found.drive.option["stop_time"] = 5.0
+    with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):
+        found.drive.stop()
+
+
+@pytest.mark.parametrize(
+    ("shown", "sentence"),
+    [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, which is not what it was told")],
+)
+def test_a_delta_that_follows_another_setpoint_is_not_started(shown: float, sentence: str) -> None:
+    found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
+    with pytest.raises(Refused, match=sentence):
+        found.drive.start()
+    assert found.sent == []
+
+
+def test_an_invt_that_goes_on_jogging_is_stopped_as_one() -> None:
+    found = wire("invt-goodrive", GD_RUNS)
+    found.drive.option["stop_time"] = 5.0
+    with pytest.raises(Unconfirmed, match="5 s"):
+        found.drive.stop()
+    assert sent(found) == [DELTA + "00 05", DELTA + "00 08"]
+
+
+def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
+    found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
+    found.drive.jog()
+    found.sent.clear()
+    with pytest.raises(Refused, match=r"may still jog.*stop\(\)"):
+        found.drive.start()
+    assert found.sent == []
+    found.say({"status": found.drive.status.values(GD_STANDBY)})
+    with pytest.raises(Unconfirmed):  # it stands and so may be started, and is not seen to run
+        found.drive.start()
+    assert sent(found) == [DELTA + "00 01"]
+
+
+@pytest.mark.parametrize(
+    ("status", "words", "sentence"),
+    [
+        ([ATV_OFF], ("00 06",), "not ready to be switched on"),
+        ([ATV_OFF, ATV_READY], ("00 06", "00 07"), "not switched on"),
+    ],
+)
+def test_a_cia402_drive_goes_up_step_by_step(
+    status: list[int], words: tuple[str, ...], sentence: str
+) -> None:
+    found = wire("schneider-atv320", status)
+    with pytest.raises(NotDone, match=sentence):
+        found.drive.start()
+    assert sent(found) == [ATV + word for word in words]
+
+
+def test_a_profidrive_that_does_not_get_ready_to_operate_is_switched_off() -> None:
+    found = wire("abb-acs355", [ABB_OFF, ABB_READY])
+    with pytest.raises(NotDone, match="not ready to operate"):
+        found.drive.start()
+    assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]

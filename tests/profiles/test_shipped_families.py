@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from profile_families import SHIPPED_AS, shipped
 from scripts import rows, typed
-from simulated_bus import one
+from simulated_bus import SimulatedBus, one
 
 from multidrop import Bus, load_plant
 from multidrop.cli import main
-from multidrop.drive import Condition, Drive, Refused
+from multidrop.drive import Condition, Drive, Refused, Unsupported
 from multidrop.drive.register import Access
 from multidrop.drives import MODELS
 from multidrop.drives.registry import SHIPPED, find_model, shipped_family
@@ -22,6 +22,8 @@ from multidrop.profiles import PROFILES, Profile
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 every_family = pytest.mark.parametrize("name", SHIPPED)
+every_profile_family = pytest.mark.parametrize("name", SHIPPED_AS)
+READ_ONLY = "erman-er-g-220-03"
 
 # Function codes, address on the wire, name, step, unit.
 TABLES = {
@@ -63,6 +65,24 @@ TABLES = {
 03/06 210A heatsink_temperature 1 °C
 03/06 0900 station              1
 """,
+    READ_ONLY: """
+03/06 0001 output_frequency   0.1 Hz
+03/06 0002 output_current     0.1 A
+03/06 0003 input_voltage      1 V
+03/06 0004 temperature        1 °C
+03/06 0005 pressure           0.01 bar
+03/06 0006 fault              - Fault
+03/06 0007 state_word         1
+03/06 000B wake_difference    0.01 bar
+03/06 000C dry_run_pressure   0.01 bar
+03/06 000D dry_run_time       1 s
+03/06 000E carrier_frequency  1
+03/06 000F ramp_time          ?
+03/06 0010 pressure_tolerance 0.01 bar
+03/06 0011 minimum_frequency  0.1 Hz
+03/06 0016 station            1
+03/06 1000 pressure_setpoint  0.01 bar
+""",
     "delta-ms300": """
 03/06 2000 control              - DeltaControl
 03/06 2001 reference            0.01 Hz
@@ -95,7 +115,7 @@ TABLES = {
 
 def test_the_families_by_name() -> None:
     assert list(SHIPPED) == sorted(TABLES)
-    assert set(SHIPPED) == set(SHIPPED_AS)
+    assert {*SHIPPED} == {*SHIPPED_AS, READ_ONLY}
     assert not set(SHIPPED) & set(MODELS)
     assert all(find_model(name).model == name for name in SHIPPED)
     with pytest.raises(ValueError, match=r"no model 'abb-acs35'; did you mean abb-acs355\?"):
@@ -110,17 +130,38 @@ def test_the_registers_are_those_of_the_manual(name: str) -> None:
 @every_family
 def test_a_family_says_where_it_comes_from_and_what_was_not_tried(name: str) -> None:
     family = shipped_family(name)
-    assert issubclass(family, Profile)
+    assert issubclass(family, Profile) is (name != READ_ONLY)
     assert "not tried on hardware" in family.title
     assert "Not tried on hardware" in (family.__doc__ or "")
     assert all(register.place for register in family.registers.values())
     assert family.manual
-    assert family.watchdog != Drive.watchdog
-    assert family.remote != Drive.remote
     assert family.line_parameters
+    if name != READ_ONLY:
+        assert family.watchdog != Drive.watchdog
+        assert family.remote != Drive.remote
 
 
-@every_family
+def test_the_pump_controller_whose_map_leaves_too_much_open_is_only_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    family = shipped_family(READ_ONLY)
+    assert {register.access for register in family.registers.values()} == {Access.READING}
+    assert "confirmed" not in family.options
+    bus, drive, sim = (SimulatedBus(monkeypatch, sim := simulated(family(63))), family(63), sim)
+    bus.attach(drive)
+    for call in (drive.start, drive.stop, drive.reset_fault, lambda: drive.set_frequency(20), drive.state):
+        with pytest.raises(Unsupported):
+            call()
+    assert bus.written == []
+    sim["pressure"] = 2.5
+    assert bus.bus.read(drive, drive.register("pressure")) == 2.5
+    drive.perform(drive.identify.script())
+    sim["minimum_frequency"] = 0
+    with pytest.raises(Refused):
+        drive.perform(drive.identify.script())
+
+
+@every_profile_family
 def test_nothing_is_commanded_before_the_owner_has_confirmed_it(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,7 +175,7 @@ def test_nothing_is_commanded_before_the_owner_has_confirmed_it(
     assert bus.written
 
 
-@every_family
+@every_profile_family
 def test_what_only_tells_the_family_is_not_polled(name: str) -> None:
     polled = {register.name for register in shipped_family(name).readings()}
     assert "status" in polled
@@ -142,7 +183,7 @@ def test_what_only_tells_the_family_is_not_polled(name: str) -> None:
 
 
 @pytest.mark.slow
-@every_family
+@every_profile_family
 def test_a_motor_is_commanded_through_the_engine(name: str) -> None:
     drive: Any = shipped(name, 1)
     sim = simulated(shipped(name, 1))
@@ -168,7 +209,7 @@ def test_a_plant_file_names_them(tmp_path: Path) -> None:
         + "".join(
             f'[[line.drive]]\nname = "d{address}"\nmodel = "{name}"\naddress = {address}\nbaudrate = 9600\n'
             f'format = "{"8N1" if "8N1" in next(iter(shipped_family(name).formats.values())) else "8N2"}"\n'
-            "confirmed = 1\n"
+            f"{'confirmed = 1' if name in SHIPPED_AS else ''}\n"
             for address, name in enumerate(SHIPPED, 1)
         )
     )
@@ -182,7 +223,7 @@ def test_the_command_line_lists_and_checks_them(capsys: pytest.CaptureFixture[st
     assert all(f"\n{name} " in listed for name in (*MODELS, *SHIPPED)[1:])
     for name in SHIPPED:
         assert main(["check", name]) == 0
-        assert "nobody has tested it" in capsys.readouterr().out
+        assert ("nobody has tested it" in capsys.readouterr().out) is (name in SHIPPED_AS)
 
 
 def test_nothing_of_them_is_read_before_one_is_asked_for() -> None:

@@ -9,18 +9,21 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.read_limits import limit_errors
 from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.text import Text, text_errors
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb
 from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
+A = TypeVar("A")
 LONGEST_SILENCE = 1.0  # s
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
@@ -83,25 +86,34 @@ class Drive:
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
+    texts: ClassVar[Mapping[str, Text]] = {}
 
     bus: Any = None  # that it is attached to
 
     def __init_subclass__(cls) -> None:
         """Collect the registers. Raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
-        found: dict[str, Register[Any]] = {}
-        for owner in reversed(cls.__mro__):
-            for name, attribute in vars(owner).items():
-                if isinstance(attribute, Register):
-                    found[name] = attribute
-                else:
-                    found.pop(name, None)  # a subclass has something else of this name
+        found = cls._declared(Register)
         cls.registers = found
+        cls.texts = cls._declared(Text)
         cls.options = cls._all_options()
-        if wrong := declaration_errors(found, TAKEN_NAMES, cls.options) or list(limit_errors(cls)):
+        wrong = declaration_errors(found, TAKEN_NAMES, cls.options) + text_errors(cls.texts, TAKEN_NAMES)
+        if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
+
+    @classmethod
+    def _declared(cls, kind: type[A]) -> dict[str, A]:
+        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
+        found: dict[str, A] = {}
+        for owner in reversed(cls.__mro__):
+            for name, attribute in vars(owner).items():
+                if isinstance(attribute, kind):
+                    found[name] = attribute
+                else:
+                    found.pop(name, None)
+        return found
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
@@ -121,7 +133,7 @@ class Drive:
         different makes, and may start their motor; and one from a file, which nobody has tested.
         """
         family = type(self)
-        if self.option.get("confirmed"):
+        if "confirmed" not in self.options or self.option.get("confirmed"):
             return
         if family.declared_in:
             reason = (
@@ -280,6 +292,8 @@ class Drive:
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:
             raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+        if name in self.texts:
+            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
         super().__setattr__(name, value)
 
     def exception(self, code: int) -> str:

@@ -19,6 +19,7 @@ from multidrop.family_file.facts import FAMILY_KEYS, facts_of
 from multidrop.family_file.names import unusable
 from multidrop.family_file.register_keys import shown
 from multidrop.family_file.registers import MOST_REGISTERS, Declared, defaults_of
+from multidrop.family_file.texts import texts_of
 from multidrop.family_file.verbs import SECTIONS as VERB_SECTIONS
 from multidrop.family_file.verbs import add_verbs
 from multidrop.toml_check import Key, TomlPlace, parse_document
@@ -135,8 +136,9 @@ def _family(
             f"'counts_from' is missing, and {shown(counting.assumed[0])} is a number; add counts_from = 0 "
             "where the manual's numbers are sent as they are, or 1 where its register 1 is sent as 0"
         )
+    texts = texts_of(document.get("text", {}), counting, declared.places, place)
     options = _options(document.get("option", {}), declared.places, place)
-    if not declared.places and not given.get("registers"):
+    if not declared.places and not texts and not given.get("registers"):
         place.wrong("declares no register; add [reading] and NAME = { at = 0x0010 }")
     if len(declared.places) > MOST_REGISTERS:
         place.wrong(f"declares more than {MOST_REGISTERS} registers; leave out those that nobody reads")
@@ -149,6 +151,7 @@ def _family(
         "broadcasts": any(register.broadcast for register in declared.registers.values()),
         **facts,
         **declared.registers,
+        **texts,
     }
     base = _base(given.get("profile"), document, of_family)
     if base is Drive:

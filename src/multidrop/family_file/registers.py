@@ -141,6 +141,8 @@ class Declared:
     def _details(self, access: Access, good: Mapping[str, Any], table: str) -> tuple[dict[str, Any], Any]:
         space = TABLES[table]
         defaults = {key: value for key, value in self.defaults.items() if key not in NOT_DETAILS}
+        if "number_format" in good:
+            defaults.pop("invalid", None)  # which are counts of the default format
         if space.carrier is Carrier.BIT:
             defaults = {key: value for key, value in defaults.items() if key not in _WITHOUT_BITS}
         if access is Access.READING:

@@ -63,7 +63,7 @@ class Refusals:
     def _is_refused(self, job: PolledJob) -> bool:
         """Return True where it is to be asked in another way; a part of a refused block at once."""
         count = job.rows.refusals
-        if not count or job in self._trials:
+        if not count or job in self._trials or job is self._probes.get(job.drive):
             return False
         is_part = len(job.block.registers) > 1 and job in self._wholes
         return count >= (1 if is_part else REFUSALS) and not job.owner.is_passing(job.rows.refusal)

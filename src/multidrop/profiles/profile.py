@@ -87,6 +87,8 @@ class Profile(Drive):
             yield f"{name}: this is a name that every profile has for something else; call it otherwise"
         if name == "reference" and register.span is not None and register.span[0] < 0:
             yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
+        if name == "reference" and ((register.step or 0) < 0 or getattr(register, "offset", None)):
+            yield f"{name}: a greater count is more of it: its step is above 0, and it has no offset"
 
     @classmethod
     def _errors_together(cls, found: Mapping[str, Any]) -> Iterator[str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 from typing import Any, cast
 
-from multidrop.drive.register import Access, Carrier, Register
+from multidrop.drive.register import Access, Carrier, NumberFormat, Register
 
 _CODED = "what the profile itself says; leave it out"
 
@@ -59,9 +59,12 @@ def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]
 
 
 def _word_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
-    is_plain = register.words == 1 and register.step == 1 and not register.unit
+    is_plain = register.number_format is NumberFormat.U16 and register.step == 1 and not register.unit
     if not is_plain or register.table.carrier is not Carrier.WORD:
         yield f"{name}: it is one word of bits, without a unit and a step"
+    for fact in ("offset", "part", "invalid", "scale_register"):
+        if getattr(register, fact, None):
+            yield f"{name}: it is a whole word, and takes no {fact}"
     if register.values is None:
         return
     known = ", ".join(role.extra)
