@@ -238,6 +238,7 @@ PLACEHOLDERS = {
     "COMMAND": "poll",
     "FILE": "plant.toml",
     "HZ": "10",
+    "DRIVE": "pump-1",
 }
 MENTIONED = sorted(
     {

@@ -7,8 +7,9 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.target import add_target_arguments, target_of
 from multidrop.cli.support.values import Row, aligned, as_json, as_row
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -16,22 +17,20 @@ from multidrop.errors import DriveRefused
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_target_arguments(parser)
-    parser.add_argument(
-        "registers", metavar="REGISTER", nargs="*", default=[], help="all readings and settings if none"
-    )
+    add_target_arguments(parser, "[REGISTER ...]")
+    parser.description = f"{parser.description} Without a REGISTER: all that can be read."
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = drive_of(arguments)
-    wanted = [drive.register(name) for name in arguments.registers]
+    target, names = target_of(arguments)
+    drive = target.drive
+    wanted = [drive.register(name) for name in names]
     for register in wanted:
         if not register.readable:
-            raise ValueError(f"{register.name} can only be written; see `multidrop models {arguments.model}`")
+            raise ValueError(f"{register.name} can only be written; see `multidrop models {target.model}`")
     wanted = wanted or [register for register in drive.registers.values() if register.readable]
-    with Bus(arguments.port) as bus:
-        bus.attach(drive)
+    with target.open_bus() as bus:
         values = _read(bus, drive, wanted)
     if arguments.json:
         record = {"drive": drive.name, "model": drive.model, "address": drive.address}
