@@ -34,6 +34,19 @@ class PolledDrive:
         """Registers and their periods in s, as planning takes them."""
         return [(poll.register, poll.every) for poll in self.polls]
 
+    def at_rate(self, register: Register[Any] | None, every: float | None) -> PolledDrive:
+        """Return the same with another rate, for one register, or with None for all that are polled.
+
+        Raises ValueError for a register that is not polled.
+        """
+        if register is not None and register not in [poll.register for poll in self.polls]:
+            names = ", ".join(poll.register.name for poll in self.polls) or "nothing"
+            raise ValueError(f"{register.name} of {self.drive.name} is not polled: that is {names}")
+        polls = [
+            Polled(poll.register, every) if register in (None, poll.register) else poll for poll in self.polls
+        ]
+        return PolledDrive(self.drive, tuple(polls))
+
 
 @dataclass(frozen=True)
 class PlantLine:

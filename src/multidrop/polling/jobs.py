@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from multidrop.bus import Bus
@@ -70,6 +71,7 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
+        self._skipped = 0  # of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
         """Plan a drive's polls for this response delay in s. Raises ValueError for another's register."""
@@ -88,6 +90,17 @@ class JobMaker:
         if key not in self._made:
             self._made[key] = self.make(drive, block, period_ns)
         return self._made[key]
+
+    def forget(self, jobs: Iterable[PolledJob]) -> None:
+        """Keep jobs with a period no longer: rates come and go without number.
+
+        Those without one are kept: the core may hold what it repeats until the port is closed.
+        """
+        for job in jobs:
+            key = job.owner, job.block, job.period_ns
+            if job.period_ns is not None and self._made.get(key) is job:
+                del self._made[key]
+                self._skipped += job.skipped
 
     def make(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
         """Make a job of its own."""
@@ -108,4 +121,4 @@ class JobMaker:
     @property
     def skipped(self) -> int:
         """Slots that were left out because the line was busy."""
-        return sum(job.skipped for job in self._made.values())
+        return self._skipped + sum(job.skipped for job in self._made.values())

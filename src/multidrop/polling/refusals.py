@@ -60,6 +60,7 @@ class Refusals:
     def forget(self, drive: Drive) -> None:
         """Set nothing of this drive aside any more: it leaves."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
+        self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
 
 
 def _is_refused(job: PolledJob) -> bool:
