@@ -155,7 +155,9 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
-/* The same to the newest chunk; a block that is NULL has no rows. */
+/* Return how many of the block's fields have no value in a good reply. */
+uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
+/* Append to the newest chunk; a block that is NULL has no rows. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */

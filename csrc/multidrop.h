@@ -13,13 +13,14 @@ enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
-    MD_STATUSES = 18,         /* of a row without an exception */
+    MD_STATUSES = 19,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
     MD_TIMES_KEPT = 6,        /* of the same request */
-    MD_MOST_NUMBERS = 65536   /* of a row queue's ports */
+    MD_MOST_NUMBERS = 65536,  /* of a row queue's ports */
+    MD_MOST_INVALID = 8       /* counts of a register that mean no value */
 };
 
 /* ---- checksum.c: return the checksum ---- */
@@ -101,27 +102,49 @@ int64_t md_utc_minus_monotonic_ns(void);
 /* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
 
 enum md_number_format {
-    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32,
-    MD_F32_SWAPPED, MD_BIT
+    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
+    MD_I8, /* the low byte of a word */
+    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32,
+    MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
+    MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
 };
 
-/* Read the number at word (MD_BIT: bit) `at` of a reply's data. */
+/* Read the number at word (MD_BIT: bit) `at` of a reply's data: none where a BCD digit is above 9. */
 double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
 struct md_field {
     uint16_t at;
     uint8_t format; /* enum md_number_format */
-    uint16_t reg; /* code of its name */
+    uint16_t reg;   /* code of its name */
+    uint16_t extra; /* 0: none; else it is the block's extra[extra - 1] */
     double multiplier, divisor;
+};
+
+/* Bits of a number that mean that there is no value: bits & mask == pattern. */
+struct md_invalid {
+    uint64_t mask, pattern;
+};
+
+/* The rest of a field, which few have. */
+struct md_extra {
+    double addend;         /* value = (raw * multiplier + addend) / divisor */
+    uint8_t low, bits;     /* raw is so many bits of the number, from this one on; bits 0: the number */
+    uint8_t scale_format;  /* of the number whose power of ten it is multiplied by, at word scale_at; */
+    uint8_t has_scale;     /* beyond 10^-22 to 10^22 there is no value */
+    uint16_t scale_at;
+    uint8_t invalid_count, scale_invalid_count; /* the scale's follow on the number's own */
+    struct md_invalid invalid[MD_MOST_INVALID];
 };
 
 /* The fields of a drive's reply. Drives of a kind share them. */
 struct md_block {
     const struct md_field *fields;
+    const struct md_extra *extra;
     int count;
     uint32_t refusals; /* exceptions in a row */
     uint8_t refusal;   /* the last one's code */
+    uint8_t may_lack;  /* a good reply may hold no value for some field */
     uint16_t drive;    /* code of its name */
 };
 
@@ -129,6 +152,7 @@ struct md_block {
 enum md_status {
     MD_OK = 0,
     MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
+    MD_NO_VALUE = 18,  /* the reply holds what the device gives in place of a value: NaN, an invalid count */
     MD_EXCEPTION = 256 /* + the exception's code */
 };
 

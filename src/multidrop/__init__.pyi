@@ -27,6 +27,7 @@ from multidrop.drive.declaration_check import DeclarationError as DeclarationErr
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
 from multidrop.drive.register import HOLDING as HOLDING
+from multidrop.drive.register import HOLDING_MULTIPLE as HOLDING_MULTIPLE
 from multidrop.drive.register import INPUT as INPUT
 from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Carrier as Carrier
@@ -36,6 +37,8 @@ from multidrop.drive.register import Table as Table
 from multidrop.drive.register import command as command
 from multidrop.drive.register import reading as reading
 from multidrop.drive.register import setting as setting
+from multidrop.drive.text import Text as Text
+from multidrop.drive.text import text as text
 from multidrop.drives import YD1000 as YD1000
 from multidrop.drives import DelixiModbus as DelixiModbus
 from multidrop.drives import DelixiNative as DelixiNative
@@ -51,6 +54,7 @@ from multidrop.errors import NoReply as NoReply
 from multidrop.errors import NoSuchPort as NoSuchPort
 from multidrop.errors import NotAttached as NotAttached
 from multidrop.errors import NotDone as NotDone
+from multidrop.errors import NoValue as NoValue
 from multidrop.errors import Overtaken as Overtaken
 from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused

@@ -17,7 +17,7 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import check_own
+from multidrop.control.rules import check_own, check_own_text
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Echo, Message, Peer
@@ -26,6 +26,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
+from multidrop.drive.text import Text
 from multidrop.errors import BusError
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 from multidrop.transport.line import Line
@@ -231,7 +232,7 @@ class Bus:
     def read(self, drive: Drive, register: Register[T]) -> T:
         """Return the register's value in engineering units.
 
-        Raises NoReply, BadReply, DriveRefused or LineError; ValueError if it cannot be read.
+        Raises NoReply, NoValue, BadReply, DriveRefused or LineError; ValueError if it cannot be read.
         """
         return cast(T, self.read_many(drive, [register])[register.name])
 
@@ -241,6 +242,14 @@ class Bus:
         for register in registers:
             check_own(drive, register)
         return self._exchanges.values(drive, registers, READ_ATTEMPTS)
+
+    def read_text(self, drive: Drive, text: Text) -> str:
+        """Return a text of the drive, such as its serial number.
+
+        Raises NoReply, BadReply, DriveRefused or LineError; ValueError for another family's text.
+        """
+        check_own_text(drive, text)
+        return self._exchanges.text(drive, text)
 
     # ---- writing ----
 

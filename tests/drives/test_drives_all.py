@@ -244,7 +244,7 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
     low, high = 0, (1 << 16 * register.words) - 1
     if register.number_format is NumberFormat.BIT:
         high = 1
-    if register.number_format in (NumberFormat.I16, NumberFormat.I32, NumberFormat.I32_SWAPPED):
+    if register.number_format in (NumberFormat.I16, NumberFormat.I32):
         low, high = -(high + 1) // 2, high // 2
     if register.span is not None:
         low, high = (int(Fraction(str(end)) / register.scale) for end in register.span)

@@ -45,7 +45,7 @@ class Example(Drive):
     state_3 = reading(3, table=INPUT)
     coil = setting(3, table=COIL)
     long = setting(40, number_format=NumberFormat.U32)
-    swapped = setting(42, number_format=NumberFormat.I32_SWAPPED)
+    swapped = setting(42, number_format=NumberFormat.I32, order="CDAB")
     run = command(0x2000)
 
 

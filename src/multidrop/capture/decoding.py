@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from fractions import Fraction
 
 from multidrop.capture.lookup import RegisterLookup, RequestTarget, line_of
 from multidrop.capture.pcapng_reader import Capture
 from multidrop.core import Columns, Decoded, Decoder, Field, Names, RowLayout, Stream
+from multidrop.drive.row_field import row_field
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
@@ -81,7 +81,9 @@ class _LineDecoding:
         drive = self._drives.number(target.drive)
         fields = []
         for place in target.places:
-            scale = place.register.scale if place.register else Fraction(1)
-            name = self._registers.number(place.name)
-            fields.append(Field(place.at, place.number_format, name, scale.numerator, scale.denominator))
+            code = self._registers.number(place.name)
+            if place.register is None:
+                fields.append(Field(place.at, place.number_format, code, 1, 1))
+            else:
+                fields.append(row_field(place.register, place.at, code))
         return RowLayout(drive, fields)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned, wrapped
-from multidrop.core import Framing
+from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -78,6 +80,8 @@ def _sheet(family: type[Drive]) -> str:
                 lines += wrapped(meaning, f"  {name}  ", " " * 8)
     for table in dict.fromkeys(register.table for register in family.registers.values()):
         lines += ["", _table_heading(table, family), *_registers(family, table)]
+    if family.texts:
+        lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<")]
     if family.__doc__:
         lines.append("")
         for line in inspect.cleandoc(family.__doc__).splitlines():
@@ -172,13 +176,16 @@ def _row(register: Register[Any]) -> tuple[str, ...]:
     return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
 
 
+def _text_row(text: Text) -> tuple[str, ...]:
+    return f"  {text.address:04X}H", text.name, f"{2 * text.length} characters", text.place
+
+
 def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.access is Access.SETTING or register.kept is not Kept.UNKNOWN:
         yield f"kept: {register.kept.value}"
     if register.ram_address is not None:
         yield f"written at {register.ram_address:04X}H, in RAM"
-    if register.words > 1:
-        yield f"{register.words} words, {register.number_format.name}"
+    yield from _number(register)
     if register.at_least:
         yield f"at least {register.at_least}"
     if register.at_most:
@@ -201,6 +208,27 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.values is not None:
         yield ", ".join(f"{member.value} {member.name}" for member in register.values)
     yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
+
+
+def _number(register: Register[Any]) -> Iterator[str]:
+    if register.words > 1:
+        order = "" if register.order in ("AB", "ABCD") else f" in the order {register.order}"
+        yield f"{register.words} words, {register.number_format.name}{order}"
+    elif register.number_format in (NumberFormat.I8, NumberFormat.BCD16):
+        yield register.number_format.name
+    if register.part:
+        low, high = register.part
+        yield f"bit {low} of its word" if low == high else f"bits {low} to {high} of its word"
+    if register.offset:
+        yield f"{register.offset:+g} {register.unit}".rstrip()
+    if register.scale_register:
+        yield f"times ten to the power of {register.scale_register}"
+    if register.invalid:
+        yield "no value: " + ", ".join(_count(register, count) for count in register.invalid)
+
+
+def _count(register: Register[Any], count: float) -> str:
+    return f"{count:g}" if register.is_float or count < 0 else f"{int(count):04X}H"
 
 
 def _bits(register: Register[Any], mask: int) -> str:
@@ -245,6 +273,10 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
         "remote": family.remote,
         "watchdog": family.watchdog,
         "registers": [_register(register) for register in family.registers.values()],
+        "texts": [
+            {"name": text.name, "table": text.table.name, "address": text.address, "length": text.length}
+            for text in family.texts.values()
+        ],
         "notes": inspect.cleandoc(family.__doc__ or ""),
     }
 
@@ -257,6 +289,11 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "access": register.access.value,
         "at_least": register.at_least or None,
         "at_most": register.at_most or None,
+        "part": register.part,
+        "invalid": [count if math.isfinite(count) else str(count) for count in register.invalid],
+        "offset": register.offset,
+        "order": register.order,
+        "scale_register": register.scale_register or None,
         "values": None if names is None else {member.name: member.value for member in names},
         "wire": register.number_format.name,
         "kept": register.kept.value,
@@ -264,7 +301,8 @@ def _register(register: Register[Any]) -> dict[str, Any]:
 
 
 _REGISTER_KEYS = (  # in this order
-    *("name", "table", "address", "access", "unit", "step", "span", "at_least", "at_most", "values", "wire"),
+    *("name", "table", "address", "access", "unit", "step", "offset", "span", "at_least", "at_most"),
+    *("values", "wire", "order", "part", "invalid", "scale_register"),
     *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),
     *("never", "place", "outside", "note"),
 )

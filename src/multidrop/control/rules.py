@@ -11,6 +11,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Kept, Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
+from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.errors import Advice, Refused, Unsupported
 
@@ -54,6 +55,17 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
     if drive.registers.get(register.name) is not register:
         family = drive.title or type(drive).__name__
         raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
+
+
+def check_own_text(drive: Drive, text: Text) -> None:
+    """Raise ValueError for another family's text, TypeError for what is none."""
+    if not isinstance(drive, Drive):
+        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
+    if not isinstance(text, Text):
+        raise TypeError(f"{text!r} is no text of {drive.name}: use its attribute, or drive.texts[NAME]")
+    if drive.texts.get(text.name) is not text:
+        family = drive.title or type(drive).__name__
+        raise ValueError(f"this {text.name} is no text of {drive.name}, which is a {family}")
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:

@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
-from multidrop.core.columns import COLUMNS, Columns, Field, Names, NumberFormat, RowLayout, raw_value, spell
+from multidrop.core.columns import (
+    COLUMNS,
+    LOW_BYTE_FIRST,
+    LOW_WORD_FIRST,
+    MOST_INVALID,
+    Columns,
+    Extra,
+    Field,
+    Names,
+    NumberFormat,
+    RowLayout,
+    raw_value,
+    spell,
+)
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
 from multidrop.core.exchange import Completion, Exchange, Peer, completion
 from multidrop.core.frame import (
@@ -48,6 +61,9 @@ __all__ = [
     "COLUMNS",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
+    "LOW_BYTE_FIRST",
+    "LOW_WORD_FIRST",
+    "MOST_INVALID",
     "REFUSALS",
     "STATUSES",
     "STREAM_ROOM",
@@ -60,6 +76,7 @@ __all__ = [
     "Decoder",
     "Echo",
     "Exchange",
+    "Extra",
     "Failure",
     "Field",
     "FrameFault",

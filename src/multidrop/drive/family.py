@@ -9,17 +9,20 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.text import Text, text_errors
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb
 from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
+A = TypeVar("A")
 LONGEST_SILENCE = 1.0  # s
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
@@ -77,25 +80,36 @@ class Drive:
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
+    texts: ClassVar[Mapping[str, Text]] = {}
 
     bus: Any = None  # that it is attached to
 
     def __init_subclass__(cls) -> None:
         """Collect the registers. Raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
-        found: dict[str, Register[Any]] = {}
-        for owner in reversed(cls.__mro__):
-            for name, attribute in vars(owner).items():
-                if isinstance(attribute, Register):
-                    found[name] = attribute
-                else:
-                    found.pop(name, None)  # a subclass has something else of this name
+        found = cls._declared(Register)
         cls.registers = found
+        cls.texts = cls._declared(Text)
         cls.options = cls._all_options()
-        if wrong := declaration_errors(found, _NAMES, cls.options):
+        wrong = declaration_errors(found, _NAMES, cls.options)
+        wrong += text_errors(cls.texts, _NAMES)
+        wrong = wrong or scale_errors(found, cls.most_registers, cls.readable_gaps)
+        if wrong:
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
+
+    @classmethod
+    def _declared(cls, kind: type[A]) -> dict[str, A]:
+        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
+        found: dict[str, A] = {}
+        for owner in reversed(cls.__mro__):
+            for name, attribute in vars(owner).items():
+                if isinstance(attribute, kind):
+                    found[name] = attribute
+                else:
+                    found.pop(name, None)
+        return found
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
@@ -255,6 +269,8 @@ class Drive:
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:
             raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+        if name in self.texts:
+            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
         super().__setattr__(name, value)
 
     def exception(self, code: int) -> str:

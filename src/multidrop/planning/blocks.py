@@ -29,8 +29,8 @@ class Block:
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
         """Return the block that reads these registers of one table and what lies between them."""
-        table, start = registers[0].table, min(register.address for register in registers)
-        count = max(register.address + register.words for register in registers) - start
+        table, start = registers[0].table, min(register.reach.start for register in registers)
+        count = max(register.reach.stop for register in registers) - start
         return cls(table, start, count, tuple(registers), read_request(drive, table, start, count))
 
     def offset(self, register: Register[Any]) -> int:
@@ -131,8 +131,8 @@ class _Neighbours:
         """Yield (begin, count) of each request that may read registers[begin:end]."""
         stop = 0
         for begin in range(end - 1, -1, -1):
-            start = self.registers[begin].address
-            stop = max(stop, start + self.registers[begin].words)
+            start = self.registers[begin].reach.start
+            stop = max(stop, self.registers[begin].reach.stop)
             if begin < end - 1 and (stop - start > self.limit or not self.joined[begin]):
                 return
             yield begin, stop - start
@@ -149,11 +149,11 @@ def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neigh
         tables.setdefault(register.table, []).append(register)
     found = []
     for table, wanted in tables.items():
-        wanted.sort(key=lambda register: (register.address, register.words))
+        wanted.sort(key=lambda register: (register.reach.start, register.reach.stop))
         readable = _readable(cast(Any, type(drive)), table)
         gaps = drive.readable_gaps.get(table, range(0))
         joined = tuple(
-            all(at in readable or at in gaps for at in range(one.address + one.words, other.address))
+            all(at in readable or at in gaps for at in range(one.reach.stop, other.reach.start))
             for one, other in pairwise(wanted)
         )
         found.append(_Neighbours(table, tuple(wanted), joined, drive.most_registers.get(table, 1)))

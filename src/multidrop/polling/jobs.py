@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from multidrop.bus import Bus
 from multidrop.control.rules import check_own
-from multidrop.core import Exchange, Field, Names, RowLayout
+from multidrop.core import Exchange, Names, RowLayout
 from multidrop.drive.family import Drive
+from multidrop.drive.row_field import row_field
 from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import kind, sending, silence
 from multidrop.planning.schedule import Job
@@ -28,13 +29,7 @@ class RowNames:
         return RowLayout(
             self.drives.number(drive.name),
             [
-                Field(
-                    block.offset(register),
-                    register.number_format,
-                    self.registers.number(register.name),
-                    register.scale.numerator,
-                    register.scale.denominator,
-                )
+                row_field(register, block.offset(register), self.registers.number(register.name))
                 for register in block.registers
             ],
         )

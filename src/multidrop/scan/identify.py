@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from multidrop.core import Framing, Message, raw_value
+from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, carry_out
 from multidrop.drive.timing import Settings
-from multidrop.errors import BusError, Refused
+from multidrop.errors import BusError, NoValue, Refused
 from multidrop.planning.blocks import blocks
 from multidrop.scan.results import GUESS
 from multidrop.scan.sweep import Sweep
@@ -100,4 +100,7 @@ def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
 def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
     (block,) = blocks(drive, [register])
     reply = ask(drive, block.request)
-    return register.decode(raw_value(reply.data, block.offset(register), register.number_format))
+    value = register.value_in(reply.data, block.offset(register))
+    if value is None:
+        raise NoValue(drive.name, register.name)
+    return value

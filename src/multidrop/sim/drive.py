@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-from multidrop.core import Framing, Message, raw_value
+from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Kept
 from multidrop.sim.memory import Memory, MemoryCell, decode, pack
@@ -51,8 +51,10 @@ class DriveCounters:
 def _most_cells(drive: Drive) -> dict[int, int]:
     """Return the most cells of a request by the code that reads them: at least those of one register."""
     most: dict[int, int] = {}
-    for table in dict.fromkeys(register.table for register in drive.registers.values()):
-        longest = max(register.words for register in drive.registers.values() if register.table == table)
+    held = [(register.table, len(register.reach)) for register in drive.registers.values()]
+    held += [(text.table, text.length) for text in drive.texts.values()]
+    for table in dict.fromkeys(table for table, _ in held):
+        longest = max(words for other, words in held if other == table)
         limit = min(max(drive.most_registers.get(table, 1), longest), MOST_CELLS[table.carrier])
         for code in {table.read, _COUNTED_AS.get(table.write or 0)} - {None}:
             most[code or 0] = max(most.get(code or 0, 1), limit)
@@ -62,7 +64,7 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 class SimulatedDrive:
     """A drive of any class: its registers hold what is written to them.
 
-    `drive[name]` gets and sets a register's value in its own unit.
+    `drive[name]` gets and sets a register's value in its own unit, None for "no value", or a text.
     """
 
     functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
@@ -83,12 +85,17 @@ class SimulatedDrive:
         return f"<{type(self).__name__} {self.drive.name}>"
 
     def __getitem__(self, name: str) -> Any:
+        if name in self.drive.texts:
+            return self.memory.get_text(self.drive.texts[name])
         register = self.drive.register(name)
         for cell in self.memory.of(register):
             self.refresh(cell)
         return self.memory.get(register)
 
-    def __setitem__(self, name: str, value: float) -> None:
+    def __setitem__(self, name: str, value: Any) -> None:
+        if name in self.drive.texts:
+            self.memory.set_text(self.drive.texts[name], value)
+            return
         register = self.drive.register(name)
         self.memory.set(register, value)
         for cell in self.memory.of(register):
@@ -105,7 +112,8 @@ class SimulatedDrive:
         register = cell.register
         if register is None or register.words > 1:
             return raw
-        if not register.takes(decode(register, raw)):
+        value = decode(register, raw)
+        if value is None or not register.takes(value):
             raise Refusal(Reason.VALUE)
         return raw
 
@@ -115,7 +123,8 @@ class SimulatedDrive:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
                 data = b"".join(pack(cell.table, raws[cell]) for cell in cells)
-                if not register.takes(register.decode(raw_value(data, 0, register.number_format))):
+                value = register.value_in(data, 0)
+                if value is None or not register.takes(value):
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:

@@ -7,10 +7,12 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop import core
-from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit, raw_value
+from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
+from multidrop.drive.request import read_request
+from multidrop.drive.text import Text
+from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached, NoValue
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
@@ -62,10 +64,10 @@ class PreparedRead:
         self._places = [(register, block.offset(register)) for register in block.registers]
 
     def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
-        """Yield the name and the value of each register."""
+        """Yield the name and the value of each register; None where the drive gave none."""
         data = reply.data
         for register, at in self._places:
-            yield register.name, register.decode(raw_value(data, at, register.number_format))
+            yield register.name, register.value_in(data, at)
 
 
 class PreparedReads:
@@ -154,7 +156,7 @@ class Exchanges:
         """Return registers' values by name, each block asked for up to `attempts` times.
 
         One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
-        answers are known to be late, for as long as `timeout` seconds.
+        answers are known to be late, for as long as `timeout` seconds. Raises NoValue where one has none.
         """
         found: dict[str, Any] = {}
         for read in self._prepare(drive).of(tuple(registers)):
@@ -162,13 +164,23 @@ class Exchanges:
             if insists:
                 exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
             found.update(read.decode(self._ask(drive, exchange, attempts)))
-        return {register.name: found[register.name] for register in registers}
+        return _with_values(drive, {register.name: found[register.name] for register in registers})
 
     def value(
         self, drive: Drive, register: Register[Any], attempts: int = READ_ATTEMPTS, *, insists: bool = False
     ) -> Any:
         """Return one register's value."""
         return self.values(drive, [register], attempts, insists=insists)[register.name]
+
+    def text(self, drive: Drive, text: Text) -> str:
+        """Return a text, read in as many requests as its family's limit makes it."""
+        limit = drive.most_registers.get(text.table, text.length)
+        data, end = b"", text.address + text.length
+        for start in range(text.address, end, limit):
+            count = min(limit, end - start)
+            block = Block(text.table, start, count, (), read_request(drive, text.table, start, count))
+            data += self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS).data
+        return text.decode(data)
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
@@ -191,7 +203,7 @@ class Exchanges:
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return dict(read.decode(self._ask(drive, insisting, 1)))[register.name]
+        return _with_values(drive, dict(read.decode(self._ask(drive, insisting, 1))))[register.name]
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
         """Return the reply to a read, which is sent again where it is lost."""
@@ -256,3 +268,12 @@ class Exchanges:
         if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
             raise NoReply(drive.name)
         raise BadReply(drive.name, STATUSES[-result], completion.raw)
+
+
+def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
+    """Return what was found; NoValue where the drive gave no value for one."""
+    for name, value in found.items():
+        if value is None:
+            known = {name: value for name, value in found.items() if value is not None}
+            raise NoValue(drive.name, name, known)
+    return found
