@@ -65,22 +65,34 @@ static int is_failure(int result)
     }
 }
 
+static void count_reply(struct md_block *block, uint8_t exception)
+{
+    if (exception) {
+        block->refusals++;
+        block->refusal = exception;
+    } else if (block->refusals || !block->is_answered) { /* mostly nothing is written */
+        block->refusals = 0;
+        block->is_answered = 1;
+    }
+    if (block->failures)
+        block->failures = 0;
+}
+
 static void count(const struct md_exchange *exchange, const struct md_completion *completion)
 {
     struct md_drive *drive = exchange->drive;
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
-    if (is_failure(completion->result))
+    if (is_failure(completion->result)) {
         md_count_failures(drive, drive->failures + 1);
+        if (block)
+            block->failures++;
+    }
     if (completion->result <= 0)
         return;
     md_count_failures(drive, 0);
-    if (block && completion->reply.exception) {
-        block->refusals++;
-        block->refusal = completion->reply.exception;
-    } else if (block && block->refusals) {
-        block->refusals = 0;
-    }
+    if (block)
+        count_reply(block, completion->reply.exception);
 }
 
 static void tap(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)

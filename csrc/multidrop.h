@@ -143,8 +143,10 @@ struct md_block {
     const struct md_extra *extra;
     int count;
     uint32_t refusals; /* exceptions in a row */
+    uint32_t failures; /* exchanges in a row without a reply, or with a bad one */
     uint8_t refusal;   /* the last one's code */
     uint8_t may_lack;  /* a good reply may hold no value for some field */
+    uint8_t is_answered; /* a good reply came once that was no exception */
     uint16_t drive;    /* code of its name */
 };
 

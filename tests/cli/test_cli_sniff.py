@@ -322,6 +322,11 @@ def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> Non
     )
     (line, _) = run("decode", tmp_path / "a.pcapng", "--plant", plant, "--json")[1].splitlines()
     assert json.loads(line)["values"] == {"power": None}
+    out = tmp_path / "a.csv"
+    assert run("decode", tmp_path / "a.pcapng", "--plant", plant, "--out", out)[0] == 0
+    assert [(row.register, row.value, row.status) for row in recorded(out)] == [
+        ("power", None, "no valid value")
+    ]
 
 
 def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:

@@ -319,7 +319,7 @@ def test_a_register_without_a_value_is_told_by_the_bus(monkeypatch: pytest.Monke
         hall.bus.read_many(drive, [drive.level, drive.speed])
     assert (lack.value.register, dict(lack.value.values)) == ("level", {"speed": 20})
     assert hall.bus.write(drive, drive.limit, 7) == 7  # though it held none
-    with pytest.raises(ValueError, match=r"limit = 65535 m is the count that means no value$"):
+    with pytest.raises(ValueError, match=r"limit = 65535 is the count that means no value$"):
         hall.bus.write(drive, drive.limit, 0xFFFF)
     assert sim["limit"] == 7
 

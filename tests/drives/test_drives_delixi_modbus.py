@@ -7,7 +7,7 @@ from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
 
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
-from multidrop.drive.register import Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.drives.delixi_modbus import DelixiModbus, DelixiModbusControl
 from multidrop.drives.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource
 
@@ -49,7 +49,7 @@ def test_the_line_and_its_limits() -> None:
     assert DelixiModbus.formats[Framing.ASCII] == ("7N2", "7E1", "7O1")
     assert sorted(DelixiModbus.baudrates) == [1200, 2400, 4800, 9600, 19200, 38400]
     assert DelixiModbus.addresses == range(1, 32)
-    assert DelixiModbus.most_registers == {}
+    assert DelixiModbus.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="7N2"):
         DelixiModbus(1, framing="ascii", format="8N2")
 

@@ -8,7 +8,7 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
-from multidrop.drive.register import Kept
+from multidrop.drive.register import HOLDING, Kept
 from multidrop.drives.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
 
 FORWARD = "01 06 10 00 C4 00 DF CA"
@@ -225,7 +225,7 @@ def test_the_line_and_its_limits() -> None:
     assert YD1000(1, baudrate=1200).response_timeout > 0.22
     assert sorted(YD1000.baudrates) == [1200, 2400, 4800, 9600]
     assert set(YD1000.formats[drive.framing]) == {"8N1", "8E1", "8O1"}
-    assert YD1000.most_registers == {}
+    assert YD1000.most_registers == {HOLDING: 1}
     assert "F803" in YD1000.watchdog
 
 

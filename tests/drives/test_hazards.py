@@ -19,7 +19,7 @@ from simulated_bus import SimulatedBus, one, text
 
 from multidrop.core import Framing, Message, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.drive.register import Kept, NumberFormat
+from multidrop.drive.register import HOLDING, Kept, NumberFormat
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.delixi_native import DelixiNativeStatus
 from multidrop.drives.erman_er_g_220 import ErmanFault, ErmanStatus, Modes
@@ -640,7 +640,7 @@ def test_d7_the_faults_10_to_14_in_both_spellings() -> None:
 
 def test_y5_y6_only_two_functions_and_no_address_0() -> None:
     assert {(it.table.read, it.table.write) for it in YD1000.registers.values()} == {(3, 6)}
-    assert YD1000.most_registers == {}
+    assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
 

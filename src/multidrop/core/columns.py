@@ -135,6 +135,20 @@ class RowLayout:
         """The last exception's code."""
         return int(self.c.refusal)
 
+    @property
+    def failures(self) -> int:
+        """Exchanges in a row without a reply, or with a bad one."""
+        return int(self.c.failures)
+
+    @property
+    def is_answered(self) -> bool:
+        """True once a good reply came that was no exception."""
+        return bool(self.c.is_answered)
+
+    def forget(self) -> None:
+        """Begin as if nothing had been asked."""
+        self.c.refusals = self.c.failures = self.c.is_answered = 0
+
 
 COLUMNS: dict[str, Literal["q", "H", "d"]] = {
     "time": "q",

@@ -12,12 +12,14 @@ from typing import Any
 from multidrop.core import MOST_INVALID, NumberFormat
 from multidrop.drive.number_check import number_errors
 from multidrop.drive.number_format import ORDERS, WORDS
-from multidrop.drive.register import SAME_SPACE, Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 
 LAST_ADDRESS = 0xFFFF
 _TEXTS = ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")
 _TRUTHS = ("while_running", "moves")
 _COUNTS = ("broadcast", "harmless", "never_together")
+# Function codes that write the same registers: one at a time, and several at once.
+_SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 
 
 class DeclarationError(ValueError):
@@ -252,7 +254,7 @@ def _shared(registers: list[Register[Any]]) -> Iterator[str]:
 
 def _space(table: Table) -> object:
     modbus = table.carrier in (Carrier.BIT, Carrier.WORD)
-    return (table.carrier, SAME_SPACE.get(table.write or 0, table.write)) if modbus else table
+    return (table.carrier, _SAME_SPACE.get(table.write or 0, table.write)) if modbus else table
 
 
 def _addresses(register: Register[Any]) -> range:

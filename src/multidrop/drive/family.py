@@ -13,6 +13,7 @@ from typing import Any, ClassVar, TypeVar, cast
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.read_limits import limit_errors
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
@@ -58,8 +59,11 @@ class Drive:
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
 
-    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; 1 where a table is not named
+    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange with it to its next request
+
+    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; the standard's where none is stated
     readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that may be read across
+    read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
     exceptions: ClassVar[Mapping[int, str]] = {
         1: "illegal function",
         2: "illegal address",
@@ -91,10 +95,8 @@ class Drive:
         cls.registers = found
         cls.texts = cls._declared(Text)
         cls.options = cls._all_options()
-        wrong = declaration_errors(found, _NAMES, cls.options)
-        wrong += text_errors(cls.texts, _NAMES)
-        wrong = wrong or scale_errors(found, cls.most_registers, cls.readable_gaps)
-        if wrong:
+        wrong = declaration_errors(found, _NAMES, cls.options) + text_errors(cls.texts, _NAMES)
+        if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))

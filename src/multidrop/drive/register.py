@@ -58,18 +58,13 @@ class Table:
     kept: Kept = Kept.UNKNOWN  # where the function code alone decides it
 
     @property
-    def space(self) -> object:
-        """The addresses that it means: tables with one for both have the same words or bits at them."""
-        if self.carrier not in (Carrier.BIT, Carrier.WORD):
-            return self
-        return self.carrier, self.read, SAME_SPACE.get(self.write or 0, self.write)
+    def read_space(self) -> tuple[Carrier, int | None]:
+        """Key of the tables that are read alike: their registers may share a request."""
+        return self.carrier, self.read
 
-
-# Function codes that write the same registers: one at a time, and several at once.
-SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 
 HOLDING = Table("holding register", 0x03, 0x06)
-HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # the same, of a device that has no 06
+HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # also one register is written by 10H
 INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from multidrop.core import NumberFormat
-from multidrop.drive.register import Access, Register, Table
+from multidrop.drive.read_limits import may_be_crossed, read_limit
+from multidrop.drive.register import Access, Register
 
-MOST_WORDS = 125  # of one request
 
-
-def scale_errors(
-    registers: Mapping[str, Register[Any]],
-    most: Mapping[Table, int],
-    gaps: Mapping[Table, Collection[int]],
-) -> list[str]:
-    """Tie registers to their scale registers; return a sentence for each that cannot be.
-
-    `most` are the registers of a table that one request may read, `gaps` the reserved addresses that it may
-    read across.
-    """
+def scale_errors(family: Any) -> list[str]:
+    """Tie a class's registers to their scale registers; return a sentence for each that cannot be."""
+    registers: Mapping[str, Register[Any]] = family.registers
     found = []
     for name, register in registers.items():
         if not register.scale_register:
@@ -28,7 +20,7 @@ def scale_errors(
         wrong = list(_wrong(register, registers))
         if not wrong:
             _tie(register, registers[register.scale_register])
-            wrong = list(_apart(register, registers, most, gaps))
+            wrong = list(_apart(register, family))
         found += [f"{name}: {sentence}" for sentence in wrong]
     return found
 
@@ -42,7 +34,7 @@ def _wrong(register: Register[Any], registers: Mapping[str, Register[Any]]) -> I
         yield f"its scale register {scale.name} is no I16 that can be read: it holds a power of ten"
     elif scale.part or scale.offset or scale.step != 1 or scale.scale_register or scale.values:
         yield f"its scale register {scale.name} is no plain count: it holds a power of ten"
-    if scale.table.space != register.table.space:
+    if scale.table.read_space != register.table.read_space:
         yield f"its scale register {scale.name} is in another table: one request reads both"
     if register.access is not Access.READING:
         yield "a register with a scale register is never written: the device may change the scale meanwhile"
@@ -57,22 +49,16 @@ def _tie(register: Register[Any], scale: Register[Any]) -> None:
     vars(register).pop("reach", None)
 
 
-def _apart(
-    register: Register[Any],
-    registers: Mapping[str, Register[Any]],
-    most: Mapping[Table, int],
-    gaps: Mapping[Table, Collection[int]],
-) -> Iterator[str]:
-    limit = most.get(register.table, MOST_WORDS)
+def _apart(register: Register[Any], family: Any) -> Iterator[str]:
+    limit = read_limit(family, register.table)
     if len(register.reach) > limit:
         shown = f"{len(register.reach)} registers with its scale register {register.scale_register}"
         yield f"one request reads at most {limit} registers, and these are {shown}"
         return
-    known = set(gaps.get(register.table, ()))
-    for other in registers.values():
-        if other.table.space == register.table.space and other.readable:
-            known.update(range(other.address, other.address + other.words))
-    unknown = [address for address in register.reach if address not in known]
+    scale = register.scaled_by
+    own = {*range(register.address, register.address + register.words), scale and scale.address}
+    between = [address for address in register.reach if address not in own]
+    unknown = [address for address in between if not may_be_crossed(family, register.table, [address])]
     if unknown:
         yield (
             f"address {unknown[0]:04X}H between it and its scale register {register.scale_register} is not "

@@ -67,6 +67,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         Framing.RTU: ("8N2", "8E1", "8O1"),
         Framing.ASCII: ("7N2", "7E1", "7O1"),
     }
+    most_registers = {HOLDING: 1}  # in none of its examples more
     exceptions = {}
     broadcasts = True
     remote = "P00.00 must be 2 (RS-485), and P00.01 1 (digital setting)"

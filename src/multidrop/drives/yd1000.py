@@ -9,7 +9,7 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import BusError, Drive, DriveRefused, Refused, Unconfirmed
-from multidrop.drive.register import Details, Kept, Register, command, reading, setting
+from multidrop.drive.register import HOLDING, Details, Kept, Register, command, reading, setting
 from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
@@ -190,6 +190,7 @@ class YD1000(Drive):
     silence_characters = 24  # section 4.3
     response_delay_characters = 24
     response_timeout = 0.5  # 24 characters are 220 ms at 1200 bit/s
+    most_registers = {HOLDING: 1}  # its table of functions has no other read
     exceptions = {
         1: "no such function (after VF-S15)",
         2: "no such register (after VF-S15)",

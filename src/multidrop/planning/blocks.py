@@ -6,19 +6,20 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
-from typing import Any, cast
+from itertools import accumulate
+from typing import Any
 
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Register, Table
+from multidrop.drive.read_limits import may_be_crossed, read_limit, read_span
+from multidrop.drive.register import Carrier, Register, Table
 from multidrop.drive.request import read_request
 from multidrop.planning.bus_time import characters, silence
 
 
 @dataclass(frozen=True)
 class Block:
-    """Registers of one table, and the request that reads them from a drive together."""
+    """Registers of one read space, and the request that reads them from a drive together."""
 
     table: Table
     start: int
@@ -28,9 +29,10 @@ class Block:
 
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
-        """Return the block that reads these registers of one table and what lies between them."""
-        table, start = registers[0].table, min(register.reach.start for register in registers)
-        count = max(register.reach.stop for register in registers) - start
+        """Return the block that reads these registers of one read space and what lies between them."""
+        spans = [read_span(drive, register) for register in registers]
+        table, start = registers[0].table, min(span.start for span in spans)
+        count = max(span.stop for span in spans) - start
         return cls(table, start, count, tuple(registers), read_request(drive, table, start, count))
 
     def offset(self, register: Register[Any]) -> int:
@@ -65,11 +67,12 @@ def plan(
 ) -> Plan:
     """Return the quickest plan that reads each of these registers every so many seconds.
 
-    `delay` is the drive's response delay in s, where it was measured. Registers of a table are read
-    together up to the family's limit where that is quicker, also across other registers that can be read,
-    and across reserved addresses where the family's document allows that. Registers of different rates
-    never share a request: one would be read more often than it is wanted. Raises ValueError for a
-    register that cannot be read.
+    `delay` is the drive's response delay in s, where it was measured. Registers that are read by one
+    function are read together up to the family's limit, or else the standard's, where that is quicker, also
+    across other registers that can be read, and across reserved addresses where the family's document
+    allows that. Registers of different rates never share a request: one would be read more often than it is
+    wanted. Those of a group in `read_together` that have the same rate always share one, and the blocks are
+    in the groups' order. Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
@@ -89,7 +92,15 @@ def plan(
                     most = min(most, _even(drive, other, way))
                 elif other.requests > way.requests:
                     least = max(least, _even(drive, way, other))
-    return Plan(tuple(found), least, most)
+    return Plan(tuple(in_declared_order(drive, found)), least, most)
+
+
+def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
+    """Return the blocks with registers of `read_together` first, in that order."""
+    places = {name: place for place, group in enumerate(drive.read_together) for name in group}
+    return sorted(
+        found, key=lambda one: min(places.get(each.name, len(places)) for each in one.block.registers)
+    )
 
 
 def planned(
@@ -105,14 +116,17 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None
     return tuple(each.block for each in found.planned)
 
 
-def all_blocks(drive: Drive, registers: Iterable[Register[Any]]) -> list[Block]:
-    """Return every block that may read neighbours among these registers."""
-    return [
-        Block.of(drive, neighbours.registers[begin:end])
-        for neighbours in _neighbours(drive, registers)
-        for end in range(1, len(neighbours.registers) + 1)
-        for begin, _ in neighbours.ending_at(end)
-    ]
+def all_requests(
+    drive: Drive, registers: Iterable[Register[Any]]
+) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
+    """Yield every request that may read neighbours among these registers.
+
+    Each is the number of addresses, the registers by rising address, and which of them: from and to.
+    """
+    for neighbours in _neighbours(drive, registers):
+        for end in range(1, len(neighbours.registers) + 1):
+            for begin, count in neighbours.ending_at(end):
+                yield count, neighbours.registers, begin, end
 
 
 # ---- registers that may share a request ----
@@ -120,54 +134,67 @@ def all_blocks(drive: Drive, registers: Iterable[Register[Any]]) -> list[Block]:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Registers of a table by rising address, and which of them one request may read."""
+    """Registers of one read space by rising address, and which of them one request may read.
 
-    table: Table
+    They may overlap: several may be parts of one word.
+    """
+
+    carrier: Carrier
     registers: tuple[Register[Any], ...]
+    spans: tuple[tuple[int, int], ...]  # (first address, the one behind the last) of each
     joined: tuple[bool, ...]  # of each and the next one: all from the one to the other may be read
+    tied: tuple[bool, ...]  # of each and the next one: a request that ends between them parts a group
     limit: int  # that one request may read; a single register is read whole all the same
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
         """Yield (begin, count) of each request that may read registers[begin:end]."""
-        stop = 0
+        if end < len(self.registers) and self.tied[end - 1]:
+            return
+        farthest = max(self.limit, max(stop - start for start, stop in self.spans))
+        behind = longest = 0
         for begin in range(end - 1, -1, -1):
-            start = self.registers[begin].reach.start
-            stop = max(stop, self.registers[begin].reach.stop)
-            if begin < end - 1 and (stop - start > self.limit or not self.joined[begin]):
+            start, stop = self.spans[begin]
+            behind, longest = max(behind, stop), max(longest, stop - start)
+            count = behind - start
+            if begin < end - 1 and (count > farthest or not self.joined[begin]):
                 return
-            yield begin, stop - start
+            if count <= max(self.limit, longest) and not (begin and self.tied[begin - 1]):
+                yield begin, count
 
 
 def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neighbours]:
-    """Return these registers by table."""
-    tables: dict[Table, list[Register[Any]]] = {}
+    """Return these registers by read space."""
+    spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
         if not register.readable:
             raise ValueError(
                 f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}"
             )
-        tables.setdefault(register.table, []).append(register)
-    found = []
-    for table, wanted in tables.items():
-        wanted.sort(key=lambda register: (register.reach.start, register.reach.stop))
-        readable = _readable(cast(Any, type(drive)), table)
-        gaps = drive.readable_gaps.get(table, range(0))
-        joined = tuple(
-            all(at in readable or at in gaps for at in range(one.reach.stop, other.reach.start))
-            for one, other in pairwise(wanted)
-        )
-        found.append(_Neighbours(table, tuple(wanted), joined, drive.most_registers.get(table, 1)))
-    return found
+        spaces.setdefault(register.table.read_space, []).append((read_span(drive, register), register))
+    return [_side_by_side(drive, wanted) for wanted in spaces.values()]
 
 
-@lru_cache(maxsize=256)
-def _readable(family: type[Drive], table: Table) -> frozenset[int]:
-    """Return the addresses at which the family has something to read."""
-    return frozenset(
-        address
-        for register in family.registers.values()
-        if register.table == table and register.readable
-        for address in range(register.address, register.address + register.words)
+def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _Neighbours:
+    wanted.sort(key=lambda each: (each[0].start, each[0].stop))
+    table = wanted[0][1].table
+    behind = accumulate((span.stop for span, _ in wanted), max)
+    joined = [
+        may_be_crossed(drive, table, range(stop, other.start))
+        for stop, (other, _) in zip(behind, wanted[1:], strict=False)
+    ]
+    places = {register.name: place for place, (_, register) in enumerate(wanted)}
+    tied = [False] * len(joined)
+    for group in drive.read_together:
+        inside = [places[name] for name in group if name in places]
+        for first, last in [(min(inside), max(inside))] if inside else []:
+            tied[first:last] = [True] * (last - first)
+    return _Neighbours(
+        table.carrier,
+        tuple(register for _, register in wanted),
+        tuple((span.start, span.stop) for span, _ in wanted),
+        tuple(joined),
+        tuple(tied),
+        read_limit(drive, table),
     )
 
 
@@ -196,7 +223,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
     for end in range(1, len(neighbours.registers) + 1):
         fewest: dict[int, _Way] = {}  # characters, by number of requests
         for begin, count in neighbours.ending_at(end):
-            own = characters(framing, neighbours.table, count)
+            own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
                 known = fewest.get(before.requests + 1)
                 if known is None or before.characters + own < known.characters:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Carrier, Table
+from multidrop.drive.register import Carrier
 
 if TYPE_CHECKING:
     from multidrop.planning.blocks import Block
@@ -28,15 +28,15 @@ def silence(drive: Drive) -> float:
     return max(drive.needed_silence(), least) + settings.bit
 
 
-def characters(framing: Framing, table: Table, count: int) -> int:
+def characters(framing: Framing, carrier: Carrier, count: int) -> int:
     """Return the characters of the request that reads so many registers and of its reply."""
     around, each = _FRAMES[framing]
-    return around + each * ((count + 7) // 8 if table.carrier is Carrier.BIT else 2 * count)
+    return around + each * ((count + 7) // 8 if carrier is Carrier.BIT else 2 * count)
 
 
 def sending(drive: Drive, block: Block) -> float:
     """Return the seconds in which characters of the request and of the reply are on the wire."""
-    return characters(drive.framing, block.table, block.count) * drive.settings.character
+    return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:

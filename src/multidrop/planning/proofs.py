@@ -8,12 +8,13 @@ protocol by parameter, and otherwise by the values that two registers are known 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
+from functools import lru_cache
 from typing import Any
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register
-from multidrop.planning.blocks import Block, all_blocks
+from multidrop.planning.blocks import Block, all_requests
 
 MOST_PROOFS = 4  # each costs memory for every drive
 
@@ -26,10 +27,10 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     The last one is the least likely to be polled. There is none where a family can tell no two replies apart.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
-    shapes: dict[Hashable, Block] = {}
-    for block in _candidates(drive):
-        shapes.setdefault(_shape(block), block)
-    found: list[tuple[Block, RawRange | None]] = [(block, None) for block in shapes.values()]
+    family: Any = type(drive)
+    found: list[tuple[Block, RawRange | None]] = [
+        (Block.of(drive, registers), None) for registers in _told_apart(family)
+    ]
     if known:
         found = [*known, *found[1:]]
     if len(found) >= MOST_PROOFS:
@@ -37,18 +38,28 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     return found if len(found) > 1 else []
 
 
-def _candidates(drive: Drive) -> Iterator[Block]:
-    """Yield all blocks: first those that are polled anyway, and of those the short ones."""
-    readable: list[Register[Any]] = [register for register in drive.registers.values() if register.readable]
+@lru_cache(maxsize=256)
+def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
+    """Return registers whose requests differ in what their replies show: some of them, and the last one.
+
+    First come those that are polled anyway, and of those the shortest requests.
+    """
+    readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
+    shapes: dict[Hashable, tuple[Register[Any], ...]] = {}
     for registers in (readings, readable):
-        yield from sorted(all_blocks(drive, registers), key=lambda block: block.count)
+        for count, ordered, begin, end in sorted(all_requests(family, registers), key=lambda one: one[0]):
+            shape = _shape(ordered[begin], count)
+            if shape not in shapes:
+                shapes[shape] = ordered[begin:end]
+    found = list(shapes.values())
+    return tuple(found if len(found) <= MOST_PROOFS else [*found[:MOST_PROOFS], found[-1]])
 
 
-def _shape(block: Block) -> Hashable:
+def _shape(first: Register[Any], count: int) -> Hashable:
     """Return what a reply shows of its request."""
-    if block.table.carrier is Carrier.LONG:
-        return block.table.read, block.start
-    if block.table.carrier is Carrier.BIT:
-        return block.table.read, (block.count + 7) // 8
-    return block.table.read, block.count
+    if first.table.carrier is Carrier.LONG:
+        return first.table.read, first.address
+    if first.table.carrier is Carrier.BIT:
+        return first.table.read, (count + 7) // 8
+    return first.table.read, count

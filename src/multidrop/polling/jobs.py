@@ -13,6 +13,7 @@ from multidrop.drive.row_field import row_field
 from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import kind, sending, silence
 from multidrop.planning.schedule import Job
+from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.exchange import make_read
 
@@ -44,6 +45,7 @@ class PolledJob(Job):
     exchange: Exchange
     rows: RowLayout
     own_ns: int  # of silence and characters, to which the response delay comes
+    may_be_too_long: bool  # for the drive
 
     @property
     def name(self) -> str:
@@ -66,6 +68,7 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # what was refused stays known at any rate
         self._skipped = 0  # of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
@@ -83,7 +86,9 @@ class JobMaker:
     def job(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
         key = drive, block, period_ns
         if key not in self._made:
-            self._made[key] = self.make(drive, block, period_ns)
+            if (drive, block) not in self._rows:
+                self._rows[drive, block] = self._names.layout(drive, block)
+            self._made[key] = self.make(drive, block, period_ns, rows=self._rows[drive, block])
         return self._made[key]
 
     def forget(self, jobs: Iterable[PolledJob]) -> None:
@@ -97,9 +102,11 @@ class JobMaker:
                 del self._made[key]
                 self._skipped += job.skipped
 
-    def make(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
+    def make(
+        self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
+    ) -> PolledJob:
         """Make a job of its own."""
-        rows = self._names.layout(drive, block)
+        rows = rows or self._names.layout(drive, block)
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(
             drive=drive.address,
@@ -111,6 +118,7 @@ class JobMaker:
             exchange=make_read(drive, block, self._bus.peer(drive), rows, period=(period_ns or 0) / 1e9),
             rows=rows,
             own_ns=own_ns,
+            may_be_too_long=may_be_too_long(drive, block),
         )
 
     @property

@@ -234,8 +234,9 @@ class PolledLine:
 
     def _miss(self, slots: list[Slot], why: Status) -> None:
         for job, due_ns in slots:
-            job.exchange.peer.unasked[why] += job.rows.count
-            self._row_queue.add_miss(job.rows, why, due_ns)
+            if job.rows.count:
+                job.exchange.peer.unasked[why] += job.rows.count
+                self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
         """Make rows of slots that passed unasked once they are due: they are planned ahead."""

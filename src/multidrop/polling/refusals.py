@@ -1,51 +1,73 @@
-"""Refusals: registers that their drive refuses are asked singly, then set aside and asked rarely.
+"""Refusals: what a drive does not answer as a whole is asked in halves, and a refused register rarely.
 
-So no register is lost because of its neighbours. One that is answered after all is polled as before.
+So no register is lost because of its neighbours. A register that is answered after all is polled as before,
+and so is a whole that was split: now and then it is tried again, without rows. A block may also be too long
+for its drive, which then keeps silent. That is split as well, where the class states no limit, the block was
+never answered, and the drive answers other requests meanwhile; a silent drive is asked for one register.
 """
 
 from __future__ import annotations
 
 import logging
 
+from multidrop.core import RowLayout
 from multidrop.drive.family import Drive
 from multidrop.planning.blocks import Block
 from multidrop.planning.schedule import Schedule
+from multidrop.planning.splitting import halves, least
 from multidrop.polling.jobs import JobMaker, PolledJob
 from multidrop.transport.aside_log import log_aside
 
-REFUSALS = 3  # exceptions in a row after which a register is asked for in another way
-SET_ASIDE_NS = 60_000_000_000  # between attempts to read a register that the drive refuses
+REFUSALS = 3  # exceptions in a row after which a block or a register is asked for in another way
+FAILURES = 3  # requests in a row for a block without a reply, while the drive answers others
+SET_ASIDE_NS = 60_000_000_000  # between attempts to read what the drive refuses
 
 _log = logging.getLogger("multidrop.polling")
 
 
 class Refusals:
-    """Registers of one line that are set aside."""
+    """Registers of one line that are set aside, and blocks that are split."""
 
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
         self._set_aside: dict[PolledJob, PolledJob] = {}  # the rare job, and the one it replaces
         self._rare: dict[PolledJob, PolledJob] = {}  # by the job that each replaces
+        self._wholes: dict[PolledJob, PolledJob] = {}  # the planned job, by each of its parts
+        self._trials: dict[PolledJob, PolledJob] = {}  # the rare attempt, and the planned job that it makes
+        self._probes: dict[int, PolledJob] = {}  # by drives that have only blocks that may be too long
 
     @property
     def names(self) -> list[str]:
         """Drives and registers that are set aside now."""
-        return [job.name for job in self._set_aside]
+        return [
+            f"{job.owner.name}.{register.name}" for job in self._set_aside for register in job.block.registers
+        ]
 
     def heed(self, now_ns: int) -> None:
         """Ask for refused registers in another way, and for those that are answered again as before."""
+        for trial in [trial for trial in self._trials if trial.rows.is_answered]:
+            self._make_whole(trial, now_ns)
         for job in [job for job in self._set_aside if not job.rows.refusals]:
             self._schedule.replace([job], [self._set_aside.pop(job)], now_ns)
-        for job in [job for job in self._schedule.jobs if _is_refused(job)]:
-            if len(job.block.registers) > 1:
-                parts = [
-                    self._maker.job(job.owner, Block.of(job.owner, [register]), job.period_ns)
-                    for register in job.block.registers
-                ]
-                self._schedule.replace([job], parts, now_ns)
+        for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
+            if parts := halves(job.owner, job.block):
+                self._split(job, parts, now_ns)
+                self._try_rarely(self._wholes.get(job, job), now_ns)
             elif job not in self._set_aside:
                 self._put_aside(job, now_ns)
+        for job in [job for job in self._schedule.jobs if job.may_be_too_long and job.rows.failures]:
+            self._heed_silence(job, now_ns)
+        if self._probes:
+            self._end_probes()
+
+    def _is_refused(self, job: PolledJob) -> bool:
+        """Return True where it is to be asked in another way; a part of a refused block at once."""
+        count = job.rows.refusals
+        if not count or job in self._trials or job is self._probes.get(job.drive):
+            return False
+        is_part = len(job.block.registers) > 1 and job in self._wholes
+        return count >= (1 if is_part else REFUSALS) and not job.owner.is_passing(job.rows.refusal)
 
     def _put_aside(self, job: PolledJob, now_ns: int) -> None:
         if job not in self._rare:
@@ -57,11 +79,63 @@ class Refusals:
         said = "%s is refused (code %02XH), and asked rarely from now on"
         log_aside(_log, logging.INFO, said, job.name, job.rows.refusal)
 
+    # ---- blocks ----
+
+    def _split(self, job: PolledJob, blocks: tuple[Block, ...], now_ns: int) -> None:
+        parts = [self._maker.job(job.owner, block, job.period_ns) for block in blocks]
+        for part in parts:
+            part.rows.forget()
+            self._wholes[part] = self._wholes.get(job, job)
+        self._schedule.replace([job], parts, now_ns)
+        why = f"is refused (code {job.rows.refusal:02X}H)" if job.rows.refusals else "is not answered"
+        said = "%s with %d more %s, and asked for in two parts"
+        log_aside(_log, logging.INFO, said, job.name, len(job.block.registers) - 1, why)
+
+    def _try_rarely(self, whole: PolledJob, now_ns: int) -> None:
+        """Try now and then whether a block is answered as a whole after all."""
+        if whole in self._trials.values():
+            return
+        trial = self._maker.make(whole.owner, whole.block, SET_ASIDE_NS, rows=RowLayout(0, []))
+        self._trials[trial] = whole
+        self._schedule.add(trial, now_ns + SET_ASIDE_NS)
+
+    def _make_whole(self, trial: PolledJob, now_ns: int) -> None:
+        whole = self._trials.pop(trial)
+        parts = [
+            job for job in self._schedule.jobs if self._wholes.get(self._set_aside.get(job, job)) is whole
+        ]
+        self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare not in parts}
+        self._wholes = {part: other for part, other in self._wholes.items() if other is not whole}
+        whole.rows.forget()
+        self._schedule.replace([trial, *parts], [whole], now_ns)
+
+    # ---- silence ----
+
+    def _heed_silence(self, job: PolledJob, now_ns: int) -> None:
+        """Split a block that may be too long, once the drive is seen to answer shorter requests."""
+        peer, drive = job.exchange.peer, job.owner
+        if job.rows.is_answered or job in self._trials:
+            return
+        if peer.failures < FAILURES <= job.rows.failures:
+            self._split(job, halves(drive, job.block), now_ns)
+        elif not peer.has_answered and drive.address not in self._probes:
+            jobs = [other for other in self._schedule.jobs if other.owner is drive]
+            if all(other.may_be_too_long for other in jobs):
+                probe = self._probes[drive.address] = self._maker.make(drive, least(drive, job.block), None)
+                self._schedule.add(probe, now_ns)
+
+    def _end_probes(self) -> None:
+        """Ask no more for one register of drives whose blocks are all answered or split."""
+        doubtful = {
+            job.drive for job in self._schedule.jobs if job.may_be_too_long and not job.rows.is_answered
+        }
+        for address in self._probes.keys() - doubtful:
+            self._schedule.remove(self._probes.pop(address))
+
     def forget(self, drive: Drive) -> None:
         """Set nothing of this drive aside any more: it leaves."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
         self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
-
-
-def _is_refused(job: PolledJob) -> bool:
-    return job.rows.refusals >= REFUSALS and not job.owner.is_passing(job.rows.refusal)
+        self._trials = {trial: job for trial, job in self._trials.items() if trial.owner is not drive}
+        self._wholes = {part: job for part, job in self._wholes.items() if part.owner is not drive}
+        self._probes.pop(drive.address, None)

@@ -13,13 +13,13 @@ from typing import Any, ClassVar, NamedTuple
 
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
+from multidrop.drive.read_limits import STANDARD_LIMITS, read_limit
 from multidrop.drive.register import Access, Carrier, Kept
 from multidrop.sim.memory import Memory, MemoryCell, decode, pack
 from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
-MOST_CELLS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}  # in any reply
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
 
@@ -52,10 +52,8 @@ def _most_cells(drive: Drive) -> dict[int, int]:
     """Return the most cells of a request by the code that reads them: at least those of one register."""
     most: dict[int, int] = {}
     held = [(register.table, len(register.reach)) for register in drive.registers.values()]
-    held += [(text.table, text.length) for text in drive.texts.values()]
-    for table in dict.fromkeys(table for table, _ in held):
-        longest = max(words for other, words in held if other == table)
-        limit = min(max(drive.most_registers.get(table, 1), longest), MOST_CELLS[table.carrier])
+    for table, words in [*held, *((text.table, 1) for text in drive.texts.values())]:
+        limit = min(max(read_limit(drive, table), words), STANDARD_LIMITS[table.carrier])
         for code in {table.read, _COUNTED_AS.get(table.write or 0)} - {None}:
             most[code or 0] = max(most.get(code or 0, 1), limit)
     return most

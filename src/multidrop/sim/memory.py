@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 from multidrop.core import Framing
@@ -45,7 +46,7 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[object, int], MemoryCell] = {}
+        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables that are read alike share them
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, also in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
@@ -56,7 +57,7 @@ class Memory:
             self.make_readable(text.table, self._addresses(text))
 
     def _cell(self, table: Table, address: int) -> MemoryCell:
-        return self._cells.setdefault((table.space, address), MemoryCell(table, address))
+        return self._cells.setdefault((_space(table), address), MemoryCell(table, address))
 
     def _declare(self, register: Register[Any]) -> None:
         table = register.table
@@ -120,7 +121,7 @@ class Memory:
         """
         coding = register.coding
         if value is None:
-            self.set_raw(register, _no_value(register))
+            self._put(register, *_no_value(register))
         elif register.values is not None:
             self.set_raw(register, _placed(register, int(value)))
         elif register.is_float:
@@ -139,11 +140,13 @@ class Memory:
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
         """Hold these bits, of a register that is a part of its words beside those of the others."""
+        self._put(register, raw, register.coding.mask)
+
+    def _put(self, register: Register[Any], raw: int, mask: int) -> None:
         cells = self.of(register)
         size = _BYTES[register.table.carrier]
         order = "AB" if register.table.carrier is Carrier.BIT else register.coding.order
         before = arranged(b"".join(pack(cell.table, cell.raw) for cell in cells), order)
-        mask = register.coding.mask
         bits = (int.from_bytes(before) & ~mask) | (raw & mask)
         data = arranged(bits.to_bytes(len(before)), order)
         for at, cell in enumerate(cells):
@@ -169,6 +172,11 @@ class Memory:
         return [self._cell(register.table, register.address + at) for at in range(register.words)]
 
 
+@cache
+def _space(table: Table) -> object:
+    return table if table.read is None else table.read_space
+
+
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
     """Return True for the register whose name and span a cell has: a writable one, then a whole one."""
     if known is None or register.access is not Access.READING:
@@ -183,11 +191,12 @@ def _placed(register: Register[Any], raw: int) -> int:
     return raw << register.part[0] & register.coding.mask
 
 
-def _no_value(register: Register[Any]) -> int:
-    for _, pattern in register.coding.invalid_patterns:
-        return pattern
+def _no_value(register: Register[Any]) -> tuple[int, int]:
+    """Return bits that mean no value, and the mask of those that matter."""
+    for mask, pattern in register.coding.invalid_patterns:
+        return pattern, mask
     if register.is_float:
-        return bits_of(math.nan, register.number_format)
+        return bits_of(math.nan, register.number_format), register.coding.mask
     raise ValueError(f"{register.name} has no count that means no value")
 
 

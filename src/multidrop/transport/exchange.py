@@ -9,6 +9,7 @@ from typing import Any
 from multidrop import core
 from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit
 from multidrop.drive.family import Drive
+from multidrop.drive.read_limits import read_limit
 from multidrop.drive.register import Register
 from multidrop.drive.request import read_request
 from multidrop.drive.text import Text
@@ -16,12 +17,14 @@ from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached, NoVal
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
+from multidrop.planning.splitting import halves, least, may_be_too_long
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
+ILLEGAL_FUNCTION = 1  # a shorter request has the same one
 MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
 NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
 
@@ -61,6 +64,7 @@ class PreparedRead:
     def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
         self.block = block
         self.exchange = make_read(drive, block, peer)
+        self.may_be_too_long = may_be_too_long(drive, block)
         self._places = [(register, block.offset(register)) for register in block.registers]
 
     def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
@@ -85,6 +89,9 @@ class PreparedReads:
             return tuple(prepare(block) for block in blocks(drive, registers))
 
         self.of = of
+        self.prepare = prepare
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
+        self.answered: set[Block] = set()  # blocks that may have been too long, and are not
 
 
 class Exchanges:
@@ -156,15 +163,55 @@ class Exchanges:
         """Return registers' values by name, each block asked for up to `attempts` times.
 
         One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
-        answers are known to be late, for as long as `timeout` seconds. Raises NoValue where one has none.
+        answers are known to be late, for as long as `timeout` seconds. A block that the drive refuses as a
+        whole, or keeps silent to, is asked for in parts from then on, until the port is opened again. Raises
+        NoValue where a register has none.
         """
+        prepared = self._prepare(drive)
         found: dict[str, Any] = {}
-        for read in self._prepare(drive).of(tuple(registers)):
-            exchange = read.exchange
-            if insists:
-                exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
-            found.update(read.decode(self._ask(drive, exchange, attempts)))
+        wanted = list(reversed(prepared.of(tuple(registers))))
+        while wanted:
+            read = wanted.pop()
+            parts = prepared.parts.get(read.block)
+            if parts is None:
+                try:
+                    found.update(self._values(drive, read, attempts, insists, timeout))
+                    if read.may_be_too_long:
+                        prepared.answered.add(read.block)
+                    continue
+                except (DriveRefused, NoReply, BadReply) as failure:
+                    parts = self._parts(drive, prepared, read, failure)
+                    if not parts:
+                        raise
+                prepared.parts[read.block] = parts
+            wanted += [prepared.prepare(part) for part in reversed(parts)]
         return _with_values(drive, {register.name: found[register.name] for register in registers})
+
+    def _values(
+        self, drive: Drive, read: PreparedRead, attempts: int, insists: bool, timeout: float
+    ) -> dict[str, Any]:
+        exchange = read.exchange
+        if insists:
+            exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
+        return dict(read.decode(self._ask(drive, exchange, attempts)))
+
+    def _parts(
+        self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
+    ) -> tuple[Block, ...]:
+        """Return the blocks to ask for instead of one that failed; none where that would not help."""
+        block = read.block
+        if isinstance(failure, DriveRefused):
+            is_whole = failure.code == ILLEGAL_FUNCTION or drive.is_passing(failure.code)
+            return () if is_whole else halves(drive, block)
+        if not read.may_be_too_long or block in prepared.answered:
+            return ()
+        try:  # is it there at all?
+            self._ask(drive, prepared.prepare(least(drive, block)).exchange, 1)
+        except (NoReply, BadReply):
+            return ()
+        except DriveRefused:
+            pass
+        return halves(drive, block)
 
     def value(
         self, drive: Drive, register: Register[Any], attempts: int = READ_ATTEMPTS, *, insists: bool = False
@@ -174,7 +221,7 @@ class Exchanges:
 
     def text(self, drive: Drive, text: Text) -> str:
         """Return a text, read in as many requests as its family's limit makes it."""
-        limit = drive.most_registers.get(text.table, text.length)
+        limit = read_limit(drive, text.table)
         data, end = b"", text.address + text.length
         for start in range(text.address, end, limit):
             count = min(limit, end - start)

@@ -1,0 +1,282 @@
+"""Reading together where a class states no limit, and groups that always share a request."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from examples import examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from meter import ADDRESSES, Meter, StatedMeter
+
+from multidrop import HOLDING_MULTIPLE
+from multidrop.core import Message
+from multidrop.drive import Drive, Framing
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import (
+    COIL,
+    DISCRETE,
+    HOLDING,
+    INPUT,
+    Carrier,
+    NumberFormat,
+    Register,
+    Table,
+    command,
+    reading,
+    setting,
+)
+from multidrop.drive.request import write_request
+from multidrop.drives import MODELS
+from multidrop.planning.blocks import Block, blocks, planned
+from multidrop.planning.bus_time import sending, silence
+from multidrop.planning.prediction import predict
+from multidrop.sim import SimulatedDrive
+
+
+def family(**declared: Any) -> type[Drive]:
+    return type("Drawn", (Drive,), {"__doc__": "Of this test.", **declared})
+
+
+def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
+    wanted = [drive.register(name) for name in names] if names else drive.registers.values()
+    return [(block.start, block.count) for block in blocks(drive, wanted)]
+
+
+# ---- nothing stated ----
+
+
+@pytest.mark.parametrize(("table", "most"), [(HOLDING, 125), (INPUT, 125), (COIL, 2000), (DISCRETE, 2000)])
+def test_side_by_side_the_standard_s_limits_hold(table: Table, most: int) -> None:
+    drive = family(**{f"r{at}": reading(at, table=table) for at in range(most + 1)})(1)
+    counts = sorted(count for _, count in spans(drive))
+    assert len(counts) == 2
+    assert sum(counts) == most + 1
+    one = [drive.register(f"r{at}") for at in range(most)]
+    assert [block.count for block in blocks(drive, one)] == [most]
+
+
+def test_undeclared_addresses_are_never_read_across() -> None:
+    drive = family(a=reading(1), b=reading(2), c=reading(4), d=reading(5), e=reading(7), order=command(6))(1)
+    assert spans(drive, "a", "b", "c", "d", "e") == [(1, 2), (4, 2), (7, 1)]
+
+
+def test_a_declared_register_that_nobody_wants_is_read_across() -> None:
+    drive = family(a=reading(1), b=reading(2), c=reading(3))(1)
+    assert spans(drive, "a", "c") == [(1, 3)]
+
+
+def test_what_is_stated_for_one_table_leaves_the_others_to_the_standard() -> None:
+    registers = {f"h{at}": reading(at) for at in range(4)}
+    registers |= {f"i{at}": reading(at, table=INPUT) for at in range(4)}
+    drive = family(most_registers={HOLDING: 2}, **registers)(1)
+    assert spans(drive) == [(0, 2), (2, 2), (0, 4)]
+
+
+def test_delixi_s_own_frames_have_room_for_one() -> None:
+    table = Table("parameter", 0x07, 0x05, Carrier.LONG)
+    drive = family(framings=(Framing.DELIXI,), a=reading(500, table=table), b=reading(501, table=table))(1)
+    assert spans(drive) == [(500, 1), (501, 1)]
+
+
+# The requests for all readings at the families' own settings, before the standard's limits were a default:
+# (function, start, count).
+REQUESTS = {
+    "erman-er-g-220": [(4, 1, 12), (4, 1024, 4)],
+    "invt-che": [(3, 0x1001, 1), (3, 0x3000, 14), (3, 0x3010, 7), (3, 0x5000, 2)],
+    "innovert-ibd": [(3, 3, 2), (3, 22, 1)],
+    "delixi-modbus": [(3, 500 + at, 1) for at in range(32)],
+    "delixi-native": [(3, 0, 1), *((7, 500 + at, 1) for at in range(32))],
+    "yd1000": [
+        *((3, at, 1) for at in (0x1100, *range(0x1200, 0x120A))),
+        *((3, at, 1) for at in range(0x1210, 0x1215)),
+    ],
+}
+
+
+@pytest.mark.parametrize("model", REQUESTS)
+def test_no_built_in_family_s_requests_have_changed(model: str) -> None:
+    drive = MODELS[model](3)
+    found = [(block.request.function, block.start, block.count) for block in blocks(drive, drive.readings())]
+    assert sorted(found) == REQUESTS[model]
+
+
+# ---- the meter ----
+
+
+def test_a_meter_of_39_floats_is_read_in_eight_requests_by_default_and_in_four_with_its_gaps() -> None:
+    assert len(ADDRESSES) == 39
+    lines = []
+    for meter in (Meter, StatedMeter):
+        drive = meter(1, baudrate=9600, format="8N1")
+        wanted = [(drive.register(name), None) for name in ADDRESSES]
+        found = planned(drive, wanted)
+        lines.append((len(found), round(predict(found, lateness=0.0).cycle, 3)))
+    assert lines == [(8, 0.341), (4, 0.268)]
+
+
+def test_by_default_the_meter_is_asked_for_what_it_declares_and_nothing_else() -> None:
+    drive = Meter(1)
+    declared = {at for address in ADDRESSES.values() for at in (address, address + 1)}
+    asked = [range(one.start, one.start + one.count) for one in blocks(drive, drive.readings())]
+    assert all(at in declared or one.start == 0xFC00 for one in asked for at in one)
+    assert {at for one in asked for at in one} == declared | {0xFC00, 0xFC01}
+
+
+# ---- tables that are read alike ----
+
+
+class Mixed(Drive):
+    """Some registers are written by 06, others by 10H alone; all are read by 03."""
+
+    low = setting(1, "", span=(0, 9))
+    multiple = setting(2, "", span=(0, 9), table=HOLDING_MULTIPLE)
+    read_only = reading(3, table=Table("status", 0x03, None))
+    other = reading(4, table=INPUT)
+
+
+def test_tables_of_one_read_function_share_requests() -> None:
+    drive = Mixed(1)
+    found = blocks(drive, drive.registers.values())
+    assert [(one.request.function, one.start, one.count) for one in found] == [(3, 1, 3), (4, 4, 1)]
+    assert (HOLDING_MULTIPLE.read, HOLDING_MULTIPLE.write, HOLDING_MULTIPLE.name) == (3, 16, HOLDING.name)
+
+
+def test_the_least_limit_stated_for_what_is_read_alike_holds() -> None:
+    class Narrow(Mixed):
+        most_registers = {HOLDING_MULTIPLE: 2, HOLDING: 3}
+
+    drive = Narrow(1)
+    assert len(blocks(drive, [Narrow.low, Narrow.multiple, Narrow.read_only])) == 2
+
+
+def test_one_word_is_written_by_10h() -> None:
+    drive, sim = Mixed(1), SimulatedDrive(Mixed(1))
+    request = write_request(drive, Mixed.multiple, 7)
+    assert request == Message(1, 0x10, 2, 1, b"\0\7")
+    reply = sim.answer(request, 0)
+    assert reply is not None
+    assert (reply.exception, sim["multiple"]) == (0, 7)
+    single = sim.answer(Message(1, 0x06, 2, data=b"\0\1"), 1)
+    assert single is not None
+    assert single.exception
+    (block,) = blocks(drive, [Mixed.low, Mixed.multiple, Mixed.read_only])
+    together = sim.answer(block.request, 2)
+    assert together is not None
+    assert together.data == bytes((0, 0, 0, 7, 0, 0))
+
+
+# ---- registers that overlap ----
+
+
+LAYOUTS = st.lists(
+    st.tuples(st.integers(0, 11), st.sampled_from([NumberFormat.U16, NumberFormat.U32])),
+    min_size=1,
+    max_size=7,
+)
+
+
+def partitions(registers: list[Register[float]]) -> list[list[list[Register[float]]]]:
+    """Return all ways to put registers into groups, neighbours or not."""
+    if not registers:
+        return [[]]
+    first, *others = registers
+    found = []
+    for rest in partitions(others):
+        found += [[[first], *rest]]
+        found += [[*rest[:at], [first, *rest[at]], *rest[at + 1 :]] for at in range(len(rest))]
+    return found
+
+
+def allowed(drive: Drive, group: list[Register[float]], limit: int) -> bool:
+    declared = {at for one in drive.registers.values() for at in range(one.address, one.address + one.words)}
+    start, stop = min(one.address for one in group), max(one.address + one.words for one in group)
+    return stop - start <= max(limit, *(one.words for one in group)) and declared >= set(range(start, stop))
+
+
+@settings(max_examples=examples(150), deadline=None)
+@given(LAYOUTS, st.sampled_from([None, 1, 3]), st.sampled_from([1200, 115200]))
+def test_no_other_way_to_read_registers_that_overlap_is_quicker(
+    layout: list[tuple[int, NumberFormat]], limit: int | None, baudrate: int
+) -> None:
+    registers = {
+        f"r{number}": reading(address, number_format=number_format)
+        for number, (address, number_format) in enumerate(layout)
+    }
+    stated = {} if limit is None else {HOLDING: limit}
+    drive = family(most_registers=stated, **registers)(1, baudrate=baudrate)
+
+    def seconds(found: list[Block]) -> float:
+        return sum(silence(drive) + sending(drive, one) + drive.response_delay for one in found)
+
+    ours = list(blocks(drive, drive.registers.values()))
+    assert sorted(one.name for block in ours for one in block.registers) == sorted(registers)
+    assert all(allowed(drive, list(one.registers), limit or 125) for one in ours)
+    ways = partitions(list(drive.registers.values()))
+    best = min(
+        seconds([Block.of(drive, group) for group in way])
+        for way in ways
+        if all(allowed(drive, group, limit or 125) for group in way)
+    )
+    assert seconds(ours) == pytest.approx(best)
+
+
+# ---- groups ----
+
+
+class Grouped(Drive):
+    """Energy in two words with others between, a state that is to be read first, and much gap."""
+
+    most_registers = {HOLDING: 100}
+    readable_gaps = {HOLDING: range(200)}
+    read_together = (("latch",), ("energy_high", "energy_low"))
+    energy_high = reading(0)
+    between = reading(30)
+    energy_low = reading(60)
+    latch = reading(150)
+    other = reading(110)
+
+
+@pytest.mark.parametrize("baudrate", [1200, 9600, 115200])
+def test_a_group_shares_a_request_where_apart_would_be_quicker(baudrate: int) -> None:
+    drive = Grouped(1, baudrate=baudrate)
+    assert (0, 61) in spans(drive, "energy_high", "energy_low")
+    found = [
+        block for block in blocks(drive, drive.registers.values()) if Grouped.energy_low in block.registers
+    ]
+    assert all(Grouped.energy_high in block.registers for block in found)
+
+
+def test_one_of_a_group_alone_costs_no_more_than_itself() -> None:
+    assert spans(Grouped(1), "energy_low") == [(60, 1)]
+    rates = [(Grouped.energy_high, 1.0), (Grouped.energy_low, None)]
+    assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]
+
+
+def test_groups_are_asked_in_the_declared_order_and_before_all_else() -> None:
+    order = [block.registers[0].name for block in blocks(Grouped(1), Grouped.registers.values())]
+    assert order[:2] == ["latch", "energy_high"]
+    assert order[-1] == "other"
+
+
+@pytest.mark.parametrize(
+    ("details", "sentence"),
+    [
+        ({"read_together": (("a", "far"),)}, "between them are addresses that are not declared"),
+        ({"read_together": (("a", "b"),), "most_registers": {HOLDING: 1}}, "they take 2 addresses, and one"),
+        ({"read_together": (("a", "input_3"),)}, "these are in several"),
+        ({"read_together": (("a", "none"),)}, "the name of a register that can be read"),
+        ({"read_together": (("a", "run"),)}, "the name of a register that can be read"),
+        ({"read_together": ("ab",)}, "no tuple of groups"),
+        ({"read_together": (("a", "b"), ("b",))}, "b is in another group too"),
+        ({"least_interval": -0.1}, "no time from 0 to 10 s"),
+        ({"least_interval": "100 ms"}, "no time from 0 to 10 s"),
+        ({"most_registers": {HOLDING: 126}}, "no number from 1 to 125"),
+        ({"most_registers": {HOLDING: 0}}, "no number from 1 to 125"),
+    ],
+)
+def test_what_cannot_be_is_a_declaration_error(details: dict[str, Any], sentence: str) -> None:
+    registers = {"a": reading(1), "b": reading(2), "far": reading(9), "input_3": reading(3, table=INPUT)}
+    with pytest.raises(DeclarationError, match=sentence):
+        family(**registers, run=command(4), **details)
