@@ -21,7 +21,7 @@ from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire
 from multidrop import bus
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
-from multidrop.core import Completion, Exchange, Message
+from multidrop.core import Completion, Exchange, Message, TransactionIds
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
@@ -138,7 +138,8 @@ class PathLine:
         self.port = self.identity = "world"
         self.now = BEGIN_NS
         self.wire = wire
-        self.has_echo = self.is_lost = False
+        self.has_echo = self.is_lost = self.is_tcp = False
+        self.ids = TransactionIds.MATCH
         self.queue = WorldPort(cast(World, self))
 
     def require(self, settings: tuple[int, str]) -> None:
@@ -179,7 +180,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
         wire.delay = delay
         wire.open()
         line = PathLine(wire)
-        monkeypatch.setattr(bus, "Line", lambda port, echo: line)
+        monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
         monkeypatch.setattr(clock, "now_ns", lambda: line.now)
         monkeypatch.setattr(clock, "sleep", line.sleep)
         opened = Bus("world")

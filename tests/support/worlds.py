@@ -17,7 +17,7 @@ from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import Completion, Exchange, Message, RowQueue, completion
+from multidrop.core import Completion, Exchange, Message, RowQueue, TransactionIds, completion
 from multidrop.drive import Drive
 from multidrop.errors import LineError
 from multidrop.plant.model import PolledDrive
@@ -196,6 +196,8 @@ class WorldLine:
 
     regain = reopen  # it is lost: the poller has dropped it
     is_lost = False  # nobody stops a motor here
+    is_tcp = False
+    ids = TransactionIds.MATCH
 
 
 class World:
@@ -211,7 +213,7 @@ class World:
         self._turn = threading.Condition()
         self._threads = {*threading.enumerate()}
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", lambda port, echo: WorldLine(self))
+        patch.setattr(bus, "Line", lambda port, echo, ids: WorldLine(self))
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
         patch.setattr(poller, "RowQueue", self._row_queue)

@@ -6,10 +6,12 @@ from multidrop.core.columns import COLUMNS, Columns, Field, Names, NumberFormat,
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
 from multidrop.core.exchange import Completion, Exchange, Peer, completion
 from multidrop.core.frame import (
+    MODBUS,
     Framing,
     Message,
     build_reply,
     build_request,
+    characters_on_wire,
     crc16,
     lrc,
     parse_reply,
@@ -18,7 +20,7 @@ from multidrop.core.frame import (
     sum8,
 )
 from multidrop.core.latch import Latch, Permit
-from multidrop.core.port import Echo, Port, now_ns, utc_minus_monotonic_ns
+from multidrop.core.port import Echo, Port, TransactionIds, Transactions, now_ns, utc_minus_monotonic_ns
 from multidrop.core.port_settings import (
     REFUSALS,
     CharacterFormat,
@@ -48,6 +50,7 @@ __all__ = [
     "COLUMNS",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
+    "MODBUS",
     "REFUSALS",
     "STATUSES",
     "STREAM_ROOM",
@@ -80,11 +83,14 @@ __all__ = [
     "Status",
     "Stream",
     "Tap",
+    "TransactionIds",
+    "Transactions",
     "Unpacked",
     "Unpacker",
     "Wrappings",
     "build_reply",
     "build_request",
+    "characters_on_wire",
     "completion",
     "crc16",
     "delay_edge",

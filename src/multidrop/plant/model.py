@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from multidrop.core import Echo
+from multidrop.core import Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
@@ -44,6 +44,7 @@ class PlantLine:
     drives: tuple[PolledDrive, ...]
     switching: float = 0.0  # s that the port takes to change them
     echo: Echo = Echo.AUTO
+    ids: TransactionIds = TransactionIds.MATCH
 
 
 @dataclass(frozen=True)
