@@ -53,6 +53,8 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
+    if framing is Framing.TCP:  # the gateway knows the settings
+        return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None
     format = settings.format if settings.format in family.formats_in(framing) else None
