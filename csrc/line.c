@@ -103,6 +103,15 @@ static void tap_received(const struct md_line *line, struct md_ending ending)
     tap(line, MD_NOISE, completion->last_ns, line->rx + at + len, line->rx_len - at - len);
 }
 
+/* A network needs none. Where replies have no ids to be told by, it shows whether more is to come, such as a
+ * second copy, which could otherwise be taken for the next reply. */
+static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
+{
+    enum { CHARACTERS = 4 };
+    int64_t least_ns = line->transactions == MD_IGNORED ? CHARACTERS * exchange->character_ns : 0;
+    return later(least_ns, exchange->silence_ns);
+}
+
 static void finish(struct md_line *line, struct md_ending ending)
 {
     struct md_completion *completion = line->completion;
@@ -117,7 +126,7 @@ static void finish(struct md_line *line, struct md_ending ending)
     if (line->transactions && completion->last_ns) /* a network takes the next request at once */
         line->quiet_ns = completion->last_ns;
     if (completion->sent_ns) /* else the silence after what went before still holds */
-        line->silence_ns = line->exchange->silence_ns;
+        line->silence_ns = silence_of(line, line->exchange);
     go(line, MD_ENDED);
     count(line->exchange, completion);
 }
@@ -175,7 +184,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->completion = completion;
     line->tx_at = 0;
     line->echo_due = line->echo != MD_NO_ECHO && !line->transactions;
-    line->silence_ns = later(line->silence_ns, exchange->silence_ns);
+    line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     go(line, MD_BEGUN);
     md_late_resume(line, exchange->drive);
@@ -290,10 +299,15 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     md_reply_find_late(line, 0, now_ns);
 }
 
-/* Frames of Modbus TCP. What is not awaited puts nothing off: a network has no silence to keep. */
+/* Frames of Modbus TCP. What is not awaited puts nothing off where it is told by its id. */
 static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_ending ending;
+    if (line->state < AWAITING && line->transactions == MD_IGNORED) {
+        line->quiet_ns = later(line->quiet_ns, now_ns);
+        if (line->state == IDLE || now_ns < line->give_up_ns)
+            go(line, MD_STRAY_BYTES);
+    }
     while (len > 0 && !line->is_out_of_step) {
         if (line->state >= AWAITING) {
             line->completion->last_ns = now_ns;
