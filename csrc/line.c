@@ -94,7 +94,8 @@ static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
     size_t at = ending.at, len = ending.len;
-    if (ending.result <= 0 && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
+    int may_be_echo = ending.result <= 0 && !line->transactions && line->tx_len > 0;
+    if (may_be_echo && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
         at += line->tx_len; /* the adapter's echo */
         len -= line->tx_len;
     }
@@ -320,7 +321,10 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
         if (md_tcp_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len); /* behind what is out of step */
+    if (line->state < AWAITING) /* behind what is out of step */
+        md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
+    for (size_t at = 0; at < len && line->state >= AWAITING;) /* it may tell what is spoken there */
+        at += keep(line, bytes + at, len - at);
     if (line->state != IDLE && now_ns < line->give_up_ns)
         go(line, MD_BYTES_IN_TIME);
 }
