@@ -56,7 +56,9 @@ def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> No
     fields = [word for field in FIELDS for word in ("-e", field)]
     command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
     said = subprocess.run([*command, *fields], capture_output=True, text=True, check=True).stdout
-    packets = [line.split("\t") for line in said.splitlines()]
+    lines = [line.split("\t") for line in said.splitlines()]
+    packets = [it for it in lines if it[1]]  # a late reply is part of no exchange
+    assert len(packets) > 0.9 * len(lines)
     answered = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Response")]
     asked = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Query")]
     assert len(answered) == len({row.monotonic_ns for row in rows if row.value is not None})
