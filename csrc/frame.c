@@ -191,7 +191,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
 
 /* ---- frames ---- */
 
-static int body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
+static inline int body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     return request ? reply_length(framing, body, have, request) : request_length(framing, body, have);
 }
