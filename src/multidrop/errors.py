@@ -37,9 +37,10 @@ class NoSuchPort(LineError, ValueError):
 class NoReply(BusError, TimeoutError):
     """The drive said nothing within its time-out."""
 
-    def __init__(self, drive: str) -> None:
+    def __init__(self, drive: str, where: str = "", hint: str = "") -> None:
         super().__init__(
-            f"{drive} does not answer: check its address, baud rate, format, wiring, and that it has power"
+            f"{drive} does not answer{where}: check its address, baud rate, format, wiring, and that it has "
+            f"power{hint}"
         )
         self.drive = drive
 

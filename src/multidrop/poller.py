@@ -68,7 +68,13 @@ class Poller:
         register_at_fork(self)
         try:
             for number, declared in enumerate(plant.lines):
-                bus = Bus(declared.port, echo=declared.echo, ledger=ledger, audit=audit)
+                bus = Bus(
+                    declared.port,
+                    echo=declared.echo,
+                    transaction=declared.ids,
+                    ledger=ledger,
+                    audit=audit,
+                )
                 self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._names))
         except BaseException:
             self.close()

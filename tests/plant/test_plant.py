@@ -233,6 +233,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             "line = [3]",
             "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
+            "transaction, "
             "drive",
         ),
         (
@@ -284,8 +285,13 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (HEAD + TOY + "baudrate = 0", 'line "L", drive "D": baud rate 0 is not one of TOY T1: 9600, 19200'),
         (HEAD + TOY + 'format = "8O1"', 'line "L", drive "D": format \'8O1\' is not one of TOY T1: 8N1, 8E1'),
         (
+            HEAD + TOY + 'framing = "udp"',
+            'line "L", drive "D": framing \'udp\' is not one of TOY T1: rtu, ascii',
+        ),
+        (
             HEAD + TOY + 'framing = "tcp"',
-            'line "L", drive "D": framing \'tcp\' is not one of TOY T1: rtu, ascii',
+            'line "L", drive "D": framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, '
+            "and /dev/a is none",
         ),
         (
             HEAD + "baudrate = 9600\n" + FIXED,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from multidrop.capture.lookup import RegisterLookup, RequestTarget, line_of
 from multidrop.capture.pcapng_reader import Capture
-from multidrop.core import Columns, Decoded, Decoder, Field, Names, RowLayout, Stream
+from multidrop.core import Columns, Decoded, Decoder, Field, Framing, Names, RowLayout, Stream
 from multidrop.drive.row_field import row_field
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
@@ -74,7 +74,8 @@ class _LineDecoding:
         if len(self._registers) > _MOST_NAMES:
             return False
         target = self._lookup.find(framing, request)
-        block = self._layout(target) if request.address else None  # nobody answers a broadcast
+        is_broadcast = request.address == 0 and framing is not Framing.TCP  # nobody answers one
+        block = None if is_broadcast else self._layout(target)
         return self.decoder.know(block)
 
     def _layout(self, target: RequestTarget) -> RowLayout:

@@ -15,6 +15,7 @@ from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 from multidrop.scan import (
@@ -27,6 +28,7 @@ from multidrop.scan import (
     Sweep,
     Untried,
     one_of_each_framing,
+    over_tcp,
     plant_text,
     scan,
     sweeps,
@@ -118,6 +120,8 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     )
     if arguments.quick:
         planned = planned[: len(planned) // 2]
+    if speaks_tcp(arguments.port):
+        return over_tcp(planned)
     return one_of_each_framing(planned) if fixed else planned
 
 

@@ -11,8 +11,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, TypeVar, cast
 
-from multidrop.core import Framing
+from multidrop.core import MODBUS, Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.read_limits import limit_errors
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.scale_check import scale_errors
@@ -25,6 +26,7 @@ from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
 A = TypeVar("A")
 LONGEST_SILENCE = 1.0  # s
+SERIAL_ADDRESSES = range(1, 248)  # 0 is a broadcast there
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
@@ -36,11 +38,13 @@ _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 class Drive:
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
-    family's. `silence`, in s, takes the place of the standard's t3.5 where all drives on the line bear
-    it; what the family's document demands is kept all the same. Options are facts that only the owner
-    knows (see `options`); `ram` names registers that the owner knows to be kept in RAM although the
-    document does not say so. Raises ValueError for anything the family's document does not allow.
+    `address` is 1 to 247, as far as the family goes; on a tcp:// port it is a unit id, which may be 0 to
+    255 where the family has them. Baud rate, format and framing default to the family's; on a tcp:// port
+    the framing is TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s,
+    takes the place of the standard's t3.5 where all drives on the line bear it; what the family's document
+    demands is kept all the same. Options are facts that only the owner knows (see `options`); `ram` names
+    registers that the owner knows to be kept in RAM although the document does not say so. Raises
+    ValueError for anything the family's document does not allow.
     """
 
     model: ClassVar[str] = ""
@@ -168,7 +172,8 @@ class Drive:
     ) -> None:
         self.address = self._checked("address", address, self.addresses)
         self.framing = self._framing(framing)
-        formats = self.formats[self.framing]
+        self._declared_framing = None if framing is None else self.framing
+        formats = self.formats_in(self.framing)
         self.settings = Settings(
             self._checked("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
             self._checked("format", formats[0] if format is None else format, formats),
@@ -221,7 +226,48 @@ class Drive:
             return cls.framings[0]
         if isinstance(framing, str):
             framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
+        if framing is Framing.TCP and cls.speaks(framing):
+            return framing
         return cast(Framing, cls._checked("framing", framing, cls.framings))
+
+    @classmethod
+    def speaks(cls, framing: Framing) -> bool:
+        """Return True for the document's framings, and for TCP where one is Modbus: a gateway translates."""
+        return framing in cls.framings or (
+            framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
+        )
+
+    @classmethod
+    def formats_in(cls, framing: Framing) -> tuple[str, ...]:
+        """Return the formats of a framing; with TCP those of the wire behind the gateway."""
+        return cls.formats.get(framing) or cls.formats[cls.framings[0]]
+
+    def take_framing_of(self, port: str) -> None:
+        """Take the framing that this port has: TCP on tcp://, and what was declared on any other.
+
+        Raises ValueError where the drive cannot have it.
+        """
+        is_tcp, declared = speaks_tcp(port), self._declared_framing or self.framings[0]
+        if is_tcp and self._declared_framing not in (None, Framing.TCP):
+            raise ValueError(
+                f"framing {declared} is a serial line's, and {port} speaks Modbus TCP: leave "
+                "framing out, or name the port socket:// where the far end passes serial bytes on"
+            )
+        if is_tcp and not self.speaks(Framing.TCP):
+            raise ValueError(
+                f"{self.title or type(self).__name__} does not speak Modbus, and {port} carries "
+                "nothing else: name the port socket://, and have the far end pass serial bytes on"
+            )
+        if not is_tcp and declared is Framing.TCP:
+            raise ValueError(
+                f"framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, and {port} is none"
+            )
+        if not is_tcp and self.address not in SERIAL_ADDRESSES:
+            raise ValueError(
+                f"address {self.address} is a unit id of Modbus TCP; on {port} it is to be "
+                f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
+            )
+        self.framing = Framing.TCP if is_tcp else declared
 
     @classmethod
     def _options(cls, given: dict[str, float]) -> dict[str, float]:
@@ -307,6 +353,8 @@ class Drive:
     def needed_silence(self) -> float:
         """Return the silence in s that this drive needs before a request and after its reply."""
         own = max(self.silence, self.silence_characters * self.settings.character)
+        if self.framing is Framing.TCP:  # the gateway keeps it
+            return 0.0
         if self.framing is not Framing.RTU:
             return own
         return max(self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence, own)

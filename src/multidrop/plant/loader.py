@@ -7,8 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.core import Echo
+from multidrop.core import Echo, TransactionIds
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
@@ -47,6 +48,7 @@ _LINE = {
     "silence": Key(str, 'silence = "500 us"'),
     "switching": Key(str, 'switching = "2 ms"'),
     "echo": Key(str, 'echo = "auto"'),
+    "transaction": Key(str, 'transaction = "match"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 
@@ -83,11 +85,20 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     }
     silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
     echo = place.attempt(Echo, given.get("echo", "auto"))
-    inherited = {**settings, "silence": silence}
+    ids = place.attempt(TransactionIds, given.get("transaction", "match"))
+    if "transaction" in given and not speaks_tcp(port):
+        place.wrong(f"transaction is a fact of tcp:// ports, and {port} is none; leave it out")
+    inherited = {**settings, "silence": silence, "port": port}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
     polled = tuple(filter(None, drives))
     return PlantLine(
-        name, port, **settings, drives=polled, switching=switching or 0.0, echo=echo or Echo.AUTO
+        name,
+        port,
+        **settings,
+        drives=polled,
+        switching=switching or 0.0,
+        echo=echo or Echo.AUTO,
+        ids=ids or TransactionIds.MATCH,
     )
 
 
@@ -104,13 +115,22 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     if model is None:
         return None
     arguments = {key: value for key, value in given.items() if key not in _NOT_ARGUMENTS}
-    inherited = {key: value for key, value in line.items() if value is not None and key not in given}
+    inherited = {
+        key: value for key, value in line.items() if value is not None and key not in given and key != "port"
+    }
     _try_each(model, arguments, inherited, place)
     polls = _polls(given.get("poll"), model, every, place)
     if len(place.config_errors) > before:
         return None
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
+    if drive and place.attempt(partial(_on_port, drive, line["port"])) is None:
+        return None
     return PolledDrive(drive, polls) if drive else None
+
+
+def _on_port(drive: Drive, port: str) -> Drive:
+    drive.take_framing_of(port)
+    return drive
 
 
 def _model(table: Any, place: TomlPlace) -> type[Drive] | None:

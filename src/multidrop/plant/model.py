@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from multidrop.core import Echo
+from multidrop.core import Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
@@ -59,6 +59,7 @@ class PlantLine:
     drives: tuple[PolledDrive, ...]
     switching: float = 0.0  # s that the port takes to change them
     echo: Echo = Echo.AUTO
+    ids: TransactionIds = TransactionIds.MATCH
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,13 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
     A drive with two stop bits, or on a pseudo-terminal with another parity, answers in the sweep's
     format too: it is given the family's usual one.
     """
-    if framing not in family.framings or address not in family.addresses:
+    if not family.speaks(framing) or address not in family.addresses:
         return None
+    if framing is Framing.TCP:  # the gateway knows the settings
+        return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None
-    format = settings.format if settings.format in family.formats[framing] else None
+    format = settings.format if settings.format in family.formats_in(framing) else None
     return family(address, framing=framing, baudrate=settings.baudrate, format=format)
 
 

@@ -21,7 +21,8 @@ from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
-GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
+# s: serial-line guide 2.5.2.1; Delixi, part 3; a network may take its time
+GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
 
 
 class Written(NamedTuple):
@@ -156,9 +157,12 @@ class SimulatedDrive:
             return self._answer_damaged(frame)
         if frame.message is not None:
             return self.answer(frame.message, frame.end)
-        if frame.address and not self._knows(frame.function):
+        if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
         return None  # of a length that its function does not have
+
+    def _is_for_all(self, address: int) -> bool:
+        return address == 0 and self.drive.framing is not Framing.TCP
 
     def _knows(self, function: int) -> bool:
         return function in (self.protocol.answers if self.functions is None else self.functions)
@@ -167,7 +171,7 @@ class SimulatedDrive:
         """Refuse a damaged request, if the family has a code for wrong checksums."""
         code = self._code(Reason.DAMAGED)
         whole = len(frame.body) == self.protocol.octets and self._knows(frame.function)
-        if code is None or not whole or not frame.address:
+        if code is None or not whole or self._is_for_all(frame.address):
             return None
         return self.refused(Message(frame.address, frame.function), code)
 
@@ -179,7 +183,7 @@ class SimulatedDrive:
         if now < self.deaf_until:
             return None
         self.now = now
-        is_broadcast = request.address == 0
+        is_broadcast = self._is_for_all(request.address)
         if is_broadcast and self.takes_broadcast(request):
             self.counters.broadcasts += 1
         elif request.address == self.drive.address:

@@ -7,7 +7,17 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop import core
-from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit
+from multidrop.core import (
+    STATUSES,
+    Completion,
+    Exchange,
+    Failure,
+    Framing,
+    Message,
+    Peer,
+    Permit,
+    TransactionIds,
+)
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
@@ -18,6 +28,7 @@ from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least, may_be_too_long
 from multidrop.transport import clock
 from multidrop.transport.line import Line
+from multidrop.transport.mixed_up import mixed_up, silence_hint
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -117,6 +128,8 @@ class Exchanges:
                     make_exchange(drive, block.request, made, NO_ROWS, answer=answer)
                     for block, answer in proofs(drive)
                 ]
+                if drive.framing is not Framing.TCP or self.line.ids is TransactionIds.IGNORE
+                else []
             )
         # One that comes back may still owe the answer to what it was asked before it left, and one of
         # another family at its address would get that.
@@ -297,7 +310,7 @@ class Exchanges:
         )
         completion = self._carry_out(made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
-            raise NoReply(drive.name)
+            raise _no_reply(drive, completion)
         return completion
 
     def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
@@ -318,8 +331,9 @@ class Exchanges:
         if result > 0:
             raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
         if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
-            raise NoReply(drive.name)
-        raise BadReply(drive.name, STATUSES[-result], completion.raw)
+            raise _no_reply(drive, completion)
+        advice = mixed_up(_port_of(drive), completion.raw)
+        raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
 
 
 def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
@@ -329,3 +343,14 @@ def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
             known = {name: value for name, value in found.items() if value is not None}
             raise NoValue(drive.name, name, known)
     return found
+
+
+def _port_of(drive: Drive) -> str:
+    return drive.bus.line.port if drive.bus else ""
+
+
+def _no_reply(drive: Drive, completion: Completion) -> NoReply:
+    if drive.framing is Framing.TCP and completion.raw:
+        code = completion.raw[-1]
+        return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
+    return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))

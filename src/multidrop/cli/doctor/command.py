@@ -22,19 +22,31 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
+from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
 from multidrop.cli.support.values import wrapped
-from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request, is_pseudo_terminal
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Framing,
+    Message,
+    Peer,
+    build_request,
+    characters_on_wire,
+    is_pseudo_terminal,
+)
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
-from multidrop.planning.blocks import blocks
+from multidrop.planning.blocks import Block, blocks
 from multidrop.plant.model import Plant
 from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
+from multidrop.transport.mixed_up import other_port
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
@@ -117,8 +129,16 @@ def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Fi
         yield from _remote(port)
     else:
         yield from _local(port)
-    yield _echo(port, settings)
-    yield _round_trip(port, drive)
+    nobody = Message(NOBODY, 0x03, 0, 1)
+    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, settings)
+    measured = _round_trip(port, drive)
+    yield measured
+    if not other_port(port) or (drive and not measured.is_failure):
+        return
+    if drive:
+        yield other_way_finding(port, _first_reading(drive).request, settings)
+    elif not speaks_tcp(port):  # a line without drives says nothing in the other way
+        yield other_way_finding(port, nobody, settings)
 
 
 # ---- the port ----
@@ -126,14 +146,17 @@ def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Fi
 
 def _remote(port: str) -> Iterator[Finding]:
     kind = port.partition("://")[0]
-    if kind == "socket":
+    if speaks_tcp(port):
+        what = "a Modbus TCP connection; small packets are sent at once (TCP_NODELAY)"
+        yield Finding("port", f"{port} is {what}")
+    elif kind == "socket":
         yield Finding("port", f"{port} is a TCP connection; small packets are sent at once (TCP_NODELAY)")
     else:
         yield Finding("port", f"{port} is a pyserial {kind} port, which is copied to by two threads")
     yield Finding(
         "adapter",
         "it is at the far end: its driver, latency timer and RS-485 mode cannot be seen from here",
-        "set baud rate, format and the shortest packing delay in the serial server itself",
+        "set baud rate, format and the shortest packing delay in the serial server or gateway itself",
     )
 
 
@@ -202,18 +225,23 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
             "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
             "that are there",
         )
-    register = next(iter(drive.readings()))
-    (block,) = blocks(drive, [register])
     with Bus(port) as bus:
         bus.attach(drive)
+        block = _first_reading(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
     # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
-    wire = (len(build_request(drive.framing, poll.request)) + 1) * drive.settings.character
+    sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
+    wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
     seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
     return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
+
+
+def _first_reading(drive: Drive) -> Block:
+    (block,) = blocks(drive, [next(iter(drive.readings()))])
+    return block
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
