@@ -60,6 +60,8 @@ from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
+from multidrop.family_file.loader import FamilyError as FamilyError
+from multidrop.family_file.loader import load_family as load_family
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant
 from multidrop.plant.model import Plant as Plant

@@ -18,12 +18,12 @@ from multidrop.core import RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.plant.loader import check_period
 from multidrop.plant.model import Plant, PolledDrive
 from multidrop.polling.batch import Batch
 from multidrop.polling.batch_caller import BatchCaller
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
+from multidrop.toml_check import check_period
 from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
 from multidrop.transport.wakeup import WakeUp

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from enum import IntEnum, IntFlag
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,8 @@ def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
 def is_near(found: float, exact: Fraction, parts: list[Fraction]) -> bool:
     """Return True within the rounding of float64 arithmetic with these parts."""
     try:
-        return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts]))
+        least = Fraction(2) ** -1074  # of float64; below 2^-1022 it has fewer digits
+        return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts])) + least
     except OverflowError:  # beyond the largest float64
         return max(map(abs, [exact, *parts])) > Fraction(2) ** 1020
 
@@ -127,6 +129,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 1))
 @example((NumberFormat.I64, "DCBA", 0.001, 0, -(2**63)))
 @example((NumberFormat.I16, "ABCD", -0.1, 0, 0))
+@example((NumberFormat.F64, "AB", 0.01, 0, 2.225073858507203e-309))
 def test_a_number_of_any_format_order_step_and_offset(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:
@@ -244,6 +247,29 @@ def test_a_part_of_a_word(case: Bits) -> None:
     sim["field"] = 0
     sim["field"] = exact  # the other bits stay
     assert sim.read(4, 7, size // 2) == list(words_of(data))
+
+
+class Phase(IntEnum):
+    IDLE = 0
+    HEATING = 5
+
+
+class Alarm(IntFlag):
+    DOOR = 1
+    SENSOR = 2
+
+
+def test_a_field_may_have_names() -> None:
+    family = declared(
+        phase=reading(7, Phase, part=(4, 7), table=INPUT), alarms=reading(7, Alarm, part=(8, 9), table=INPUT)
+    )
+    data = bytes.fromhex("0252")
+    assert family.registers["phase"].value_in(data, 0) is Phase.HEATING
+    assert family.registers["alarms"].value_in(data, 0) is Alarm.SENSOR
+    assert row_of(family, "phase", data).value == 5
+    sim = SimulatedDrive(family(1))
+    sim["phase"], sim["alarms"] = Phase.HEATING, Alarm.SENSOR
+    assert sim.read(4, 7, 1) == [0x0250]
 
 
 # ---- no value ----

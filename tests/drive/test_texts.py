@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
 
-from multidrop.drive import Drive
+from multidrop.core import Message
+from multidrop.drive import Drive, Refused, Script, read, verb
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import COIL, INPUT, reading
+from multidrop.drive.register import COIL, INPUT, Kept, reading, setting
 from multidrop.drive.text import Text, text
+from multidrop.scan.identify import _read
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 
 METER = """\
@@ -63,6 +65,44 @@ def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value
         assert hall.bus.read_text(drive, declared) == value == sim[declared.name]
         counts = [request.count for request, _ in hall.frames]
         assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
+
+
+class Known(Meter):
+    """Its maker says who it is."""
+
+    limit = setting(1, "m", span=(0, 10), kept=Kept.RAM)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Ask for its maker."""
+        if (found := (yield from read(self.maker))) != "ABB":
+            raise Refused(f"{self.name} is of {found}")
+
+
+@pytest.mark.parametrize("maker", ["ABB", "ABC"])
+def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = maker
+    hall = SimulatedBus(monkeypatch, sim)
+    drive = hall.attach(Known(1, name="em-1"))
+    if maker == "ABB":
+        assert hall.bus.write(drive, drive.limit, 3) == 3
+    else:
+        with pytest.raises(Refused, match="em-1 is of ABC"):
+            hall.bus.write(drive, drive.limit, 3)
+    assert (hall.written != []) == (maker == "ABB")
+
+
+def test_a_text_of_another_family_is_asked_for_by_a_scan() -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = "ABB"
+
+    def ask(drive: Drive, request: Message) -> Message:
+        reply = sim.answer(request, 0.0)
+        assert reply is not None
+        return reply
+
+    assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
 def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from batches import counting, example
+from families import METER, METER_CSV
 from frames import PRINTED, Printed
 from readers import PLANT
 
@@ -103,6 +104,13 @@ def plant() -> Iterator[bytes]:
     yield b'[[line]]\nname = "a"\nport = "b"\n[[line.drive]]\nname = "c"\nmodel = "yd1000"\naddress = 1\n'
 
 
+def family() -> Iterator[bytes]:
+    for path in sorted((Path(__file__).parents[1] / "data" / "families").glob("*.toml")):
+        yield path.read_bytes()
+    meter = METER.replace("meter.csv", "fuzzed.csv")
+    yield meter.encode() + b"\n\0\n" + METER_CSV.encode()
+
+
 def faults() -> Iterator[bytes]:
     yield b'seed = 7\ndrop = 0.01\nflip = 0.5\nlate = "100 ms"\nburst = 32\nhang_up = 0\naway = "1 s"\n'
 
@@ -129,6 +137,7 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "capture": capture,
     "columns": columns,
     "plant": plant,
+    "family": family,
     "faults": faults,
     "arrows": lambda: recorded(".arrows"),
     "csv": lambda: recorded(".csv"),

@@ -11,8 +11,9 @@ import pytest
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
-from multidrop.plant.loader import PlantError, load_plant, parse_duration
+from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
+from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing, Option
@@ -111,6 +112,16 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
         return [sentence.removeprefix(start) for sentence in refusal.value.mistakes]
 
     return mistakes
+
+
+@pytest.mark.parametrize(
+    "text", ["a." * 300 + "b = 1", "a = " + "[" * 300 + "]" * 300, "a." * 100_000 + "b=1"]
+)
+def test_what_is_nested_too_deeply_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(text)
+    with pytest.raises(PlantError):
+        load_plant(path)
 
 
 def test_lines_drives_and_polls_are_read(load: Load) -> None:
@@ -289,7 +300,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
             'line "L", drive "D": there is no model \'innovert-ibt\'; '
-            "did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "did you mean innovert-ibd? (or write path/to/file.toml or file.py:Class)",
         ),
         (
             HEAD + TOY + 'poll = ["control"]',

@@ -18,26 +18,28 @@ from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model
+from multidrop.drives.registry import SHIPPED, find_model, shipped_family
 from multidrop.plant.loader import load_plant
 
 INDENT = 16  # of a family's facts
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL", nargs="?", help="one family; or path/to/file.py:Class")
+    parser.add_argument(
+        "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
+    )
     parser.add_argument("drive", metavar="DRIVE", nargs="?", help="of the plant file in place of MODEL")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
-        families = list(MODELS.values())
+        families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:
         family = _family(arguments.model, arguments.drive)
-        print_text(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
+        print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
     return 0
 
 
@@ -67,7 +69,7 @@ def _range(numbers: range) -> str:
 # ---- one family as text ----
 
 
-def _sheet(family: type[Drive]) -> str:
+def sheet(family: type[Drive]) -> str:
     lines = [family.title or family.__name__, *wrapped(family.manual), ""]
     for name, text in _lines_of(family):
         lines += wrapped(text, f"{name:<{INDENT}}", " " * INDENT)
@@ -91,6 +93,8 @@ def _sheet(family: type[Drive]) -> str:
 
 def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     yield "model", family.model or "(a file of your own)"
+    if family.declared_in:
+        yield "origin", f"declared by its file, not tested by us; see `multidrop check {family.declared_in}`"
     yield "addresses", _range(family.addresses)
     default = " (the first is the default)" if len(family.baudrates) > 1 else ""
     yield "baud rates", ", ".join(map(str, family.baudrates)) + default
@@ -242,13 +246,14 @@ def _summary(family: type[Drive]) -> dict[str, Any]:
     return {
         "model": family.model,
         "title": family.title,
+        "declared_in": family.declared_in or None,
         "framings": [str(framing) for framing in family.framings],
         "addresses": [family.addresses[0], family.addresses[-1]],
         "register_count": len(family.registers),
     }
 
 
-def _facts(family: type[Drive]) -> dict[str, Any]:
+def facts(family: type[Drive]) -> dict[str, Any]:
     return _summary(family) | {
         "manual": family.manual,
         "baudrates": family.baudrates,

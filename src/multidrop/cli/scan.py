@@ -97,7 +97,12 @@ def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
     for text in models or MODELS:
         path, colon, name = text.rpartition(":")
         whole = f"{Path(path).resolve()}:{name}" if colon and path.endswith(".py") else text
+        if text.endswith(".toml"):
+            whole = str(Path(text).resolve())
         named[whole] = find_model(text)
+    models = [family.model for family in named.values() if family.model]
+    if twice := sorted({model for model in models if models.count(model) > 1}):
+        raise ValueError(f"two files are called {twice[0]}: scan for one of them at a time, or rename it")
     return named
 
 

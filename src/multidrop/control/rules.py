@@ -75,7 +75,8 @@ def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """
     if is_harmless(register, raw):
         return
-    if register.access is Access.COMMAND and not register.commands:
+    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
+    if (register.access is Access.COMMAND or is_unproven) and not register.commands:
         drive.check_confirmed(register.name)
     if not register.commands:
         return

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import IntEnum, IntFlag
-from itertools import combinations
 from numbers import Real
 from typing import Any
 
@@ -242,14 +241,17 @@ def _shared(registers: list[Register[Any]]) -> Iterator[str]:
     A reading may share its address with anything, and different tables may use the same addresses.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
-    for one, other in combinations(written, 2):
-        if _space(one.table) != _space(other.table) or not set(_addresses(one)) & set(_addresses(other)):
-            continue
-        if _meaning(one) != _meaning(other):
-            yield (
-                f"{other.name}: {one.name} is written at the same address "
-                f"with another format, step or access; one of the two is wrong"
-            )
+    at: dict[tuple[object, int], list[Register[Any]]] = {}
+    for other in written:
+        places = [(_space(other.table), address) for address in _addresses(other)]
+        for one in dict.fromkeys(one for place in places for one in at.get(place, ())):
+            if _meaning(one) != _meaning(other):
+                yield (
+                    f"{other.name}: {one.name} is written at the same address "
+                    f"with another format, step or access; one of the two is wrong"
+                )
+        for place in places:
+            at.setdefault(place, []).append(other)
 
 
 def _space(table: Table) -> object:

@@ -29,6 +29,7 @@ START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
 _CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
+_CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop check` of its file was read")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
 
@@ -43,6 +44,7 @@ class Drive:
     """
 
     model: ClassVar[str] = ""
+    declared_in: ClassVar[str] = ""  # name of the file that declares it; nobody tested such a family
     title: ClassVar[str] = ""
     manual: ClassVar[str] = ""
 
@@ -95,7 +97,7 @@ class Drive:
         cls.registers = found
         cls.texts = cls._declared(Text)
         cls.options = cls._all_options()
-        wrong = declaration_errors(found, _NAMES, cls.options) + text_errors(cls.texts, _NAMES)
+        wrong = declaration_errors(found, TAKEN_NAMES, cls.options) + text_errors(cls.texts, TAKEN_NAMES)
         if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
@@ -115,30 +117,42 @@ class Drive:
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, and `confirmed` where it commands a motor but cannot identify it."""
+        """Return the class's options, and `confirmed` where it commands a motor untested or unidentified."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
-        if cls.identify is not Drive.identify or not (commands or verbs):
+        if not (commands or verbs) or not (cls.declared_in or cls.identify is Drive.identify):
             return cls.options
-        return {"confirmed": _CONFIRMED, **cls.options}
+        return {"confirmed": _CHECKED if cls.declared_in else _CONFIRMED, **cls.options}
 
     def check_confirmed(self, what: str) -> None:
-        """Raise Refused where the class cannot identify its drives, and the owner has not confirmed this one.
+        """Raise Refused where nobody has confirmed a drive of a class that needs it.
 
-        The same address means different things to different makes, and may start their motor.
+        That is a class that cannot identify its drives, since the same address means different things to
+        different makes, and may start their motor; and one from a file, which nobody has tested.
         """
         family = type(self)
-        if family.identify is Drive.identify and not self.option.get("confirmed"):
-            kind = self.title or family.__name__
-            raise Refused(
-                f"{what} is not sent to {self.name}: its class has no `identify` that could tell a {kind} "
-                "from another drive, to which the same may mean a start; look at its name plate, and declare "
-                "confirmed = 1",
-                rule="nobody has confirmed what it is",
-                advice=Advice.declare("confirmed", 1),
+        if "confirmed" not in self.options or self.option.get("confirmed"):
+            return
+        if family.declared_in:
+            reason = (
+                f"{family.declared_in} declares it, which nobody has tested: read `multidrop check "
+                f"{family.declared_in}` against the manual and look at its name plate"
             )
+        elif family.identify is Drive.identify:
+            kind = self.title or family.__name__
+            reason = (
+                f"its class has no `identify` that could tell a {kind} from another drive, to which the same "
+                "may mean a start; look at its name plate"
+            )
+        else:
+            return
+        raise Refused(
+            f"{what} is not sent to {self.name}: {reason}, and declare confirmed = 1",
+            rule="nobody has confirmed what it is",
+            advice=Advice.declare("confirmed", 1),
+        )
 
     def __init__(
         self,
@@ -251,6 +265,13 @@ class Drive:
             for register in cls.registers.values()
             if register.access is Access.READING and register.readable
         )
+
+    @property
+    def ledger_name(self) -> str:
+        """Name under which writes to its EEPROM are counted: files of one name are told by their titles."""
+        if self.declared_in:
+            return f"{self.model}: {self.title}"
+        return self.model or type(self).__name__
 
     @property
     def echo_probe(self) -> Register[Any] | None:
@@ -424,7 +445,7 @@ class Drive:
 
 
 # Names that a register cannot have.
-_NAMES = frozenset(
+TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
     | {"option", "ram", "commanded", "perform", "check_identity"}
 )

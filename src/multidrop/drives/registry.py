@@ -1,7 +1,8 @@
-"""Find a family by the name that a person writes: a built-in one, or a class in a file of their own.
+"""Find a family by the name that a person writes: built-in, shipped as a file, or in a file of their own.
 
-Such a file is a program: looking a class up runs it, with all rights of the caller. It may import modules
-that lie beside it. Each file is logged to `multidrop.drives.registry` before it is run.
+The shipped ones are TOML files of this package, which nobody has tried on hardware. A TOML file is data. A
+Python file is a program: looking its class up runs it, with all rights of the caller. It may import modules
+that lie beside it. Each of these is logged to `multidrop.drives.registry` before it is run.
 """
 
 from __future__ import annotations
@@ -13,23 +14,39 @@ from types import ModuleType
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.drives.model_file import load_model_file
+from multidrop.family_file.loader import load_family
+
+_SHIPPED = Path(__file__).parents[1] / "families"
+SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # each is read when it is asked for
+
+
+def shipped_family(name: str) -> type[Drive]:
+    """Return the family of SHIPPED that has this name; it is called so, and not by its file."""
+    family = load_family(_SHIPPED / f"{name}.toml")
+    family.model = family.declared_in = name
+    return family
 
 
 def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
-    """Return the family called `text`: one of MODELS, or "path/to/file.py:Class".
+    """Return the family called `text`: one of MODELS or SHIPPED, "path/to/file.toml", or "file.py:Class".
 
-    A relative path begins at `relative_to`, or at the working directory. The file is run, once a process.
-    Raises ValueError, also for whatever the file itself does wrong.
+    A relative path begins at `relative_to`, or at the working directory. A Python file is run, once a
+    process. Raises ValueError, also for whatever the file itself does wrong.
     """
     if text in MODELS:
         return MODELS[text]
+    if text in SHIPPED:
+        return shipped_family(text)
+    if text.endswith(".toml"):
+        return load_family((relative_to or Path()) / text)
     path, colon, name = text.rpartition(":")
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
-        near = difflib.get_close_matches(text.lower(), MODELS, n=2)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(MODELS)}"
-        raise ValueError(f"there is no model {text!r}; {hint} (or write path/to/file.py:Class)")
+        known = (*MODELS, *SHIPPED)
+        near = difflib.get_close_matches(text.lower(), known, n=2)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
+        raise ValueError(f"there is no model {text!r}; {hint} (or write path/to/file.toml or file.py:Class)")
     return _drive(_load((relative_to or Path()) / path), path, name if colon else "")
 
 

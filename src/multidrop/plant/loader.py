@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -13,8 +12,9 @@ from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
+from multidrop.family_file.loader import FamilyError
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
-from multidrop.plant.toml_check import Key, TomlPlace, read_document
+from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 
 class PlantError(ValueError):
@@ -35,38 +35,6 @@ def load_plant(path: Path | str) -> Plant:
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     return Plant(lines, path)
-
-
-def parse_duration(text: str) -> float:
-    """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
-    units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-    seconds = float(match[1]) * units[match[2]] if match else 0
-    if not _SHORTEST <= seconds <= _LONGEST:
-        raise ValueError(f'{text!r} is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"')
-    return seconds
-
-
-def check_period(seconds: float) -> None:
-    """Raise ValueError unless a period in s is one that a plant file may have."""
-    is_number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
-    if not is_number or not _SHORTEST <= seconds <= _LONGEST:
-        raise ValueError(f"every = {seconds!r} is not a number of seconds from 0.0001 to 86400, or None")
-
-
-def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """Return the duration under this key in s; None where it is not given, or wrong."""
-    return place.attempt(_duration_under, key, given[key]) if key in given else None
-
-
-def _duration_under(key: str, text: str) -> float:
-    try:
-        return parse_duration(text)
-    except ValueError as mistake:
-        raise ValueError(f"{key} = {mistake}") from mistake
-
-
-_SHORTEST, _LONGEST = 100e-6, 86400.0  # s
 
 
 _PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
@@ -149,7 +117,17 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
     text = table.get("model") if isinstance(table, dict) else None
     if not text or not isinstance(text, str):
         return None
-    return place.attempt(find_model, text, place.path.parent)
+    try:
+        return find_model(text, place.path.parent)
+    except FamilyError as wrong:
+        once = ("family", text)
+        if once not in place.seen:  # else all of its mistakes are there already
+            for mistake in wrong.mistakes:
+                place.wrong(mistake)
+        place.seen.setdefault(once, "")
+    except ValueError as mistake:
+        place.wrong(mistake)
+    return None
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:

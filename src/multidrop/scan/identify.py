@@ -13,9 +13,10 @@ from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, carry_out
+from multidrop.drive.text import Text
 from multidrop.drive.timing import Settings
 from multidrop.errors import BusError, NoValue, Refused
-from multidrop.planning.blocks import blocks
+from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS
 from multidrop.scan.sweep import Sweep
 
@@ -97,7 +98,10 @@ def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
     return carry_out(script, do)
 
 
-def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
+def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
+    if isinstance(register, Text):
+        found = text_blocks(drive, register)
+        return register.decode(b"".join(ask(drive, block.request).data for block in found))
     (block,) = blocks(drive, [register])
     reply = ask(drive, block.request)
     value = register.value_in(reply.data, block.offset(register))

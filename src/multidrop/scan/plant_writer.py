@@ -44,7 +44,7 @@ def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
         yield f"# {device.doubt}"
     if len(device.models) > 1:
         yield f"# it may as well be {' or '.join(device.models[1:])}"
-    yield f'name = "{device.models[0]}-{device.address}"'
+    yield f"name = {_text(f'{device.models[0]}-{device.address}')}"
     yield f"model = {_text(model)}"
     yield f"address = {device.address}"
     yield f'framing = "{device.framing}"'

@@ -9,12 +9,10 @@ from typing import Any
 from multidrop import core
 from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit
 from multidrop.drive.family import Drive
-from multidrop.drive.read_limits import read_limit
 from multidrop.drive.register import Register
-from multidrop.drive.request import read_request
 from multidrop.drive.text import Text
 from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached, NoValue
-from multidrop.planning.blocks import Block, blocks
+from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least, may_be_too_long
@@ -214,20 +212,23 @@ class Exchanges:
         return halves(drive, block)
 
     def value(
-        self, drive: Drive, register: Register[Any], attempts: int = READ_ATTEMPTS, *, insists: bool = False
+        self,
+        drive: Drive,
+        register: Register[Any] | Text,
+        attempts: int = READ_ATTEMPTS,
+        *,
+        insists: bool = False,
     ) -> Any:
-        """Return one register's value."""
+        """Return one register's value, or a text."""
+        if isinstance(register, Text):
+            return self.text(drive, register, attempts, insists=insists)
         return self.values(drive, [register], attempts, insists=insists)[register.name]
 
-    def text(self, drive: Drive, text: Text) -> str:
+    def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
         """Return a text, read in as many requests as its family's limit makes it."""
-        limit = read_limit(drive, text.table)
-        data, end = b"", text.address + text.length
-        for start in range(text.address, end, limit):
-            count = min(limit, end - start)
-            block = Block(text.table, start, count, (), read_request(drive, text.table, start, count))
-            data += self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS).data
-        return text.decode(data)
+        peer = self.peer(drive)
+        reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
+        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
@@ -245,8 +246,12 @@ class Exchanges:
             prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
         return prepared
 
-    def value_as(self, other: Drive, drive: Drive, register: Register[Any]) -> Any:
+    def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
         """Return what a drive replies to the request of another family, sent once and without waiting."""
+        if isinstance(register, Text):
+            peer, blocks_of = self.peer(drive), text_blocks(other, register)
+            asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
+            return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
