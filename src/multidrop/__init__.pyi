@@ -19,7 +19,6 @@ from multidrop.drive import Option as Option
 from multidrop.drive import Script as Script
 from multidrop.drive import State as State
 from multidrop.drive import insist as insist
-from multidrop.drive import read as read
 from multidrop.drive import until as until
 from multidrop.drive import verb as verb
 from multidrop.drive import wait as wait
@@ -72,9 +71,12 @@ from multidrop.plant.model import PolledDrive as PolledDrive
 from multidrop.poller import Poller as Poller
 from multidrop.polling.batch import Batch as Batch
 from multidrop.polling.batch import Row as Row
+from multidrop.polling.wide import WideRows as WideRows
 from multidrop.recording import convert as convert
 from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer
+from multidrop.recording.format import RecordingReader as RecordingReader
+from multidrop.recording.reading import read as read
 from multidrop.transport.statistics import Delays as Delays
 from multidrop.transport.statistics import Diagnostics as Diagnostics
 from multidrop.transport.statistics import LineStatistics as LineStatistics

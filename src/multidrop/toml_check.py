@@ -163,6 +163,13 @@ def parse_duration(text: str) -> float:
     return seconds
 
 
+def check_period(seconds: float) -> None:
+    """Raise ValueError unless a period in s is one that a plant file may have."""
+    is_number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
+    if not is_number or not _SHORTEST <= seconds <= _LONGEST:
+        raise ValueError(f"every = {seconds!r} is not a number of seconds from 0.0001 to 86400, or None")
+
+
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
     """Return the duration under this key in s; None where it is not given, or wrong."""
     return place.attempt(_duration_under, key, given[key]) if key in given else None

@@ -242,6 +242,7 @@ PLACEHOLDERS = {
     "COMMAND": "poll",
     "FILE": "plant.toml",
     "HZ": "10",
+    "DRIVE": "pump-1",
 }
 MENTIONED = sorted(
     {

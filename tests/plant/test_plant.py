@@ -482,3 +482,40 @@ def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_pat
     path.write_text(path.read_text().replace('["acceleration"]', "[3]"))
     with pytest.raises(PlantError, match="ram takes names of registers, not 3"):
         load_plant(path)
+
+
+# ---- other ports, and names ----
+
+
+def two_lines(directory: Path) -> Path:
+    path = directory / "plant.toml"
+    line = '[[line]]\nname = "{0}"\nport = "/dev/{0}"\n[[line.drive]]\nname = "pump-{1}"\n'
+    rest = 'model = "yd1000"\naddress = 1\n'
+    path.write_text(line.format("hall", 1) + rest + line.format("roof", 2) + rest)
+    return path
+
+
+def test_a_line_gets_another_port_and_all_else_stays(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    changed = plant.with_ports({"roof": "ports/roof"})
+    assert [line.port for line in changed.lines] == ["/dev/hall", "ports/roof"]
+    assert changed.lines[1].drives == plant.lines[1].drives
+    assert [line.port for line in plant.lines] == ["/dev/hall", "/dev/roof"]
+    assert plant.with_ports({"roof": "/dev/hall", "hall": "/dev/roof"}).lines[0].port == "/dev/roof"
+
+
+def test_ports_that_cannot_be_given(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
+        plant.with_ports({"rof": "x"})
+    with pytest.raises(ValueError, match="lines hall and roof would both be at /dev/hall"):
+        plant.with_ports({"roof": "/dev/hall"})
+
+
+def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    assert plant.find_line("roof") is plant.lines[1]
+    line, drive = plant.find_drive("pump-2")
+    assert (line.name, drive.name) == ("roof", "pump-2")
+    with pytest.raises(ValueError, match=r"has no drive 'fan'; there are pump-1, pump-2"):
+        plant.find_drive("fan")

@@ -19,6 +19,7 @@ from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
 from multidrop.drives.registry import SHIPPED, find_model, shipped_family
+from multidrop.plant.loader import load_plant
 
 INDENT = 16  # of a family's facts
 
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
     )
+    parser.add_argument("drive", metavar="DRIVE", nargs="?", help="of the plant file in place of MODEL")
     add_json_argument(parser)
 
 
@@ -36,9 +38,13 @@ def run(arguments: argparse.Namespace) -> int:
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:
-        family = find_model(arguments.model)
+        family = _family(arguments.model, arguments.drive)
         print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
     return 0
+
+
+def _family(model: str, drive: str | None) -> type[Drive]:
+    return find_model(model) if drive is None else type(load_plant(model).find_drive(drive)[1])
 
 
 def _list(families: list[type[Drive]]) -> str:

@@ -7,8 +7,9 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.target import add_target_arguments, target_of
 from multidrop.cli.support.values import Row, aligned, as_json, as_row
 from multidrop.core import Status
 from multidrop.drive.family import Drive
@@ -18,25 +19,23 @@ from multidrop.errors import DriveRefused, NoValue
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_target_arguments(parser)
-    parser.add_argument(
-        "registers", metavar="REGISTER", nargs="*", default=[], help="all readings and settings if none"
-    )
+    add_target_arguments(parser, "[REGISTER ...]")
+    parser.description = f"{parser.description} Without a REGISTER: all that can be read."
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = drive_of(arguments)
-    texts = [drive.texts[name] for name in arguments.registers if name in drive.texts]
-    wanted = [drive.register(name) for name in arguments.registers if name not in drive.texts]
+    target, names = target_of(arguments)
+    drive = target.drive
+    texts = [drive.texts[name] for name in names if name in drive.texts]
+    wanted = [drive.register(name) for name in names if name not in drive.texts]
     for register in wanted:
         if not register.readable:
-            raise ValueError(f"{register.name} can only be written; see `multidrop models {arguments.model}`")
-    if not arguments.registers:
+            raise ValueError(f"{register.name} can only be written; see `multidrop models {target.model}`")
+    if not names:
         texts = list(drive.texts.values())
         wanted = [register for register in drive.registers.values() if register.readable]
-    with Bus(arguments.port) as bus:
-        bus.attach(drive)
+    with target.open_bus() as bus:
         values = _read(bus, drive, wanted)
         read_texts = {text: _read_text(bus, drive, text) for text in texts}
     if arguments.json:

@@ -9,12 +9,12 @@ from multidrop.drive.register import HOLDING, Table
 
 _LAST_ADDRESS = 0xFFFF
 MOST_WORDS = 125  # of one request
-_ORDERS = ("AB", "BA")
+_ORDERS = ("AB", "BA", "B")  # B: one character a register, in its low byte
 
 
 @dataclass(frozen=True, eq=False)
 class Text:
-    """A text of a drive: its address, its length in registers of two characters, and which comes first.
+    """A text of a drive: its address, its length in registers, and the order of characters in them.
 
     Raises ValueError for what no request could read.
     """
@@ -32,7 +32,7 @@ class Text:
         if not _is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
             raise ValueError(f"a text at {self.address!r}: its registers are not within 0 to FFFFH")
         if self.order not in _ORDERS:
-            raise ValueError(f"order = {self.order!r} of a text is neither 'AB' nor 'BA'")
+            raise ValueError(f"order = {self.order!r} of a text is none of 'AB', 'BA' and 'B'")
         if not isinstance(self.table, Table) or self.table.read not in (0x03, 0x04):
             raise ValueError(f"a text is in HOLDING or INPUT registers, not in {self.table!r}")
 
@@ -51,14 +51,19 @@ class Text:
         """
         if self.order == "BA":
             data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
+        elif self.order == "B":
+            data = data[1::2]
         found = data.partition(b"\0")[0].decode("latin-1").rstrip()
         return "".join(character if character.isprintable() else "?" for character in found)
 
     def encode(self, value: str) -> bytes:
         """Return the bytes of the registers that hold a text. Raises ValueError for one that does not fit."""
         data = value.encode("latin-1")
-        if len(data) > 2 * self.length:
-            raise ValueError(f"{self.name} holds {2 * self.length} characters, not {len(data)}")
+        most = self.length * (1 if self.order == "B" else 2)
+        if len(data) > most:
+            raise ValueError(f"{self.name} holds {most} characters, not {len(data)}")
+        if self.order == "B":
+            return b"".join(bytes((0, character)) for character in data.ljust(most, b"\0"))
         data = data.ljust(2 * self.length, b"\0")
         if self.order == "BA":
             data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
@@ -66,7 +71,10 @@ class Text:
 
 
 def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB", place: str = "") -> Text:
-    """Declare a text of so many registers, two characters in each; order "BA": the second one comes first."""
+    """Declare a text of so many registers, two characters in each; order "BA": the second one comes first.
+
+    Order "B" is one character in each, in its low byte.
+    """
     return Text(address, length, table, order, place)
 
 

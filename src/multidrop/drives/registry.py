@@ -1,23 +1,19 @@
 """Find a family by the name that a person writes: built-in, shipped as a file, or in a file of their own.
 
 The shipped ones are TOML files of this package, which nobody has tried on hardware. A TOML file is data. A
-Python file is a program: looking its class up runs it, with all rights of the caller. Each of these is logged
-to `multidrop.drives.registry` before it is run.
+Python file is a program: looking its class up runs it, with all rights of the caller. It may import modules
+that lie beside it. Each of these is logged to `multidrop.drives.registry` before it is run.
 """
 
 from __future__ import annotations
 
 import difflib
-import importlib.util
-import logging
-import sys
-import traceback
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
+from multidrop.drives.model_file import load_model_file
 from multidrop.family_file.loader import load_family
 
 _SHIPPED = Path(__file__).parents[1] / "families"
@@ -78,30 +74,4 @@ def _load(path: Path) -> ModuleType:
         raise ValueError(f"no model can be taken from {path}: {failure.strerror}") from failure
     if not is_there:
         raise ValueError(f"there is no file {path} to take a model from")
-    return _load_once(path.resolve())
-
-
-@cache
-def _load_once(path: Path) -> ModuleType:
-    """Run the file once a process, so that its classes stay the same for all their drives."""
-    name = f"multidrop_models.{path.stem}_{abs(hash(path)):x}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{path} cannot be loaded as Python")
-    logging.getLogger(__name__).info("%s is run as Python: a model of one's own is a program", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as mistake:
-        del sys.modules[name]
-        raise ValueError(f"{path}{_line(mistake, path)}: {type(mistake).__name__}: {mistake}") from mistake
-    return module
-
-
-def _line(mistake: BaseException, path: Path) -> str:
-    """Return the line of the file in which it happened, where that is known."""
-    if isinstance(mistake, SyntaxError):
-        return ""  # its text has the line
-    lines = [at.lineno for at in traceback.extract_tb(mistake.__traceback__) if at.filename == str(path)]
-    return f", line {lines[-1]}" if lines else ""
+    return load_model_file(path)

@@ -22,8 +22,9 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
-from multidrop.cli.support.arguments import add_json_argument, add_port_argument
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
 from multidrop.cli.support.values import wrapped
 from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request, is_pseudo_terminal
 from multidrop.drive.family import Drive
@@ -31,6 +32,7 @@ from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
 from multidrop.planning.blocks import blocks
+from multidrop.plant.model import Plant
 from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
 
@@ -44,7 +46,7 @@ SETTING_UP = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_port_argument(parser)
+    add_line_arguments(parser, "NAME")
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
     parser.add_argument("--address", type=int, metavar="N", help="its address")
     parser.add_argument(
@@ -56,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = _drive(arguments)
-    settings = drive.settings if drive else _line_settings(arguments)
+    plant = plant_at(arguments)
+    drive, settings = _of_plant(plant, arguments) if plant else _by_hand(arguments)
     findings = list(_findings(arguments.port, drive, settings))
     if arguments.json:
         records = [asdict(finding) for finding in findings]
@@ -65,6 +67,29 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text("\n".join(_text(findings)))
     return 1 if any(finding.is_failure for finding in findings) else 0
+
+
+def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
+    """Return the drive to measure with, where one is named, and its or its line's settings.
+
+    `port` is the line's port afterwards. Raises ValueError for what only a port by hand takes.
+    """
+    for name in ("model", "address", "baudrate", "format", "framing"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is a matter of the plant file: write it into {plant.path}")
+    lines = {line.name for line in plant.lines}
+    if arguments.name is None or arguments.name in lines:
+        line = line_of(plant, arguments.name)
+        arguments.port = line.port
+        return None, usual_settings(line)
+    line, drive = plant.find_drive(arguments.name)
+    arguments.port = line.port
+    return drive, drive.settings
+
+
+def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
+    drive = _drive(arguments)
+    return drive, drive.settings if drive else _line_settings(arguments)
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -174,7 +199,8 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
         return Finding(
             "round trip",
             "not measured: a drive must answer",
-            "name one with --model and --address; `multidrop scan` finds those that are there",
+            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
+            "that are there",
         )
     register = next(iter(drive.readings()))
     (block,) = blocks(drive, [register])
