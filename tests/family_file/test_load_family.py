@@ -12,7 +12,7 @@ import pytest
 from families import METER, METER_CSV, Meter, write_meter
 
 from multidrop import Drive, FamilyError, Kept, load_family
-from multidrop.drive.register import HOLDING, INPUT, Register
+from multidrop.drive.register import HOLDING, INPUT, NumberFormat, Register
 from multidrop.family_file.facts import FAMILY_KEYS
 from multidrop.family_file.loader import SECTIONS
 from multidrop.family_file.register_keys import REGISTER_KEYS
@@ -361,7 +361,6 @@ def test_every_key_is_in_the_reference() -> None:
 
 
 def test_texts(tmp_path: Path) -> None:
-    pytest.importorskip("multidrop.drive.text")
     entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
     loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
     assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
@@ -380,6 +379,32 @@ def test_texts(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:
-    pytest.importorskip("multidrop.drive.text")
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
     assert any(told in mistake for mistake in found), found
+
+
+def test_details_of_a_number(tmp_path: Path) -> None:
+    text = (
+        HEAD
+        + """\
+[default]
+number_format = "F32"
+order = "CDAB"
+invalid = "NaN"
+[reading]
+power = { at = 1, unit = "W" }
+level = { at = 3, number_format = "I16", offset = -40, invalid = [0x7FFF, 0x8000], step = -0.1, order = "BA" }
+count = { at = 4, number_format = "U64", order = "DCBA", invalid = 0 }
+flag = { at = 8, number_format = "U16", part = "3", order = "ABCD" }
+field = { at = 8, number_format = "U16", part = "4-7", values = { off = 0, on = 1 }, order = "ABCD" }
+current = { at = 9, number_format = "U16", scale_register = "power_of_ten", order = "ABCD" }
+power_of_ten = { at = 10, number_format = "I16", order = "ABCD" }
+"""
+    )
+    found = family(tmp_path, text).registers
+    power, level, count = found["power"], found["level"], found["count"]
+    assert (power.order, len(power.invalid), power.invalid[0] != power.invalid[0]) == ("CDAB", 1, True)
+    assert (level.offset, level.step, level.invalid, level.order) == (-40, -0.1, (0x7FFF, 0x8000), "BA")
+    assert (count.number_format, count.order, count.invalid) == (NumberFormat.U64, "DCBA", (0,))
+    assert (found["flag"].part, found["field"].part) == ((3, 3), (4, 7))
+    assert found["current"].scaled_by is found["power_of_ten"]

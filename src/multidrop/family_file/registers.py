@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from multidrop.drive.register import HOLDING_MULTIPLE, Access, Carrier, Register, command, reading, setting
@@ -20,7 +20,6 @@ _DECLARE: Mapping[Access, Callable[..., Register[Any]]] = {
     Access.COMMAND: command,
 }
 _WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # defaults that a bit does not take
-_KNOWN = {known.name for known in fields(Register)}
 
 ReadAddress = Callable[[Any, str | None, str], tuple[int, str]]
 
@@ -61,9 +60,6 @@ class Declared:
         details, table = self._details(access, good, address[1])
         if "ram_address" in good:
             details["ram_address"] = good["ram_address"]
-        for detail in [detail for detail in details if detail not in _KNOWN]:
-            place.wrong(f"{detail} cannot be declared in this version; leave it out")
-            del details[detail]
         register = place.attempt(_made, access, address[0], what, {**details, "table": table})
         if register is not None:
             register.__set_name__(type(self), name)

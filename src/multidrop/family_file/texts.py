@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
+from multidrop.drive.text import Text, text
 from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.names import unusable
 from multidrop.family_file.register_keys import converted, shown
 from multidrop.toml_check import Key, TomlPlace
 
-_MODULE = "multidrop.drive.text"
 MOST_TEXTS = 100
 TEXT_KEYS = {
     "at": Key((int, str), 'at = 0xFC00, 8192, "2000H" or "40001"', needed=True),
@@ -25,18 +23,15 @@ TEXT_KEYS = {
 
 def texts_of(
     section: Any, counting: Counting, registers: Mapping[str, TomlPlace], place: TomlPlace
-) -> dict[str, Any]:
+) -> dict[str, Text]:
     """Return the texts of [text] by name; each mistake is a sentence."""
     if not isinstance(section, dict):
         place.wrong("[text] is no table; write [text] and NAME = { at = 0xFC00, length = 8 }")
         return {}
-    if section and find_spec(_MODULE) is None:
-        place.wrong("[text] cannot be read by this version; leave it out")
-        return {}
     if len(section) > MOST_TEXTS:
         place.wrong(f"[text] has {len(section)} texts, and {MOST_TEXTS} are the most")
         return {}
-    found = {}
+    found: dict[str, Text] = {}
     for name, given in section.items():
         at = place.within(f"[text] {name[:60]}")
         why = unusable(name)
@@ -44,13 +39,13 @@ def texts_of(
             at.wrong(f"{shown(name)} cannot be a text's name: {why}")
         elif name in registers:
             at.wrong("a register has this name too; call one of the two otherwise")
-        text = _text(at.check(given, TEXT_KEYS), counting, at)
-        if text is not None and not why:
-            found[name] = text
+        declared = _text(at.check(given, TEXT_KEYS), counting, at)
+        if declared is not None and not why:
+            found[name] = declared
     return found
 
 
-def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Any:
+def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Text | None:
     if not {"at", "length"} <= good.keys():
         return None
     given = place.attempt(converted, "table", good["table"]) if "table" in good else None
@@ -58,9 +53,8 @@ def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Any:
     if address is None:
         return None
     details = {key: good[key] for key in ("order", "place") if key in good}
-    declare = import_module(_MODULE).text
 
-    def make() -> Any:
-        return declare(address[0], good["length"], table=TABLES[address[1]], **details)
+    def make() -> Text:
+        return text(address[0], good["length"], table=TABLES[address[1]], **details)
 
     return place.attempt(make)
