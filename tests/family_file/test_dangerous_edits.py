@@ -159,7 +159,9 @@ EDITS: dict[str, tuple[Change, str]] = {
         "does not refuse on tripped",
     ),
     "start writes only when": (
-        lambda document: [step.update(when="inhibited") for step in steps("start")(document) if "write" in step],
+        lambda document: [
+            step.update(when="inhibited") for step in steps("start")(document) if "write" in step
+        ],
         "without `when`",
     ),
     "start asks for its direction where no state tells one": (
