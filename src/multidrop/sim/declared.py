@@ -54,7 +54,7 @@ class SimulatedDeclared(MotorDrive):
     def changed(self, cell: MemoryCell) -> None:
         super().changed(cell)
         if cell.register is not None and cell.register.name in self._controls:
-            self._obey(cell.register.name, cell.raw)
+            self._obey(cell.register.name, int(self.memory.get(cell.register)))  # in its order of bytes
 
     def _obey(self, name: str, word: int) -> None:
         self._ready = None
