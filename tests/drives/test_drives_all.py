@@ -270,7 +270,8 @@ def test_drives_import_what_they_may() -> None:
             )
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
                 room = node.module.split(".")[1]
-                assert room in {"drive", "register", "drives"}, f"{path.name} imports {node.module}"
+                finds = {"family_file"} if path.name == "registry.py" else set()
+                assert room in {"drive", "register", "drives"} | finds, f"{path.name} imports {node.module}"
 
 
 def test_a_family_without_a_verb_says_so() -> None:

@@ -404,3 +404,26 @@ def test_an_optidrive_of_the_first_guide_is_never_started(monkeypatch: pytest.Mo
     line.drive.stop()
     assert not line.sim.motor.energised
     assert line.starts == []
+
+
+def test_a_stop_is_kept_from_a_drive_that_says_twice_that_it_is_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One make's stop is another's run; but a stop goes to a drive that cannot say who it is."""
+    line = Line(monkeypatch, "invt-goodrive")
+    line.sim["signature"] = 0x0101
+    with pytest.raises(Refused, match="no stop was sent"):
+        line.drive.stop(seconds=1)
+    assert line.writes == []
+    line = Line(monkeypatch, "siemens-v20")
+    line.sim["status"] = 0x0241  # no state of its profile
+    line.drive.stop()
+    assert line.writes
+
+
+def test_a_stop_of_a_drive_that_was_known_is_never_kept_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Line(monkeypatch, "invt-goodrive")
+    line.runs()
+    line.sim["signature"] = 0x0101
+    line.drive.stop()
+    assert not line.sim.motor.energised

@@ -19,6 +19,7 @@ RESET_TIME = 2.0  # s, after which a fault that was reset must be gone
 READING = Role((Access.READING,))
 OPTIONAL = Role((Access.READING,), needed=False)
 REFERENCE = Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%"))
+PROOFS = ("station", "signature")  # roles that only tell the family
 REFERENCE_IN_FORCE = Role((Access.READING,), units=("Hz", "%"), needed=False)
 
 
@@ -38,7 +39,8 @@ class Profile(Drive):
     The verbs guarantee what the built-in families' verbs do. A stop is sent always, repeated until it is
     confirmed, and watched until the drive stands. A start or a reset is written once. A start is refused in a
     fault, in local control, and without a setpoint in force; a reset is refused while the motor turns, never
-    has a bit that runs it, and comes after a stop. `identify` only reads.
+    has a bit that runs it, and comes after a stop. `identify` only reads; without `station` and `signature`
+    it proves little, and no stop is kept back because of it alone.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -71,6 +73,7 @@ class Profile(Drive):
                 setattr(cls, name, whole)
         cls.options = {**Profile.options, **cls.options}
         super().__init_subclass__()
+        cls.identity_is_inferred = not cls.registers.keys() & {*PROOFS}
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
@@ -105,7 +108,7 @@ class Profile(Drive):
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
         """Return the registers that are polled by default: not those that only tell the family."""
-        return tuple(one for one in super().readings() if one.name not in ("station", "signature"))
+        return tuple(one for one in super().readings() if one.name not in PROOFS)
 
     # ---- for each profile ----
 
