@@ -302,6 +302,7 @@ def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
         (NumberFormat.I16, None, -32768, "80 00"),
         (NumberFormat.I32, None, 0x80000000, "80 00 00 00"),
         (NumberFormat.U64, None, 0xFFFFFFFFFFFFFFFF, "FF FF FF FF FF FF FF FF"),
+        (NumberFormat.U64, None, -1, "FF FF FF FF FF FF FF FF"),
         (NumberFormat.I64, None, 0x8000000000000000, "80 00 00 00 00 00 00 00"),
         (NumberFormat.I8, None, 0x80, "12 80"),
         (NumberFormat.F32, None, (), "7F C0 00 00"),  # NaN
