@@ -306,3 +306,30 @@ def test_every_guard_is_the_one_of_port_model_address(run: Run, plant: Path, at:
         by_hand = run(command, port, TOY, 1, *further)
         assert by_plant[0] == by_hand[0] != 0
         assert by_plant[2].replace("pump-1", "toy@1") == by_hand[2]
+
+
+METER = """\
+[family]
+title = "Meter M1"
+manual = "Meter M1, register table"
+counts_from = 0
+
+[reading]
+current = { at = 2, unit = "A", step = 0.01 }
+"""
+
+
+def test_a_family_s_file_beside_the_plant_file_is_a_model(run: Run, port: str, tmp_path: Path) -> None:
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "meter.toml").write_text(METER)
+    plant = tmp_path / "room" / "plant.toml"
+    plant.write_text(LINE.format("hall-1", port) + DRIVE.format("meter-1", "meter.toml", 1))
+    assert run("read", plant, "meter-1", "current")[:2] == (0, "current  3.25  A\n")
+    assert run("models", plant, "meter-1")[1] == run("models", tmp_path / "room" / "meter.toml")[1]
+
+
+def test_a_family_s_file_in_place_of_a_plant_file_is_told(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "meter.toml").write_text(METER)
+    status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
+    assert (status, out) == (2, "")
+    assert "'line' is missing; add [[line]]" in err
