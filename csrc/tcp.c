@@ -153,7 +153,6 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
     if (used > 0 && line->transactions == MD_IGNORED)
         return md_reply_judge(line, at, used, &reply, now_ns, ending);
     if (used > 0) {
-        line->exchange->drive->unanswered_count = 0;
         md_reply_accept(line, at, used, &reply);
         *ending = (struct md_ending){used, at, (size_t)used};
         return 1;
