@@ -219,7 +219,8 @@ struct md_history {
     struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
 };
 
-/* A drive: the bounds of its time-out are given, the rest is learnt from its exchanges and begins as 0.
+/* A drive: the bounds of its time-out and its interval are given, the rest is learnt from its exchanges and
+ * begins as 0.
  * A time-out runs from the request's last bit to the reply's first. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
@@ -227,6 +228,7 @@ struct md_drive {
     int64_t patience_ns;            /* a longer time-out, learnt from late replies */
     int64_t late_until_ns;          /* until then a late reply may come, in any order */
     int64_t answered_ns;            /* requests that left before then are answered, or never will be */
+    int64_t interval_ns, ready_ns;  /* from the end of an exchange to its next request; not before then */
     uint32_t failures;              /* in a row */
     uint32_t owed_count, unanswered_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */

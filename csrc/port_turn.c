@@ -117,6 +117,23 @@ static const struct md_exchange *find_first(struct md_before *before, const stru
     return exchange->echo_probe;
 }
 
+/* ---- drives that bear no request soon after another ---- */
+
+/* Return when its drive may be asked. A broadcast waits for none. */
+static int64_t ready_ns(const struct md_exchange *exchange)
+{
+    return exchange->request.address ? exchange->drive->ready_ns : 0;
+}
+
+/* Give its drive a rest after an exchange that was sent. */
+static void rest(const struct md_exchange *exchange, const struct md_completion *completion, int64_t now_ns)
+{
+    if (exchange->drive->interval_ns && completion->sent_ns)
+        exchange->drive->ready_ns = now_ns + exchange->drive->interval_ns;
+}
+
+/* ---- the end of a turn, and its beginning ---- */
+
 /* Its turn is over; 1: its reply may have been an earlier one, and it is sent again. A write never is: it may
  * have started a motor. */
 static int is_sent_again(struct md_before *before, const struct md_exchange *exchange,
@@ -155,6 +172,27 @@ static int is_expired(const struct md_turn *turn, int64_t now_ns)
     return is_overtaken || (urgent->expires_ns && now_ns > urgent->expires_ns);
 }
 
+/* Put the first one that may be sent now before the others, and return it; else say when one may be. While a
+ * stop waits for its drive only other stops go on: else it would wait for their exchanges, too. */
+static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
+{
+    for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
+        struct md_urgent *urgent = *at;
+        int64_t from_ns = later(urgent->not_before_ns, ready_ns(urgent->exchange));
+        if (*is_held && !urgent->exchange->insists)
+            return NULL;
+        if (now_ns >= from_ns) {
+            *at = urgent->next;
+            urgent->next = turn->urgent;
+            turn->urgent = urgent;
+            return urgent;
+        }
+        *wake_ns = sooner(*wake_ns, from_ns);
+        *is_held |= urgent->exchange->insists;
+    }
+    return NULL;
+}
+
 static void take_urgent(struct md_turn *turn, struct md_urgent *urgent, int64_t now_ns)
 {
     if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_expired(turn, now_ns))
@@ -182,8 +220,9 @@ static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64
 static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     const struct md_slot *slot = &turn->slots[turn->progress.done & (turn->room - 1)];
-    if (now_ns < slot->not_before_ns) {
-        *wake_ns = sooner(*wake_ns, slot->not_before_ns);
+    int64_t from_ns = later(slot->not_before_ns, ready_ns(slot->exchange));
+    if (now_ns < from_ns) {
+        *wake_ns = sooner(*wake_ns, from_ns);
         return 0;
     }
     if (begin(turn, MD_QUEUED, slot->exchange, &turn->completion, now_ns) && is_over(turn, slot, now_ns))
@@ -199,6 +238,11 @@ static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         return 1;
     if (!turn->round_len)
         return 0;
+    int64_t from_ns = ready_ns(turn->round[turn->round_at]);
+    if (now_ns < from_ns) {
+        *wake_ns = sooner(*wake_ns, from_ns);
+        return 0;
+    }
     if (begin(turn, MD_REPEATED, turn->round[turn->round_at], &turn->completion, now_ns))
         turn->round_at = turn->round_at + 1 < turn->round_len ? turn->round_at + 1 : 0;
     return 1;
@@ -235,12 +279,12 @@ static int is_polls_turn(const struct md_turn *turn)
 /* Take up what comes next, or say when; 1: there is something to carry out now. */
 static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    struct md_urgent *urgent = turn->urgent;
-    int is_due = urgent && now_ns >= urgent->not_before_ns;
-    *wake_ns = urgent ? urgent->not_before_ns : MD_NEVER;
-    if ((!is_due || is_polls_turn(turn)) && take_polled(turn, wake_ns, now_ns))
+    int is_held = 0;
+    *wake_ns = MD_NEVER;
+    struct md_urgent *urgent = find_urgent(turn, &is_held, wake_ns, now_ns);
+    if (!is_held && (!urgent || is_polls_turn(turn)) && take_polled(turn, wake_ns, now_ns))
         return 1;
-    if (is_due) {
+    if (urgent) {
         take_urgent(turn, urgent, now_ns);
         return 1;
     }
@@ -311,6 +355,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         if (want != MD_DONE)
             return want;
         settle(turn, now_ns - line->completion->begun_ns);
+        rest(line->exchange, line->completion, now_ns);
         finish(turn);
     }
 }

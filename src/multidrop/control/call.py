@@ -41,8 +41,8 @@ class Call:
 
     @property
     def expires_ns(self) -> int:
-        """The time of CLOCK_MONOTONIC after which nothing is sent."""
-        return self._due_ns + round(self.expiry * 1e9)
+        """The time of CLOCK_MONOTONIC after which nothing is sent; its drive may be given a rest before."""
+        return self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:
@@ -57,7 +57,7 @@ class Call:
         """Account for one exchange with the drive."""
         drive = self.drive
         wire = 2 * drive.needed_silence() + MOST_CHARACTERS * drive.settings.character
-        return self.step(drive.response_timeout + wire)
+        return self.step(drive.least_interval + drive.response_timeout + wire)
 
     def check(self, what: str) -> None:
         """Raise Overtaken once a stop was called."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from math import isnan
 from typing import Any
 
@@ -64,7 +65,10 @@ class Stopper:
         found: dict[str, Stopped] = {}
         with self._under_way(drives):
             begun = _now()
-            stops = [StopAttempt(drive, drive.stop.script, begun, seconds) for drive in drives]
+            stops = [
+                StopAttempt(drive, drive.stop.script, begun, seconds, partial(self._ready, drive))
+                for drive in drives
+            ]
             try:
                 sent = broadcast()
             except BaseException as interruption:
@@ -105,11 +109,20 @@ class Stopper:
         except CheckAgain:  # no other stop waits
             return self._writer.insist(drive, step)
 
+    def _ready(self, drive: Drive) -> float:
+        peer = self._exchanges.peers.get(drive)
+        return peer.ready_ns / 1e9 if peer else 0.0
+
     def _regain(self) -> None:
         line, now = self._exchanges.line, clock.now_ns()
         if not self.is_tended and line.is_lost and now >= self._regain_ns:
             self._regain_ns = now + REGAIN_NS
             line.regain()
+
+
+def _due(stop: StopAttempt) -> float:
+    """Return when its next step can be carried out: one that must wait for its drive holds up no other."""
+    return max(stop.due, stop.ready())
 
 
 def _now() -> float:
@@ -129,7 +142,7 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
     under_way = list(stops)
     try:
         while under_way:
-            stop = min(under_way, key=lambda stop: stop.due)  # the one that is due for longest
+            stop = min(under_way, key=_due)  # the one that is due for longest
             under_way.remove(stop)
             under_way.append(stop)
             clock.sleep(max(0.0, stop.due - _now()))

@@ -39,13 +39,19 @@ class StopAttempt:
     """One drive's stop under way; its `failure`, None while all is well.
 
     It is repeated for `seconds`; without that for LEAST_S at least, and an attempt that has begun by then
-    may take its time, which is the ramp's.
+    may take its time, which is the ramp's. `ready` returns the time before which nothing is sent to it.
     """
 
     def __init__(
-        self, drive: Drive, script: Callable[[], Script[Any]], begun: float, seconds: float | None
+        self,
+        drive: Drive,
+        script: Callable[[], Script[Any]],
+        begun: float,
+        seconds: float | None,
+        ready: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self.drive = drive
+        self.ready = ready
         self.due = begun
         self.failure: Exception | None = None
         self.is_sent = False  # a stop has left for it

@@ -22,16 +22,18 @@ class Peer:
     """The knowledge of one drive's replies (struct md_drive), shared by all its exchanges.
 
     `least_timeout` and `most_timeout`, in s, bound the time-out, which runs from the request's last
-    bit to the reply's first; between them it is learnt from the drive's own response delays.
+    bit to the reply's first; between them it is learnt from the drive's own response delays. No request
+    leaves sooner than `interval`, in s, after the end of an exchange.
     """
 
-    def __init__(self, *, least_timeout: float, most_timeout: float) -> None:
+    def __init__(self, *, least_timeout: float, most_timeout: float, interval: float = 0.0) -> None:
         self._history = ffi.new("struct md_history *")
         self.c = ffi.new(
             "struct md_drive *",
             {
                 "least_timeout_ns": round(least_timeout * 1e9),
                 "most_timeout_ns": round(most_timeout * 1e9),
+                "interval_ns": round(interval * 1e9),
                 "history": self._history,
             },
         )
@@ -62,6 +64,11 @@ class Peer:
     def late_until_ns(self) -> int:
         """The time until which the reply to an earlier request may still come."""
         return int(self.c.late_until_ns)
+
+    @property
+    def ready_ns(self) -> int:
+        """The time before which no request leaves for it."""
+        return int(self.c.ready_ns)
 
     def inherit(self, before: Peer) -> None:
         """Take the place of another at its address, whose replies may still come."""

@@ -79,7 +79,7 @@ class _PredictedJob(Job):
 
     @property
     def reached(self) -> float:
-        """Times per second, of a job with a period."""
+        """Times per second."""
         if self.skipped == 0 and self.planned.every:
             return 1 / self.planned.every
         return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
@@ -102,6 +102,9 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
+    has_rests = any(job.interval_ns for job in jobs)  # in which the line may have nothing to do
+    if has_rests:
+        load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
     cycle, switches, before = 0.0, 0, jobs[-1].planned.drive
     for job in jobs:
@@ -110,17 +113,29 @@ def predict(
         switches += drive.settings != before.settings
         before = drive
         groups.setdefault((drive, job.planned.every), []).append(job)
+    if has_rests:
+        cycle = max(cycle, *_rests(jobs).values())
     rates = [
         Rate(
             drive,
             every,
             registers=tuple(register for job in group for register in job.planned.block.registers),
             requests=len(group),
-            reached=turns if every is None else min(job.reached for job in group),
+            reached=turns if every is None and not has_rests else min(job.reached for job in group),
         )
         for (drive, every), group in groups.items()
     ]
-    return Prediction(cycle, switches, max(load, 1.0) if turn else load, tuple(rates))
+    utilisation = load if has_rests or not turn else max(load, 1.0)
+    return Prediction(cycle, switches, utilisation, tuple(rates))
+
+
+def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
+    """Return the seconds in which each drive can be asked all of its jobs once, given its rests."""
+    found: dict[Drive, float] = {}
+    for job in jobs:
+        drive = job.planned.drive
+        found[drive] = found.get(drive, 0.0) + max(silence(drive), drive.least_interval) + job.own
+    return found
 
 
 def _jobs(
@@ -134,6 +149,8 @@ def _jobs(
         _PredictedJob(
             drive=drive.address,
             kind=kind(drive),
+            silence_ns=round(silence(drive) * 1e9),
+            interval_ns=round(drive.least_interval * 1e9),
             period_ns=None if planned.every is None else round(planned.every * 1e9),
             duration_ns=round((silence(drive) + own) * 1e9),
             planned=planned,
@@ -152,16 +169,18 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
         schedule.add(job, 0)
     gaps = cache(partial(gap, switching=switching))
     at, before = 0, jobs[-1].planned.drive
-    timed = any(job.period_ns is not None for job in jobs)
+    ready_ns: dict[int, int] = {}
+    timed = any(job.period_ns is not None or job.interval_ns for job in jobs)
     for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
         ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
         silent = gaps(before, job.planned.drive)
-        begin_ns = max(at + round(silent * 1e9), not_before_ns)
+        begin_ns = max(at + round(silent * 1e9), not_before_ns, ready_ns.get(job.drive, 0))
         job.first_ns = job.first_ns if job.count else begin_ns
         job.last_ns = begin_ns
         job.count += 1
         job.taken += silent + job.own
         at, before = begin_ns + round(job.own * 1e9), job.planned.drive
+        ready_ns[job.drive] = at + job.interval_ns
 
 
 # ---- as a recording carries it ----

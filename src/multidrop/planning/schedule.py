@@ -20,6 +20,7 @@ from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # of the line, for jobs without a period, at least
 CREDIT_NS = 50_000_000  # of it, that they use up in advance
+NEVER_NS = 1 << 63
 
 
 @dataclass(eq=False, kw_only=True)
@@ -32,6 +33,8 @@ class Job:
     drive: int
     period_ns: int | None
     duration_ns: int
+    silence_ns: int = 0  # of its duration; it passes also while the line has nothing to do
+    interval_ns: int = 0  # from the end of an exchange with its drive to the next request
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
@@ -65,6 +68,8 @@ class Schedule(Generic[J]):
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
         self._begun: list[J] = []  # their slot has begun
+        self._ready: dict[int, int] = {}  # of drives with an interval: when each may be asked again
+        self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
         self._next = 0  # of them
         self._owed_ns = -CREDIT_NS  # to them
@@ -75,6 +80,8 @@ class Schedule(Generic[J]):
     def add(self, job: J, now_ns: int) -> None:
         self.jobs.append(job)
         self._health.setdefault(job.drive, Health())
+        if job.interval_ns:
+            self._ready.setdefault(job.drive, 0)
         self._number += 1
         job.number, job.due_ns = self._number, now_ns
         if job.period_ns is None:
@@ -85,6 +92,9 @@ class Schedule(Generic[J]):
     def remove(self, job: J) -> None:
         """Remove a job; what is queued of it is still carried out."""
         self.jobs.remove(job)
+        self._held = [held for held in self._held if held is not job]
+        if job.interval_ns and all(other.drive != job.drive for other in self.jobs):
+            self._ready.pop(job.drive, None)
         self._begun = [begun for begun in self._begun if begun is not job]
         self._waiting = [waiting for waiting in self._waiting if waiting[2] is not job]
         heapq.heapify(self._waiting)
@@ -111,7 +121,7 @@ class Schedule(Generic[J]):
 
     def cycle(self, now_ns: int) -> list[J]:
         """Return the round where it is all that there is to do: no slots, and all drives answer."""
-        if self.back_off.may_sleep(now_ns) or self._waiting or self._begun:
+        if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
 
@@ -125,21 +135,30 @@ class Schedule(Generic[J]):
 
         `start_ns` is when the line will have done all that it was given.
         """
-        at = max(now_ns, start_ns)
+        at = idle_since = max(now_ns, start_ns)
         taken: list[Turn[J]] = []
         while len(taken) < most and at < horizon_ns:
             self._begin_slots(at)
             job = (self._in_turn(at) if self._owed_ns > 0 else None) or self._due(at) or self._in_turn(at)
             if job is None:
-                if not self._waiting or self._waiting[0][0] >= horizon_ns:
-                    break
-                at = max(at, self._waiting[0][0])
+                at = self._next_ns(at)
                 continue
             taken.append(self._take(job, at))
-            at += self._duration_ns(job)
+            at = idle_since = at + self._duration_ns(job) - min(job.silence_ns, at - idle_since)
+            if job.interval_ns:
+                self._ready[job.drive] = at + job.interval_ns
             self._kind = job.kind
         self._put_off()
         return taken
+
+    def _is_ready(self, job: J, at_ns: int) -> bool:
+        return not self._ready or at_ns >= self._ready.get(job.drive, 0)
+
+    def _next_ns(self, at_ns: int) -> int:
+        """Return when there may be something to do again, after a time at which there is nothing."""
+        times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
+        times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
+        return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
         """Begin all slots that are due; those of drives at rest pass."""
@@ -164,7 +183,11 @@ class Schedule(Generic[J]):
         if not self._begun:
             self._is_late = False
             return None
-        begun = [job for job in self._begun if not self._health[job.drive].is_pending]
+        begun = [
+            job
+            for job in self._begun
+            if not self._health[job.drive].is_pending and self._is_ready(job, at_ns)
+        ]
         if not begun:
             return None
         if self._is_late:
@@ -180,22 +203,34 @@ class Schedule(Generic[J]):
             own = [job for job in self.jobs if job.drive == drive]
             if own:
                 return min(own, key=lambda job: job.duration_ns)
+        for job in self._held:
+            if self._is_ready(job, at_ns) and self._is_awake(job, at_ns):
+                self._held.remove(job)
+                return job
         for step in range(len(self._round)):
             number = (self._next + step) % len(self._round)
             job = self._round[number]
-            if not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending:
+            if not self._is_awake(job, at_ns):
+                continue
+            if self._is_ready(job, at_ns):
                 self._next = (number + 1) % len(self._round)
                 return job
+            if job not in self._held:
+                self._held.append(job)
         self._owed_ns = -CREDIT_NS
         return None
+
+    def _is_awake(self, job: J, at_ns: int) -> bool:
+        return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
         """Take a job at this time; of its slots the present one, and those that are over are left out."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
+        ready_ns = self._ready.get(job.drive, 0)
         if job.period_ns is None or health.rest_ns:  # or tried whether it answers
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
-            return Turn(job, health.late_until_ns, None)
+            return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
         over = (at_ns - job.due_ns) // job.period_ns
         job.skipped += over
@@ -204,7 +239,7 @@ class Schedule(Generic[J]):
         job.due_ns, job.taken_ns = due_ns + job.period_ns, at_ns
         self._await(job)
         self._owed_ns += round(job.duration_ns * TURN_SHARE / (1 - TURN_SHARE))
-        return Turn(job, max(due_ns, health.late_until_ns), due_ns)
+        return Turn(job, max(due_ns, health.late_until_ns, ready_ns), due_ns)
 
     def _duration_ns(self, job: J) -> int:
         health = self._health[job.drive]

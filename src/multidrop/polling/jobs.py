@@ -111,6 +111,8 @@ class JobMaker:
         return PolledJob(
             drive=drive.address,
             kind=kind(drive),
+            silence_ns=round(silence(drive) * 1e9),
+            interval_ns=round(drive.least_interval * 1e9),
             period_ns=period_ns,
             duration_ns=own_ns + round(drive.response_delay * 1e9),
             owner=drive,

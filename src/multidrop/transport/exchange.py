@@ -122,7 +122,9 @@ class Exchanges:
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
         if key not in self._known:  # the core may be asking a proof of one that has left
-            made = self._known[key] = Peer(least_timeout=least, most_timeout=drive.response_timeout)
+            made = self._known[key] = Peer(
+                least_timeout=least, most_timeout=drive.response_timeout, interval=drive.least_interval
+            )
             made.prove_by(
                 [
                     make_exchange(drive, block.request, made, NO_ROWS, answer=answer)

@@ -1,0 +1,172 @@
+"""A drive that bears no request soon after another: it is left alone for so long, and the line is not."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from lines import polled
+from picky import Picky, family
+from simulated_bus import SimulatedBus
+from worlds import S, World, WorldWire
+
+from multidrop.control.call import Call
+from multidrop.core import Latch, Message
+from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING
+from multidrop.planning.blocks import planned
+from multidrop.planning.prediction import predict
+from multidrop.planning.schedule import Job, Schedule
+from multidrop.sim import Faults
+from multidrop.transport.exchange import NO_ROWS, make_exchange
+
+INTERVAL = 0.1
+SLACK = 1e-6
+
+
+class Slow(Picky):
+    """Keeps the times of its requests, and whether any came before the interval after its reply was over."""
+
+    def __init__(self, drive: Drive) -> None:
+        super().__init__(drive)
+        self.times: list[float] = []
+        self.early = 0
+        self._replied = 0.0
+
+    def answer(self, request: Message, now: float) -> Message | None:
+        if request.address != self.drive.address:
+            return None
+        self.times.append(now)
+        self.early += now < self._replied + INTERVAL - SLACK
+        self._replied = now + self.delay
+        return super().answer(request, now)
+
+
+def slow(registers: int = 3, most: int = 1) -> tuple[Drive, Slow]:
+    drive = family(registers, least_interval=INTERVAL, most_registers={HOLDING: most})(1, name="slow")
+    return drive, Slow(drive)
+
+
+def quick(address: int) -> tuple[Drive, Picky]:
+    drive = family(2)(address, name=f"quick-{address}")
+    return drive, Picky(drive)
+
+
+@pytest.mark.parametrize("every", [None, 0.01, 0.5])
+@pytest.mark.parametrize("others", [0, 2])
+def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
+    every: float | None, others: int
+) -> None:
+    drive, sim = slow()
+    rest = [quick(address) for address in range(2, 2 + others)]
+    drives = [polled(drive, drive.registers.values(), every), *(polled(it, it.readings()) for it, _ in rest)]
+    with World(WorldWire([sim, *(it for _, it in rest)], Faults()), drives) as world:
+        world.run(2)
+        del sim.times[:]
+        rows = world.run(12)
+    counts = [sum(row.register == f"r{at}" and row.drive == "slow" for row in rows) for at in range(3)]
+    assert sim.early == 0
+    assert {row.status for row in rows} == {"ok"}
+    assert max(counts) - min(counts) <= 1
+    each = INTERVAL + (0.06 if others else 0.03)  # an exchange takes 30 ms at most
+    wanted = 12 / max(each, (every or 0) / 3)
+    assert sum(counts) >= 0.9 * wanted
+
+
+def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> None:
+    (drive, sim), (other, its_sim) = slow(), quick(2)
+
+    def exchanges(*drives: Drive) -> int:
+        before = [polled(it, it.readings()) for it in drives]
+        with World(WorldWire([sim, its_sim], Faults()), before) as world:
+            world.run(2)
+            return sum(row.drive == other.name for row in world.run(10))
+
+    alone, together = exchanges(other), exchanges(drive, other)
+    assert together >= 0.75 * alone  # 3 exchanges of 130 ms each take less than a quarter of the line
+    assert sim.early == 0
+
+
+def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> None:
+    (drive, sim), (other, its_sim) = slow(), quick(2)
+    drives = [polled(drive, drive.readings()), polled(other, other.readings())]
+    with World(WorldWire([sim, its_sim], Faults()), drives) as world:
+        world.run(1)
+        for _ in range(20):
+            world.run(0.037)
+            assert world.port is not None
+            called, asked = world.now / S, len(its_sim.asked)
+            bus = world.poller.bus("line")
+            stop = make_exchange(
+                drive, Message(1, 0x06, 0x20, data=b"\0\0"), bus.peer(drive), NO_ROWS, insists=True
+            )
+            world.port.begin_urgent(stop)
+            before = len(sim.times)
+            while len(sim.times) == before:
+                world.run(0.001)
+            assert len(its_sim.asked) - asked <= 1  # the one that was under way
+            assert sim.times[-1] <= called + INTERVAL + 0.06  # and two exchanges, its own one
+    assert sim.early == 0
+
+
+def test_reads_by_hand_wait_their_turn_while_others_are_polled() -> None:
+    (drive, sim), (other, its_sim) = slow(), quick(2)
+    with World(WorldWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as world:
+        bus = world.poller.bus("line")
+        bus.attach(drive)
+        world.run(1)
+        for _ in range(3):
+            world.command(drive, Message(1, 0x03, 0, 1))
+            world.run(0.3)
+        for _ in range(3):
+            world.command(drive, Message(1, 0x03, 0, 1))
+            asked = len(its_sim.asked)
+            world.command(drive, Message(1, 0x03, 1, 1))
+            world.run(0.3)
+            assert len(its_sim.asked) > asked + 3
+    assert len(sim.times) == 9
+    assert sim.early == 0
+
+
+def test_a_write_is_not_late_because_its_drive_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = family(1, least_interval=2.0)(1)
+    SimulatedBus(monkeypatch, Picky(drive)).attach(drive)
+    patient = Call(drive, Latch().permit(), 1.0)
+    eager = Call(family(1)(2), Latch().permit(), 1.0)
+    assert patient.expires_ns - eager.expires_ns == 2 * S
+
+
+def test_the_prediction_knows_it() -> None:
+    drive, sim = slow()
+    wanted = planned(drive, [(register, None) for register in drive.readings()])
+    found = predict(wanted, lateness=0.0)
+    with World(WorldWire([sim], Faults()), [polled(drive, drive.readings())]) as world:
+        world.run(2)
+        rows = world.run(20)
+    measured = sum(row.register == "r0" for row in rows) / 20
+    assert found.rates[0].reached == pytest.approx(measured, rel=0.03)
+    assert found.cycle == pytest.approx(1 / measured, rel=0.03)
+    assert found.utilisation < 0.5
+    hasty = predict(planned(drive, [(register, 0.1) for register in drive.readings()]))
+    assert not hasty.fits
+
+
+def test_jobs_of_one_drive_take_turns_beside_many_others() -> None:
+    """Without a clock: ten thousand turns of a plan."""
+    schedule: Schedule[Job] = Schedule()
+    jobs = [Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(5)]
+    jobs += [Job(drive=2, period_ns=None, duration_ns=10) for _ in range(7)]
+    for job in jobs:
+        schedule.add(job, 0)
+    at, taken = 0, []
+    for _ in range(10_000):
+        ((job, not_before_ns, _),) = schedule.take(at, at, 1 << 62, 1)
+        begun = max(at, not_before_ns)
+        taken.append((begun, job))
+        at = begun + job.duration_ns
+    own = [begun for begun, job in taken if job.drive == 1]
+    counts = [sum(job is other for _, other in taken) for job in jobs]
+    assert min(later - sooner for sooner, later in pairwise(own)) >= 1010
+    assert max(counts[:5]) - min(counts[:5]) <= 1
+    assert max(counts[5:]) - min(counts[5:]) <= 1
+    assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
