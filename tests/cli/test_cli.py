@@ -109,8 +109,8 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         ),
         (
             ["read", "sockt://10.0.0.7:4001", TOY, "1"],
-            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as socket://10.0.0.7:4001 or "
-            "rfc2217://10.0.0.7:4001",
+            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as tcp://10.0.0.7, "
+            "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
         ),
         (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),

@@ -129,8 +129,13 @@ class Coding:
         return float(count) if self.number_format is NumberFormat.F64 else round(count)
 
     def exact_count(self, value: float) -> Fraction:
-        """Return the raw count that the value would need."""
-        return (Fraction(str(value)) - self.offset) / self.step
+        """Return the raw count that the value would need.
+
+        A float means the shortest decimal that is it, 0.3 three tenths; but a count that it is exactly, as
+        those of 64 bits are, is not rounded to that.
+        """
+        count = (Fraction(value) - self.offset) / self.step
+        return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step
 
     def pack(self, raw: float) -> bytes:
         """Return the words that hold a raw count, as they go over the wire."""
