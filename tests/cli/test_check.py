@@ -61,7 +61,7 @@ def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan:
         "ramp more than one write in 60 s, and than 1000 a year: it is in EEPROM",
         "locked every write: it changes the motor",
         "run every write but by verbs, and of 0000H",
-        "confirmed every write that is not called harmless, until the drive has confirmed = 1",
+        "confirmed every write, until the drive has confirmed = 1",
         "It can move a motor, and nobody has tested it",
     ):
         assert told in refused

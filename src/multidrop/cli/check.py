@@ -134,11 +134,8 @@ def _refused(family: type[Drive]) -> Iterator[Remark]:
             yield from ((register.name, sentence) for sentence in _of_writes(drive, register))
     moving = [name for name in MOVING if getattr(family, name) is not getattr(Drive, name)]
     if "confirmed" in family.options:
-        verbs = f"{', '.join(moving)} and " * bool(moving)
-        yield (
-            "confirmed",
-            f"{verbs}every write that is not called harmless, until the drive has confirmed = 1",
-        )
+        writes = "every write that is not called harmless" if moving else "every write"
+        yield "confirmed", f"{', '.join([*moving, writes])}, until the drive has confirmed = 1"
     if not moving:
         yield "verbs", "start, stop and the like: it has none"
     if not family.broadcasts:

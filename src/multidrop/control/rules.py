@@ -71,11 +71,14 @@ def check_own_text(drive: Drive, text: Text) -> None:
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
 
-    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    A command that moves nothing by itself is sent to a drive that is known to be of its class. What a file
+    calls harmless is believed where its stop was checked with it.
     """
-    if is_harmless(register, raw):
-        return
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
+    if is_harmless(register, raw):
+        if is_unproven and not _has(drive, "stop"):
+            drive.check_confirmed(register.name)
+        return
     if (register.access is Access.COMMAND or is_unproven) and not register.commands:
         drive.check_confirmed(register.name)
     if not register.commands:
