@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from declared_families import NAMES, class_of, document_of, mistakes_of
+from examples import in_turn
 from nasty_drives import RESETS, NastyDrive
 from simulated_bus import SimulatedBus
 from verb_edits import KINDS, Document
@@ -456,9 +457,10 @@ def test_the_unchanged_files_do_no_harm(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-@pytest.mark.parametrize("name", NAMES)
-def test_no_dangerous_edit_survives(name: str, kind: Any) -> None:
+@pytest.mark.parametrize(
+    ("kind", "name"), in_turn(KINDS, NAMES), ids=lambda part: getattr(part, "__name__", part)
+)
+def test_no_dangerous_edit_survives(kind: Any, name: str) -> None:
     document = document_of(name)
     total, survivors, dangerous = 0, [], {}
     for edit in kind(document):
