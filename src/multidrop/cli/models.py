@@ -14,7 +14,7 @@ from multidrop.cli.support.values import aligned, wrapped
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit, stated_limit
-from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model, is_users_own
@@ -156,7 +156,8 @@ def _option(option: Option) -> str:
 def _table_heading(table: Table, family: type[Drive]) -> str:
     codes = []
     if table.read is not None:
-        stated = "" if stated_limit(family, table) else ", the standard's limit: the class states none"
+        is_stated = stated_limit(family, table) or table.carrier not in (Carrier.BIT, Carrier.WORD)
+        stated = "" if is_stated else ", as the standard has it: the class states no limit"
         codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most{stated}")
     if table.write is not None:
         codes.append(f"write {table.write:02X}H")
