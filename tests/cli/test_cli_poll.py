@@ -289,6 +289,7 @@ def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_on_a_terminal_a_demo_is_watched_until_its_time_is_over(tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:

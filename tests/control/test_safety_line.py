@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from examples import in_turn
 from lines import until
 from motors import MAKE, Heard
 
@@ -54,8 +55,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
 
 
 @pytest.mark.slow
-@every_family
-@pytest.mark.parametrize("lost", [2, 3, 7])
+@pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
 def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
     """It is sent until it is confirmed."""
     with line(MAKE[model](1)) as (drive, sim, heard):

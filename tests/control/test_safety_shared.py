@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from checksums import rtu
+from examples import usually
 from lines import until
 from motors import MAKE, STARTS, Heard
 from shared_pair import SharedPair, shared
@@ -115,7 +116,7 @@ class Stranger:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", RTU_FAMILIES)
+@pytest.mark.parametrize("model", usually(*RTU_FAMILIES))
 def test_starts_and_stops_while_another_client_talks(model: str) -> None:
     with hall(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
@@ -186,7 +187,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 
 
 @patient
-@pytest.mark.parametrize(("verb", "says"), MOMENTS)
+@pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
 def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
     with hall("invt-che", seed=3) as (drive, pair, heard):
         set_frequency(drive, 20)
@@ -202,7 +203,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
 
 
 @patient
-@pytest.mark.parametrize("says", SAYS)
+@pytest.mark.parametrize("says", usually(*SAYS))
 def test_what_another_client_says_confirms_no_stop(says: str) -> None:
     with hall("invt-che", seed=3) as (drive, pair, heard):
         running(drive, heard[0])

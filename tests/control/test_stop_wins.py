@@ -3,7 +3,7 @@
 Real ports and threads, and responders of our own that note every frame. Order is judged on the wire alone:
 a line delivers in order, so what comes after a stop's first frame has left after the stop was called.
 Threads that start motors are held in the middle of their looks until the stop is called. More of it:
-`STOP_EXAMPLES=100 pytest tests/control/test_stop_wins.py`.
+`STOP_EXAMPLES=100 pytest -m '' tests/control/test_stop_wins.py`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from examples import usually
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -347,7 +348,7 @@ class Stops(RuleBasedStateMachine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", usually(*KINDS))
 def test_nothing_moves_after_a_stop(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(

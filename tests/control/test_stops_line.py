@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
 from motors import MAKE, Heard
@@ -47,7 +48,7 @@ def line(model: str) -> Iterator[tuple[Bus, Any, Heard, Delayed]]:
 
 
 @pytest.mark.slow
-@every_family
+@pytest.mark.parametrize("model", usually(*MAKE))
 def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
     """Each answer comes after the next question: the look before the stop has another's."""
     with line(model) as (bus, drive, heard, wire):

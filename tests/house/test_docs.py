@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from examples import usually
 
 from multidrop import core, load_plant
 from multidrop.cli import COMMANDS, main
@@ -205,7 +206,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session
         yield Session(stack)
 
 
-@pytest.mark.parametrize("page", RUN, ids=named)
+@pytest.mark.parametrize("page", usually(*RUN), ids=named)
 def test_a_page_runs_as_it_stands(page: Path, session: Session) -> None:
     text = page.read_text("utf-8")
     for module in NEEDED:

@@ -39,6 +39,7 @@ def test_an_example_is_linked_from_the_pages_and_run_here(path: Path) -> None:
         assert f'"{path.name}"' in Path(__file__).read_text("utf-8")
 
 
+@pytest.mark.long
 def test_a_logger_to_parquet(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     run(tmp_path, "logger.py", "--seconds", "1")
@@ -60,6 +61,7 @@ def test_asyncio(tmp_path: Path) -> None:
     assert any(line.endswith(" rows") for line in lines)
 
 
+@pytest.mark.long
 def test_two_lines(tmp_path: Path) -> None:
     printed = run(tmp_path, "two_lines.py", "4")
     for name in ("pump-1: ", "pump-2: ", "fan-1: ", "hall-1: ", "hall-2: "):
@@ -75,6 +77,7 @@ def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_a_noise_hunt(tmp_path: Path) -> None:
     printed = run(tmp_path, "noise_hunt.py", "2")
     assert "pump-1: " in printed

@@ -12,6 +12,8 @@ from sources import ROOMS, ROOT, comments, docstrings, files, loop_variables, pa
 
 import multidrop
 
+pytestmark = pytest.mark.long
+
 MOST_CHARACTERS = 110
 QUESTIONS = re.compile(r"(What|Whether|Of|As|How|Who|If|Where|When)\b")
 TEXT = (".py", ".c", ".h", ".md", ".toml")

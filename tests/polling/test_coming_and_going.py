@@ -171,6 +171,7 @@ def test_no_drive_leaves_while_all_are_stopped(port: str, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_many_threads_do_all_of_it_at_once() -> None:
     """The program that does so with 64 lines for ten minutes, for a short while."""
     program = [

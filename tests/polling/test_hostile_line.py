@@ -1,7 +1,7 @@
 """Every fault on a line of every family: nothing is misattributed, every miss is explained, and it ends.
 
 On a world's clock, so that a seed is a story that can be told again. For hours, with new seeds:
-`HOSTILE_HOURS=2 pytest tests/polling/test_hostile_line.py -k hours`.
+`HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
 """
 
 from __future__ import annotations
@@ -121,6 +121,7 @@ def lines_that_tell(kind: str) -> Iterator[list[Drive]]:
         yield of_all_variants()
 
 
+@pytest.mark.long
 def test_nothing_grows_for_hours() -> None:
     """All families on one line; where there are hours, each alone too, with all kinds of faults in turn."""
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))

@@ -301,6 +301,7 @@ def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
     """Peak memory of a conversion of 40 MB stays far below them."""
     tracemalloc = pytest.importorskip("tracemalloc")

@@ -269,6 +269,7 @@ def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
     assert "bus cycle" not in report_page(look)
 
 
+@pytest.mark.long
 def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
     planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": planned}))
@@ -447,6 +448,7 @@ def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))

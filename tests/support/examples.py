@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import pytest
@@ -17,6 +18,15 @@ def examples(number: int) -> int:
 def usually(tried: object, *others: object) -> list[Any]:
     """Return the parameters of a test: the first is always tried, the others are marked `long`."""
     return [tried, *(_long(other) for other in others)]
+
+
+def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
+    """Return all pairs of them: of each, one case is always tried, the others are marked `long`."""
+    return [
+        (one, case) if number % len(cases) == nth else _long((one, case))
+        for number, one in enumerate(each)
+        for nth, case in enumerate(cases)
+    ]
 
 
 def _long(other: object) -> Any:

@@ -297,7 +297,7 @@ def test_a_tapped_port_is_tapped_when_it_is_opened_again(tmp_path: Path) -> None
         CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as writer,
         Tapped({"hall-1": bus}, writer) as tapped,
     ):
-        toy = bus.attach(Toy, 1)
+        toy = bus.attach(PatientToy, 1)
         tapped.collect()
         bus.line.reopen()
         assert bus.read(toy, toy.output_current) == 3.25
