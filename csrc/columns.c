@@ -5,45 +5,176 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const uint8_t bytes_of[] = {
-    [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_U32_SWAPPED] = 4,
-    [MD_I32_SWAPPED] = 4, [MD_U32_EITHER] = 4, [MD_F32] = 4, [MD_F32_SWAPPED] = 4,
+enum {
+    FORMAT = MD_LOW_WORD_FIRST - 1, /* without its order */
+    DECIMALS = 22                   /* 10^22 is the last power that a double holds exactly */
 };
 
-static double as_float(uint32_t bits)
+static const uint8_t words_of[] = {
+    [MD_U16] = 1, [MD_I16] = 1, [MD_U32] = 2, [MD_I32] = 2, [MD_U32_EITHER] = 2,
+    [MD_F32] = 2, [MD_BIT] = 0, [MD_I8] = 1, [MD_U64] = 4, [MD_I64] = 4,
+    [MD_F64] = 4, [MD_BCD16] = 1, [MD_BCD32] = 2,
+};
+
+static const double power_of_ten[] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
+                                      1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
+_Static_assert(sizeof power_of_ten / sizeof *power_of_ten == DECIMALS + 1, "every power has a place");
+
+/* ---- one number ---- */
+
+static int is_inside(size_t len, size_t at, int format)
+{
+    if (format == MD_BIT)
+        return at / 8 < len;
+    size_t known = (size_t)(format & FORMAT);
+    if (format < 0 || known >= sizeof words_of || known == MD_BIT)
+        return 0;
+    return at < len && 2 * (at + words_of[known]) <= len;
+}
+
+static uint64_t bits_of(const uint8_t *first, int format)
+{
+    int words = words_of[format & FORMAT], step = 2;
+    if (format & MD_LOW_WORD_FIRST) {
+        first += 2 * (words - 1);
+        step = -2;
+    }
+    int high = format & MD_LOW_BYTE_FIRST ? 1 : 0;
+    uint64_t bits = 0;
+    for (int i = 0; i < words; i++, first += step)
+        bits = bits << 16 | (uint64_t)(first[high] << 8 | first[1 - high]);
+    return bits;
+}
+
+static double of_float(uint32_t bits)
 {
     float value;
     memcpy(&value, &bits, sizeof value);
     return (double)value;
 }
 
-static int is_inside(size_t len, size_t at, int format)
+static double of_double(uint64_t bits)
 {
-    if (format == MD_BIT)
-        return at / 8 < len;
-    return format >= 0 && (size_t)format < sizeof bytes_of && at < len && 2 * at + bytes_of[format] <= len;
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static double of_decimal(uint64_t digits)
+{
+    double value = 0;
+    for (int shift = 28; shift >= 0; shift -= 4) {
+        uint64_t digit = digits >> shift & 0xF;
+        if (digit > 9)
+            return (double)NAN;
+        value = 10 * value + (double)digit;
+    }
+    return value;
+}
+
+static double number_of(uint64_t bits, int format)
+{
+    switch (format & FORMAT) {
+    case MD_I8: return (int8_t)bits;
+    case MD_I16: return (int16_t)bits;
+    case MD_I32: return (int32_t)bits;
+    case MD_I64: return (double)(int64_t)bits;
+    case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* order not stated; one word is 0 */
+    case MD_F32: return of_float((uint32_t)bits);
+    case MD_F64: return of_double(bits);
+    case MD_BCD16:
+    case MD_BCD32: return of_decimal(bits);
+    default: return (double)bits;
+    }
+}
+
+static int bit_at(const uint8_t *data, size_t at) /* the first coil is the first byte's least bit */
+{
+    return data[at / 8] >> at % 8 & 1;
+}
+
+static double number_at(const uint8_t *data, size_t at, int format)
+{
+    return format == MD_BIT ? bit_at(data, at) : number_of(bits_of(data + 2 * at, format), format);
 }
 
 double md_value(const uint8_t *data, size_t len, size_t at, int format)
 {
-    if (!is_inside(len, at, format))
-        return (double)NAN;
-    if (format == MD_BIT) /* the first coil is the least significant bit of the first byte */
-        return (data[at / 8] >> (at % 8)) & 1;
-    const uint8_t *first = data + 2 * at;
-    uint32_t one = md_get16(first), two = bytes_of[format] == 4 ? md_get16(first + 2) : 0;
-    switch (format) {
-    case MD_I16: return (int16_t)one;
-    case MD_U32: return one << 16 | two;
-    case MD_I32: return (int32_t)(one << 16 | two);
-    case MD_U32_SWAPPED: return two << 16 | one;
-    case MD_I32_SWAPPED: return (int32_t)(two << 16 | one);
-    case MD_U32_EITHER: return one | two; /* word order not stated, and one of the words is 0 */
-    case MD_F32: return as_float(one << 16 | two);
-    case MD_F32_SWAPPED: return as_float(two << 16 | one);
-    default: return one;
-    }
+    return is_inside(len, at, format) ? number_at(data, at, format) : (double)NAN;
 }
+
+/* ---- the value of a field ---- */
+
+static int is_any(uint64_t bits, const struct md_invalid *invalid, int count)
+{
+    for (int i = 0; i < count; i++)
+        if ((bits & invalid[i].mask) == invalid[i].pattern)
+            return 1;
+    return 0;
+}
+
+/* The bits of a part; those of a signed format have their own sign. */
+static double part_of(uint64_t bits, int format, const struct md_extra *extra)
+{
+    uint64_t mask = extra->bits < 64 ? (UINT64_C(1) << extra->bits) - 1 : UINT64_MAX;
+    uint64_t part = bits >> extra->low & mask, sign = UINT64_C(1) << (extra->bits - 1);
+    int is_signed = (format & FORMAT) == MD_I16 || (format & FORMAT) == MD_I32 || (format & FORMAT) == MD_I64;
+    return is_signed ? (double)(int64_t)((part ^ sign) - sign) : (double)part;
+}
+
+static double scaled(double raw, const struct md_field *field, double addend, int power)
+{
+    double multiplier = power > 0 ? field->multiplier * power_of_ten[power] : field->multiplier;
+    double divisor = power < 0 ? field->divisor * power_of_ten[-power] : field->divisor;
+    return (raw * multiplier + addend) / divisor;
+}
+
+/* Return the value; NaN where the device gives none. */
+static double value_with(const struct md_message *reply, const struct md_field *field,
+                         const struct md_extra *extra)
+{
+    uint64_t bits = field->format == MD_BIT ? (uint64_t)bit_at(reply->data, field->at)
+                                            : bits_of(reply->data + 2 * field->at, field->format);
+    if (is_any(bits, extra->invalid, extra->invalid_count))
+        return (double)NAN;
+    double raw = extra->bits ? part_of(bits, field->format, extra) : number_of(bits, field->format);
+    if (!extra->has_scale)
+        return scaled(raw, field, extra->addend, 0);
+    if (!is_inside(reply->data_len, extra->scale_at, extra->scale_format))
+        return (double)NAN;
+    uint64_t scale = bits_of(reply->data + 2 * extra->scale_at, extra->scale_format);
+    int power = (int16_t)scale;
+    if (is_any(scale, extra->invalid + extra->invalid_count, extra->scale_invalid_count) ||
+        power < -DECIMALS || power > DECIMALS)
+        return (double)NAN;
+    return scaled(raw, field, extra->addend, power);
+}
+
+/* Return the row's status, and put its value there where it is MD_OK. */
+static uint16_t find_value(const struct md_message *reply, const struct md_block *block,
+                           const struct md_field *field, double *value)
+{
+    if (!is_inside(reply->data_len, field->at, field->format))
+        return -MD_BAD_LENGTH;
+    double found =
+        field->extra ? value_with(reply, field, &block->extra[field->extra - 1])
+                     : number_at(reply->data, field->at, field->format) * field->multiplier / field->divisor;
+    if (isnan(found))
+        return MD_NO_VALUE;
+    *value = found + 0.0; /* never -0.0 */
+    return MD_OK;
+}
+
+uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply)
+{
+    uint64_t lacking = 0;
+    double value;
+    for (int i = 0; block->may_lack && i < block->count; i++)
+        lacking += find_value(reply, block, &block->fields[i], &value) == MD_NO_VALUE;
+    return lacking;
+}
+
+/* ---- rows ---- */
 
 struct md_columns *md_columns_new(size_t room)
 {
@@ -79,14 +210,44 @@ static void set_bit(uint8_t *bits, size_t at, int on)
     bits[at / 8] = (uint8_t)(on ? bits[at / 8] | mask : bits[at / 8] & ~mask);
 }
 
-static uint16_t status_of(const struct md_completion *completion, const struct md_field *field)
+/* The formats that most registers have, in bytes. */
+static const uint8_t common_bytes[UINT8_MAX + 1] = {
+    [MD_U16] = 2, [MD_I16] = 2, [MD_U32] = 4, [MD_I32] = 4, [MD_F32] = 4, [MD_F32 | MD_LOW_WORD_FIRST] = 4,
+};
+
+static inline double common_number(const uint8_t *first, int format)
 {
-    const struct md_message *reply = &completion->reply;
+    uint32_t one = md_get16(first), two = common_bytes[format] == 4 ? md_get16(first + 2) : 0;
+    switch (format) {
+    case MD_I16: return (int16_t)one;
+    case MD_U32: return one << 16 | two;
+    case MD_I32: return (int32_t)(one << 16 | two);
+    case MD_F32: return of_float(one << 16 | two);
+    case MD_F32 | MD_LOW_WORD_FIRST: return of_float(two << 16 | one);
+    default: return one;
+    }
+}
+
+/* The same as find_value, in half the time for a field that has nothing but a common format. */
+static inline uint16_t find_common_value(const struct md_message *reply, const struct md_block *block,
+                                         const struct md_field *field, double *value)
+{
+    size_t at = 2 * (size_t)field->at, bytes = common_bytes[field->format];
+    if (bytes == 0 || field->extra || at + bytes > reply->data_len)
+        return find_value(reply, block, field, value);
+    double found = common_number(reply->data + at, field->format) * field->multiplier / field->divisor;
+    if (isnan(found))
+        return MD_NO_VALUE;
+    *value = found + 0.0;
+    return MD_OK;
+}
+
+/* Return why none of the fields has a value; MD_OK: each has its own status. */
+static uint16_t status_of(const struct md_completion *completion)
+{
     if (completion->result < 0)
         return (uint16_t)-completion->result;
-    if (reply->exception)
-        return (uint16_t)(MD_EXCEPTION + reply->exception);
-    return is_inside(reply->data_len, field->at, field->format) ? MD_OK : -MD_BAD_LENGTH;
+    return completion->reply.exception ? (uint16_t)(MD_EXCEPTION + completion->reply.exception) : MD_OK;
 }
 
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
@@ -94,20 +255,20 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
 {
     if (columns->room - columns->rows < (size_t)block->count)
         return 0;
-    const struct md_message *reply = &completion->reply;
     int64_t sent_ns = completion->sent_ns ? completion->sent_ns : completion->begun_ns;
+    uint16_t common = status_of(completion);
     for (int i = 0; i < block->count; i++) {
         const struct md_field *field = &block->fields[i];
         size_t row = columns->rows++;
-        uint16_t status = status_of(completion, field);
+        double value = 0;
+        uint16_t status = common ? common : find_common_value(&completion->reply, block, field, &value);
         columns->time[row] = sent_ns + utc_minus_monotonic_ns;
         columns->sent[row] = sent_ns;
         columns->uncertainty[row] = status ? 0 : completion->first_ns - sent_ns;
         columns->drive[row] = block->drive;
         columns->reg[row] = field->reg;
         columns->status[row] = status;
-        columns->value[row] = status ? 0 : md_value(reply->data, reply->data_len, field->at, field->format) *
-                                               field->multiplier / field->divisor;
+        columns->value[row] = value;
         set_bit(columns->valid, row, status == 0);
     }
     return block->count;

@@ -7,7 +7,7 @@
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket begins near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
-_Static_assert(MD_STATUSES == 1 - MD_MAYBE_ECHO, "every status has a place");
+_Static_assert(MD_STATUSES == 1 + MD_NO_VALUE, "every status has a place");
 
 static int bucket(int64_t ns)
 {
@@ -48,7 +48,9 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
         history->busies += exception == BUSY;
         history->refused[exception] += (uint32_t)values;
     } else {
-        counters->values += values;
+        uint64_t lacking = exchange->block ? md_count_lacking(exchange->block, &completion->reply) : 0;
+        counters->values += values - lacking;
+        history->missed[MD_NO_VALUE] += lacking;
     }
 }
 

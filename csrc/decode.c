@@ -111,7 +111,8 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
         decoder->is_sure = span->kind == MD_REQUEST;
         break;
     case MD_REPLY:
-        if (!add_rows(decoder, (int)span->len, columns))
+        if (!add_rows(decoder, md_is_gateways(span->framing, &span->message) ? MD_NO_REPLY : (int)span->len,
+                      columns))
             return MD_NO_ROOM;
         break;
     default:

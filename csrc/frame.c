@@ -1,7 +1,8 @@
-/* Requests and replies in three framings: Modbus RTU, Modbus ASCII, Delixi's own ASCII.
+/* Requests and replies in four framings: Modbus RTU, Modbus ASCII, Modbus TCP, Delixi's own ASCII.
  *
- * Both Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3, serial-line
- * guide V1.02); here they are called the body. Delixi's body is A K P1 P0 D3 D2 D1 D0. */
+ * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3, serial-line
+ * guide V1.02, messaging guide for TCP/IP V1.0b); here they are called the body. Delixi's body is
+ * A K P1 P0 D3 D2 D1 D0. */
 #include "internal.h"
 
 #include <string.h>
@@ -52,6 +53,8 @@ static const struct function {
 enum {
     MOST_BODY = 253, /* 125 registers read; the standard has room for 254 */
     EXCEPTION_BODY = 3,
+    NO_PATH = 0x0A, /* of a gateway: it cannot reach the unit, or has no reply from it */
+    NO_TARGET = 0x0B,
     EXCEPTION_BIT = 0x80,
     DELIXI_BODY = 8
 };
@@ -151,11 +154,17 @@ static int request_length(int framing, const uint8_t *body, size_t have)
     return head + body[6];
 }
 
+/* Only a serial line has broadcasts: a unit id of Modbus TCP is any. */
+static int is_answered(int framing, uint8_t address)
+{
+    return address != 0 || framing == MD_TCP;
+}
+
 /* Do the same for the reply to `request`, which is refused as soon as its first bytes differ. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     const struct function *function = find_function(framing, request->function);
-    if (have >= 1 && (request->address == 0 || body[0] != request->address))
+    if (have >= 1 && (body[0] != request->address || !is_answered(framing, request->address)))
         return MD_BAD_ADDRESS;
     if (request->function & EXCEPTION_BIT) /* no request has it */
         return MD_BAD_FUNCTION;
@@ -182,7 +191,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
 
 /* ---- frames ---- */
 
-static int body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
+static inline int body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     return request ? reply_length(framing, body, have, request) : request_length(framing, body, have);
 }
@@ -246,17 +255,47 @@ static int open_rtu(const uint8_t *bytes, size_t len, const struct md_message *r
     return length + 2;
 }
 
+int md_tcp_length(const uint8_t *bytes, size_t len)
+{
+    if (len >= 4 && md_get16(bytes + 2) != 0) /* the protocol */
+        return MD_NO_START;
+    if (len < MD_TCP_HEAD)
+        return MD_INCOMPLETE;
+    int whole = MD_TCP_HEAD + md_get16(bytes + 4);
+    return whole < MD_TCP_HEAD + 2 || whole > MD_MOST_TCP ? MD_NO_START : whole;
+}
+
+static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *request, const uint8_t **body)
+{
+    int whole = md_tcp_length(bytes, len);
+    if (whole <= 0)
+        return whole;
+    size_t have = len < (size_t)whole ? len : (size_t)whole;
+    int length = body_length(MD_TCP, bytes + MD_TCP_HEAD, have - MD_TCP_HEAD, request);
+    if (length < 0)
+        return length;
+    if (length == 0 ? len >= (size_t)whole : MD_TCP_HEAD + length != whole)
+        return MD_BAD_LENGTH;
+    if (length == 0 || len < (size_t)whole)
+        return MD_INCOMPLETE;
+    *body = bytes + MD_TCP_HEAD;
+    return whole;
+}
+
 /* Find the body of the frame at the beginning of `bytes`: in place, or unhexed into `text`. */
 static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                       uint8_t text[MOST_BODY + 1], const uint8_t **body)
 {
     if (framing == MD_RTU)
         return open_rtu(bytes, len, request, body);
+    if (framing == MD_TCP)
+        return open_tcp(bytes, len, request, body);
     *body = text;
     return open_text(framing, bytes, len, request, text);
 }
 
-static int close_frame(int framing, uint8_t *body, size_t len, uint8_t *out, size_t room)
+static int close_frame(int framing, uint16_t transaction, uint8_t *body, size_t len, uint8_t *out,
+                       size_t room)
 {
     static const uint8_t digits[] = "0123456789ABCDEF";
     if (framing == MD_RTU) {
@@ -267,6 +306,13 @@ static int close_frame(int framing, uint8_t *body, size_t len, uint8_t *out, siz
         out[len] = (uint8_t)crc;
         out[len + 1] = (uint8_t)(crc >> 8);
         return (int)len + 2;
+    }
+    if (framing == MD_TCP) {
+        if (room < MD_TCP_HEAD + len)
+            return MD_BAD_REQUEST;
+        uint8_t *head = md_put16(md_put16(md_put16(out, transaction), 0), (unsigned)len);
+        memcpy(head, body, len);
+        return MD_TCP_HEAD + (int)len;
     }
     if (room < 2 * len + 5)
         return MD_BAD_REQUEST;
@@ -313,10 +359,16 @@ static int is_coil(const uint8_t *data)
     return data[1] == 0 && (data[0] == 0xFF || data[0] == 0);
 }
 
+static int is_address(int framing, uint8_t address)
+{
+    return framing == MD_TCP || (address >= 1 && address <= MD_MOST_ADDRESS);
+}
+
 static int is_request(int framing, const struct md_message *message)
 {
     const struct function *function = find_function(framing, message->function);
-    if (message->address > MD_MOST_ADDRESS || (message->address == 0 && function->may_be != BROADCAST))
+    int is_broadcast = message->address == 0 && function->may_be == BROADCAST;
+    if (!is_broadcast && !is_address(framing, message->address))
         return 0;
     return fits(function->request, function, message) &&
            (framing == MD_DELIXI || message->function != MD_WRITE_COIL || is_coil(message->data));
@@ -325,7 +377,7 @@ static int is_request(int framing, const struct md_message *message)
 static int is_reply(int framing, const struct md_message *message)
 {
     const struct function *function = find_function(framing, message->function);
-    if (message->address == 0 || message->address > MD_MOST_ADDRESS)
+    if (!is_address(framing, message->address))
         return 0;
     if (message->exception)
         return framing != MD_DELIXI || is_delixi_refusal(message->exception);
@@ -359,7 +411,7 @@ int md_build_request(int framing, const struct md_message *message, uint8_t *out
         return MD_BAD_REQUEST;
     uint8_t body[MOST_BODY + 1] = {message->address, message->function};
     size_t len = put_body(find_function(framing, message->function)->request, message, body);
-    return close_frame(framing, body, len, out, room);
+    return close_frame(framing, message->transaction, body, len, out, room);
 }
 
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room)
@@ -377,7 +429,7 @@ int md_build_reply(int framing, const struct md_message *message, uint8_t *out, 
         body[1] |= EXCEPTION_BIT;
         body[2] = message->exception;
     }
-    return close_frame(framing, body, len, out, room);
+    return close_frame(framing, message->transaction, body, len, out, room);
 }
 
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
@@ -388,6 +440,8 @@ int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_me
     if (used <= 0)
         return used;
     begin_message(message, body[0], body[1]);
+    if (framing == MD_TCP)
+        message->transaction = md_get16(bytes);
     get_body(find_function(framing, body[1])->request, body, message);
     return used;
 }
@@ -404,6 +458,8 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
     if (!is_exception && !confirms(framing, body, request))
         return MD_BAD_ECHO;
     begin_message(reply, body[0], request->function);
+    if (framing == MD_TCP)
+        reply->transaction = md_get16(bytes);
     if (is_exception) {
         reply->exception = framing == MD_DELIXI ? body[1] : body[2];
         return used;
@@ -424,9 +480,16 @@ int md_reply_length(int framing, const struct md_message *request)
     const struct function *function = find_function(framing, request->function);
     int data = function->reply == DATA ? (int)data_bytes(function, request->count) : 0;
     int body = head_length(function->reply) + data;
-    if (request->address == 0)
+    if (!is_answered(framing, request->address))
         return 0;
-    return framing == MD_RTU ? body + 2 : 2 * body + 5;
+    if (framing == MD_RTU)
+        return body + 2;
+    return framing == MD_TCP ? MD_TCP_HEAD + body : 2 * body + 5;
+}
+
+int md_is_gateways(int framing, const struct md_message *reply)
+{
+    return framing == MD_TCP && (reply->exception == NO_PATH || reply->exception == NO_TARGET);
 }
 
 void md_copy_message(struct md_message *to, const struct md_message *from)

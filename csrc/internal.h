@@ -9,7 +9,7 @@
 /* cdef: begin */
 /* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
 
-enum { MD_RX_ROOM = 2 * MD_MOST_FRAME };
+enum { MD_RX_ROOM = 2 * MD_MOST_FRAME, MD_MOST_TCP = 260 };
 
 enum md_want {
     MD_DONE,  /* nothing: the completion is filled in */
@@ -60,6 +60,8 @@ struct md_line {
     uint8_t echo;        /* of the adapter (enum md_echo): learnt, never forgotten by failures */
     uint8_t echo_is_told; /* to be there, and is not unlearnt */
     uint8_t echo_due;    /* a copy of the request is still to come, and is not its reply */
+    uint8_t transactions; /* enum md_transactions; the line is told before its first exchange */
+    uint8_t is_out_of_step; /* what came is no header of Modbus TCP: the port is to be lost */
     uint8_t waited;      /* since the request left a wait was granted */
     uint32_t looks;      /* at the port, since then */
     uint32_t cut;        /* bytes of late replies, since then */
@@ -67,6 +69,9 @@ struct md_line {
     uint16_t burst;      /* most characters that wait in the adapter; 0: it may be a whole reply */
     uint8_t rx[MD_RX_ROOM];
     uint8_t long_tx[MD_MOST_FRAME]; /* of a request that its exchange does not keep */
+    uint16_t transaction;           /* of the last request */
+    uint16_t frame_len, frame_told; /* of a frame of Modbus TCP that is not whole; of these, reported */
+    uint8_t frame[MD_MOST_TCP];
 };
 
 /* Return the state that follows on an event; -1 where the event cannot happen. */
@@ -155,14 +160,16 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
 /* Append one row for each of the block's fields; return how many, 0 when there is no room. */
 int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
-/* The same to the newest chunk; a block that is NULL has no rows. */
+/* Return how many of the block's fields have no value in a good reply. */
+uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
+/* Append to the newest chunk; a block that is NULL has no rows. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */
 
 /* ---- frame.c, reason.c ---- */
 
-enum { MD_MOST_ADDRESS = 247 };
+enum { MD_MOST_ADDRESS = 247, MD_TCP_HEAD = 6 /* before the unit id, which is the address */ };
 
 enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08 };
 
@@ -185,6 +192,10 @@ static inline uint8_t *md_put16(uint8_t *at, unsigned value)
 /* Copy only the data that the message has: most are much shorter than the longest. */
 void md_copy_message(struct md_message *to, const struct md_message *from);
 int md_hex_byte(const uint8_t digits[2]); /* value of two upper-case hex digits; -1 where they are none */
+/* Return the length that a header of Modbus TCP announces, an enum md_frame_fault where it is none. */
+int md_tcp_length(const uint8_t *bytes, size_t len);
+/* A gateway has no path to the drive, or no reply from it: the drive itself said nothing. */
+int md_is_gateways(int framing, const struct md_message *reply);
 /* Return why these bytes, which came in place of the reply, are none: an enum md_frame_fault, MD_CUT_SHORT or
  * MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
@@ -215,6 +226,8 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns);
 int md_late_is_repeated(const struct md_exchange *exchange);
 /* The exchange under way is over, and its reply may still come: for so long in any order. */
 void md_late_expect(struct md_line *line, int64_t window_ns);
+/* The drive has requests whose replies may come on this line. */
+void md_late_link(struct md_line *line, struct md_drive *drive);
 /* Replies of this drive may still come to requests on another line, or before the port was lost. */
 void md_late_resume(struct md_line *line, struct md_drive *drive);
 /* Account for the late reply that begins there: its length, MD_INCOMPLETE, or MD_NO_START. Where it may
@@ -252,6 +265,34 @@ int md_reply_has_begun(const struct md_line *line);
 struct md_ending md_reply_missed(struct md_line *line);
 /* Recognise late replies among stray bytes, from here on. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
+
+/* Take the reply that was found there for this exchange's; 0: it was cut out as a late one. */
+int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
+                   struct md_ending *ending);
+void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply);
+/* A late reply came meanwhile: the reply may be as late. */
+void md_reply_extend(struct md_line *line);
+int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply);
+/* Take out what is no part of this exchange. */
+void md_reply_cut_out(struct md_line *line, size_t at, size_t len);
+
+/* Return the time that a frame takes on the drive's own wire, behind a gateway if there is one. */
+static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len)
+{
+    enum { LONGER_THAN_RTU = 4 }; /* six bytes before it, and no CRC of two */
+    return (exchange->framing == MD_TCP ? len - LONGER_THAN_RTU : len) * exchange->character_ns;
+}
+
+/* ---- tcp.c: frames of Modbus TCP, a stream, and whose replies they are ---- */
+
+/* Give the request that is about to leave a transaction of its own. */
+void md_tcp_begin(struct md_line *line);
+/* Take in bytes, up to the end of a frame; return how many. */
+size_t md_tcp_put(struct md_line *line, const uint8_t *bytes, size_t len);
+/* Look at the frame, if it is whole; 1: the exchange ends. */
+int md_tcp_find(struct md_line *line, int64_t now_ns, struct md_ending *ending);
+/* End the exchange at its time-out. */
+struct md_ending md_tcp_missed(struct md_line *line);
 
 /* ---- echo.c: adapters that repeat what they send ---- */
 

@@ -233,7 +233,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
 
 /* ---- what is outstanding ---- */
 
-static void link_drive(struct md_line *line, struct md_drive *drive)
+void md_late_link(struct md_line *line, struct md_drive *drive)
 {
     for (const struct md_drive *owing = line->late; owing; owing = owing->next_late)
         if (owing == drive)
@@ -263,13 +263,13 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
     if (owed)
         add_time(owed, line->quiet_ns);
     drive->late_until_ns = later(until_ns, drive->late_until_ns);
-    link_drive(line, drive);
+    md_late_link(line, drive);
 }
 
 void md_late_resume(struct md_line *line, struct md_drive *drive)
 {
     if (drive->owed_count)
-        link_drive(line, drive);
+        md_late_link(line, drive);
 }
 
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before)

@@ -106,13 +106,23 @@ static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
     size_t at = ending.at, len = ending.len;
-    if (ending.result <= 0 && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
+    int may_be_echo = ending.result <= 0 && !line->transactions && line->tx_len > 0;
+    if (may_be_echo && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
         at += line->tx_len; /* the adapter's echo */
         len -= line->tx_len;
     }
     tap(line, MD_NOISE, completion->first_ns, line->rx, at);
     tap(line, ending.result > 0 ? MD_ANSWERING : MD_FAILED, completion->first_ns, line->rx + at, len);
     tap(line, MD_NOISE, completion->last_ns, line->rx + at + len, line->rx_len - at - len);
+}
+
+/* A network needs none. Where replies have no ids to be told by, it shows whether more is to come, such as a
+ * second copy, which could otherwise be taken for the next reply. */
+static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
+{
+    enum { CHARACTERS = 4 };
+    int64_t least_ns = line->transactions == MD_IGNORED ? CHARACTERS * exchange->character_ns : 0;
+    return later(least_ns, exchange->silence_ns);
 }
 
 static void finish(struct md_line *line, struct md_ending ending)
@@ -126,8 +136,10 @@ static void finish(struct md_line *line, struct md_ending ending)
     memcpy(completion->raw, line->rx + ending.at + cut, completion->raw_len);
     line->rx_len = line->rx_from = 0;
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
+    if (line->transactions && completion->last_ns) /* a network takes the next request at once */
+        line->quiet_ns = completion->last_ns;
     if (completion->sent_ns) /* else the silence after what went before still holds */
-        line->silence_ns = line->exchange->silence_ns;
+        line->silence_ns = silence_of(line, line->exchange);
     go(line, MD_ENDED);
     count(line->exchange, completion);
 }
@@ -142,7 +154,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
 {
     if (line->state == IDLE)
         return;
-    if (line->state >= AWAITING)
+    if (line->state >= AWAITING && line->transactions != MD_MATCHED)
         md_late_expect(line, md_window_ns(line->exchange)); /* the port may be back before it comes */
     line->completion->error = error;
     fail(line, result);
@@ -152,21 +164,26 @@ void md_line_abandon(struct md_line *line, int result, int error)
 
 void md_line_init(struct md_line *line, int64_t now_ns)
 {
-    *line = (struct md_line){.state = IDLE, .quiet_ns = now_ns};
+    *line = (struct md_line){.state = IDLE, .quiet_ns = now_ns, .transaction = (uint16_t)(now_ns >> 16)};
 }
 
 /* Find the request's bytes: an exchange keeps short ones. 0, or a result. */
 static int load(struct md_line *line, const struct md_exchange *exchange)
 {
+    int is_tcp = exchange->framing == MD_TCP;
+    if (is_tcp != (line->transactions != MD_NO_TRANSACTIONS))
+        return MD_BAD_REQUEST; /* it would be a frame of another meaning */
     line->tx = exchange->frame;
     line->tx_len = exchange->frame_len;
-    if (line->tx_len)
+    if (line->tx_len && !is_tcp)
         return 0;
     int length = md_build_request(exchange->framing, &exchange->request, line->long_tx, sizeof line->long_tx);
     if (length < 0)
         return length;
     line->tx = line->long_tx;
     line->tx_len = (uint16_t)length;
+    if (is_tcp)
+        md_tcp_begin(line);
     return 0;
 }
 
@@ -179,8 +196,8 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = 0;
-    line->echo_due = line->echo != MD_NO_ECHO;
-    line->silence_ns = later(line->silence_ns, exchange->silence_ns);
+    line->echo_due = line->echo != MD_NO_ECHO && !line->transactions;
+    line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
     go(line, MD_BEGUN);
     md_late_resume(line, exchange->drive);
@@ -202,7 +219,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         go(line, MD_NOTHING_CAME);
         line->rx_len = line->rx_from = 0;
         line->wake_ns =
-            now_ns + line->exchange->drive->most_timeout_ns + line->tx_len * line->exchange->character_ns;
+            now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
     case READY:
     case WRITING: /* a port that takes nothing is a broken port */
@@ -222,7 +239,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             go(line, MD_TIME_OUT);
         return MD_READ;
     case LAST_LOOK:
-        finish(line, md_reply_missed(line));
+        finish(line, line->transactions ? md_tcp_missed(line) : md_reply_missed(line));
         return MD_DONE;
     default:
         return MD_DONE;
@@ -239,7 +256,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
         line->rx_len = 0;
     }
     md_tap_put(line->tap, MD_ASKING, begun_ns, line->tx + line->tx_at, len);
-    line->quiet_ns = later(line->quiet_ns, now_ns) + (int64_t)len * exchange->character_ns;
+    line->quiet_ns = later(line->quiet_ns, now_ns) + md_wire_ns(exchange, (int64_t)len);
     line->tx_at = (uint16_t)(line->tx_at + len);
     go(line, line->tx_at < line->tx_len ? MD_PART_LEFT : MD_ALL_LEFT);
     if (line->state == WRITING)
@@ -295,12 +312,45 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     md_reply_find_late(line, 0, now_ns);
 }
 
+/* Frames of Modbus TCP. What is not awaited puts nothing off where it is told by its id. */
+static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
+{
+    struct md_ending ending;
+    if (line->state < AWAITING && line->transactions == MD_IGNORED) {
+        line->quiet_ns = later(line->quiet_ns, now_ns);
+        if (line->state == IDLE || now_ns < line->give_up_ns)
+            go(line, MD_STRAY_BYTES);
+    }
+    while (len > 0 && !line->is_out_of_step) {
+        if (line->state >= AWAITING) {
+            line->completion->last_ns = now_ns;
+            if (line->completion->first_ns == 0)
+                line->completion->first_ns = now_ns;
+        }
+        size_t taken = md_tcp_put(line, bytes, len);
+        bytes += taken;
+        len -= taken;
+        if (md_tcp_find(line, now_ns, &ending))
+            finish(line, ending);
+    }
+    if (line->state < AWAITING) /* behind what is out of step */
+        md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
+    for (size_t at = 0; at < len && line->state >= AWAITING;) /* it may tell what is spoken there */
+        at += keep(line, bytes + at, len - at);
+    if (line->state != IDLE && now_ns < line->give_up_ns)
+        go(line, MD_BYTES_IN_TIME);
+}
+
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_completion *completion = line->completion;
     struct md_ending ending;
     if (len == 0)
         return;
+    if (line->transactions) {
+        take_frames(line, bytes, len, now_ns);
+        return;
+    }
     if (line->state < AWAITING) {
         take_stray(line, bytes, len, now_ns);
         return;

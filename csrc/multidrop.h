@@ -13,13 +13,14 @@ enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
-    MD_STATUSES = 18,         /* of a row without an exception */
+    MD_STATUSES = 19,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
     MD_TIMES_KEPT = 6,        /* of the same request */
-    MD_MOST_NUMBERS = 65536   /* of a row queue's ports */
+    MD_MOST_NUMBERS = 65536,  /* of a row queue's ports */
+    MD_MOST_INVALID = 8       /* counts of a register that mean no value */
 };
 
 /* ---- checksum.c: return the checksum ---- */
@@ -30,7 +31,7 @@ uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's own: the sum's 
 
 /* ---- frame.c: return the frame's length (> 0), or an enum md_frame_fault (<= 0) ---- */
 
-enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI };
+enum md_framing { MD_RTU, MD_ASCII, MD_DELIXI, MD_TCP };
 
 /* The reason why bytes are no frame. */
 enum md_frame_fault {
@@ -52,9 +53,11 @@ enum md_frame_fault {
  *   0F, 10    request start, count, data   reply start, count
  *   Delixi's  function is K, start is P1P0, data is D3..D0 (4 bytes); a reply to K = 03 carries
  *             its value in P1P0, and has it in data too
- * `exception` is 0, or the code of an exception reply; of Delixi's protocol K = F0, FC..FF. */
+ * `exception` is 0, or the code of an exception reply; of Delixi's protocol K = F0, FC..FF. `transaction` is
+ * the id in a frame of Modbus TCP, whose address is any unit id. */
 struct md_message {
     uint8_t address, function, exception;
+    uint16_t transaction;
     uint16_t start, count;
     uint16_t data_len;
     uint8_t data[MD_MOST_DATA];
@@ -65,7 +68,7 @@ int md_build_request(int framing, const struct md_message *message, uint8_t *out
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room);
 /* Parse a request to any address at the beginning of `bytes`. */
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message);
-/* Parse the reply to `request` at the beginning of `bytes`. */
+/* Parse the reply to `request`, whatever its transaction, at the beginning of `bytes`. */
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                    struct md_message *reply);
 /* Return the length of the good reply to `request`; 0 after a broadcast. */
@@ -101,28 +104,50 @@ int64_t md_utc_minus_monotonic_ns(void);
 /* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
 
 enum md_number_format {
-    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_SWAPPED, MD_I32_SWAPPED, MD_U32_EITHER, MD_F32,
-    MD_F32_SWAPPED, MD_BIT
+    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
+    MD_I8, /* the low byte of a word */
+    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32,
+    MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
+    MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
 };
 
-/* Read the number at word (MD_BIT: bit) `at` of a reply's data. */
+/* Read the number at word (MD_BIT: bit) `at` of a reply's data: none where a BCD digit is above 9. */
 double md_value(const uint8_t *data, size_t len, size_t at, int format);
 
 /* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
 struct md_field {
     uint16_t at;
     uint8_t format; /* enum md_number_format */
-    uint16_t reg; /* code of its name */
+    uint16_t reg;   /* code of its name */
+    uint16_t extra; /* 0: none; else it is the block's extra[extra - 1] */
     double multiplier, divisor;
+};
+
+/* Bits of a number that mean that there is no value: bits & mask == pattern. */
+struct md_invalid {
+    uint64_t mask, pattern;
+};
+
+/* The rest of a field, which few have. */
+struct md_extra {
+    double addend;         /* value = (raw * multiplier + addend) / divisor */
+    uint8_t low, bits;     /* raw is so many bits of the number, from this one on; bits 0: the number */
+    uint8_t scale_format;  /* of the number whose power of ten it is multiplied by, at word scale_at; */
+    uint8_t has_scale;     /* beyond 10^-22 to 10^22 there is no value */
+    uint16_t scale_at;
+    uint8_t invalid_count, scale_invalid_count; /* the scale's follow on the number's own */
+    struct md_invalid invalid[MD_MOST_INVALID];
 };
 
 /* The fields of a drive's reply. Drives of a kind share them. */
 struct md_block {
     const struct md_field *fields;
+    const struct md_extra *extra;
     int count;
     uint32_t refusals; /* exceptions in a row */
     uint32_t failures; /* exchanges in a row without a reply, or with a bad one */
     uint8_t refusal;   /* the last one's code */
+    uint8_t may_lack;  /* a good reply may hold no value for some field */
     uint8_t is_answered; /* a good reply came once that was no exception */
     uint16_t drive;    /* code of its name */
 };
@@ -131,6 +156,7 @@ struct md_block {
 enum md_status {
     MD_OK = 0,
     MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
+    MD_NO_VALUE = 18,  /* the reply holds what the device gives in place of a value: NaN, an invalid count */
     MD_EXCEPTION = 256 /* + the exception's code */
 };
 
@@ -175,6 +201,13 @@ struct md_owed {
     uint8_t data[4];
 };
 
+/* A request of Modbus TCP whose reply may still come. */
+struct md_unanswered {
+    int64_t sent_ns;
+    uint16_t transaction;
+    uint8_t address;
+};
+
 /* The same in parts, and requests whose replies may still come. */
 struct md_history {
     uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
@@ -183,6 +216,7 @@ struct md_history {
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* values, by exception code */
     struct md_owed owed[MD_MOST_OWED];
+    struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest first */
 };
 
 /* A drive: the bounds of its time-out and its interval are given, the rest is learnt from its exchanges and
@@ -196,7 +230,7 @@ struct md_drive {
     int64_t answered_ns;            /* requests that left before then are answered, or never will be */
     int64_t interval_ns, ready_ns;  /* from the end of an exchange to its next request; not before then */
     uint32_t failures;              /* in a row */
-    uint32_t owed_count, proof_count;
+    uint32_t owed_count, unanswered_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
     struct md_history *history;     /* apart: an exchange touches fewer pages */
@@ -212,6 +246,13 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 /* ---- engine.c, port_api.c: return NULL and set errno on failure; counts and flags else ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
+
+/* The framing of a port's exchanges. */
+enum md_transactions {
+    MD_NO_TRANSACTIONS, /* any but MD_TCP */
+    MD_MATCHED,         /* MD_TCP: a reply has its request's id */
+    MD_IGNORED          /* MD_TCP through a gateway that replies with ids of its own */
+};
 
 /* One request with all that is needed to carry it out; constant while in use. What every exchange needs comes
  * first: with many lines each cache line of it is read from memory. */
@@ -243,7 +284,7 @@ struct md_exchange {
 enum md_failure {
     MD_CUT_SHORT = -9,         /* a reply began and did not end within the time-out */
     MD_NO_REPLY = -10,         /* nothing came within the time-out, but at most the request's echo */
-    MD_LINE_LOST = -11,        /* the port failed: `error` is the errno, 0 at end of file */
+    MD_LINE_LOST = -11,        /* the port failed: errno in `error`, 0 at end of file, EPROTO: no MD_TCP */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
     MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
     MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came first */
@@ -282,9 +323,10 @@ struct md_tap;
 
 struct md_engine *md_engine_start(void); /* the thread for every line of the process; it ends with that */
 
-/* `must_take`: the refusals (enum md_refusal) that are failures; -1: a port without settings. `room` for
- * queued exchanges is a power of two. */
-struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room);
+/* `must_take`: the refusals (enum md_refusal) that are failures; -1: a port without settings. `transactions`:
+ * enum md_transactions. `room` for queued exchanges is a power of two. */
+struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
+                             unsigned room);
 /* Put all that goes over the line into `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Begin nothing more of what is queued or repeated, but still urgent exchanges. Return 1 while one of the
@@ -383,6 +425,7 @@ struct md_stream {
     struct md_piece *pieces;
     size_t len, room, count, most; /* of the bytes, of the pieces */
     int is_all;                    /* nothing more will come */
+    int is_tcp;                    /* all frames are MD_TCP's; else none is */
 };
 
 enum md_kind {

@@ -26,7 +26,8 @@ void md_port_free(struct md_port *port)
     free(port);
 }
 
-struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, unsigned room)
+struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
+                             unsigned room)
 {
     struct md_port *port = new_port(room);
     if (!port) {
@@ -36,6 +37,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, un
     port->engine = engine;
     port->fd = fd;
     port->must_take = must_take;
+    port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
     /* Raw before it is first read: a terminal at VMIN 0 looks like one that hung up. */
     struct md_settings settings;

@@ -37,9 +37,11 @@ int64_t md_port_receive(struct md_port *port)
     ssize_t got = read(port->fd, bytes, sizeof bytes);
     int64_t now_ns = md_now_ns();
     port->is_empty = got < (ssize_t)sizeof bytes;
-    if (got > 0)
+    if (got > 0) {
         md_line_received(&port->turn.line, bytes, (size_t)got, now_ns);
-    else if (got == 0)
+        if (port->turn.line.is_out_of_step)
+            lose(port, EPROTO);
+    } else if (got == 0)
         lose(port, 0);
     else if (!is_transient(errno))
         lose(port, errno);

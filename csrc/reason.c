@@ -18,14 +18,23 @@ static int weight(int reason)
     return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
 }
 
+/* Where a header is damaged nothing behind it is known. */
+static size_t next_at(int framing, const uint8_t *bytes, size_t len)
+{
+    int whole = framing == MD_TCP ? md_tcp_length(bytes, len) : 1;
+    return whole > 0 ? (size_t)whole : len;
+}
+
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len)
 {
     struct md_message reply;
     int reason = len ? MD_INCOMPLETE : MD_NO_REPLY;
-    for (size_t at = 0; at < len; at++) {
+    for (size_t at = 0; at < len; at += next_at(framing, bytes + at, len - at)) {
         int why = md_parse_reply(framing, bytes + at, len - at, request, &reply);
         if (why == MD_INCOMPLETE)
             why = MD_CUT_SHORT;
+        if (why > 0 && md_is_gateways(framing, &reply))
+            return MD_NO_REPLY;
         if (weight(why) > weight(reason))
             reason = why;
     }

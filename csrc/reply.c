@@ -8,7 +8,7 @@
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
 static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* of a row's value */
 
-static int parse_at(const struct md_line *line, size_t at, struct md_message *reply)
+int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
     const struct md_exchange *exchange = line->exchange;
     int used = md_parse_reply(exchange->framing, line->rx + at, line->rx_len - at, &exchange->request, reply);
@@ -21,7 +21,7 @@ void md_reply_await(struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
     const struct md_drive *drive = exchange->drive;
-    int64_t reply_ns = reply_len * exchange->character_ns, timeout_ns = md_timeout_ns(exchange);
+    int64_t reply_ns = md_wire_ns(exchange, reply_len), timeout_ns = md_timeout_ns(exchange);
     line->give_up_ns = line->quiet_ns + timeout_ns + reply_ns;
     line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
@@ -61,11 +61,10 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns)
         line->ready_ns = now_ns + (missing - 1) * exchange->character_ns;
 }
 
-/* A late reply came meanwhile: the reply may be as late. */
-static void extend(struct md_line *line)
+void md_reply_extend(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
-    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    int64_t reply_ns = md_wire_ns(exchange, md_reply_length(exchange->framing, &exchange->request));
     line->give_up_ns = later(line->give_up_ns, line->quiet_ns + md_timeout_ns(exchange) + reply_ns);
     line->begun_by_ns = line->give_up_ns;
 }
@@ -78,7 +77,7 @@ static void measure(struct md_line *line, int reply_len)
     const struct md_exchange *exchange = line->exchange;
     struct md_completion *completion = line->completion;
     struct md_drive *drive = exchange->drive;
-    int64_t request_ns = line->tx_len * exchange->character_ns, reply_ns = reply_len * exchange->character_ns;
+    int64_t request_ns = md_wire_ns(exchange, line->tx_len), reply_ns = md_wire_ns(exchange, reply_len);
     int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
     /* Characters that follow each other tell better when the first came than a late look at them. */
     completion->first_ns = sooner(completion->first_ns, later(begun_ns + exchange->character_ns, left_ns));
@@ -86,7 +85,8 @@ static void measure(struct md_line *line, int reply_len)
     int64_t delay_ns = md_learn_delay(drive, later(begun_ns - left_ns, 0), is_whole, exchange->character_ns);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
     /* A port that is faster than its settings, such as a network's, needs no more than it took. */
-    int64_t took_ns = line->silence_ns + later(completion->last_ns, left_ns) - completion->sent_ns;
+    int64_t ended_ns = line->transactions ? completion->last_ns : later(completion->last_ns, left_ns);
+    int64_t took_ns = line->silence_ns + ended_ns - completion->sent_ns;
     md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
 }
 
@@ -98,21 +98,22 @@ static void learn_burst(struct md_line *line, size_t at, int reply_len)
         line->burst = line->sight;
 }
 
-static void accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
+static inline void accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
 {
     if (!line->exchange->insists)
         line->exchange->drive->answered_ns = line->quiet_ns;
     md_copy_message(&line->completion->reply, reply);
     line->completion->skipped -= (uint32_t)used;
-    md_echo_learn(line, at);
-    learn_burst(line, at, used);
+    if (!line->transactions) {
+        md_echo_learn(line, at);
+        learn_burst(line, at, used);
+    }
     measure(line, used);
 }
 
 /* ---- late replies ---- */
 
-/* Take out what is no part of this exchange. */
-static void cut_out(struct md_line *line, size_t at, size_t len)
+void md_reply_cut_out(struct md_line *line, size_t at, size_t len)
 {
     md_tap_put(line->tap, MD_NOISE, line->completion->last_ns, line->rx + at, len);
     line->cut += (uint32_t)len;
@@ -138,7 +139,7 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
 {
     struct md_completion *completion = line->completion;
     const struct md_block *block = line->exchange->block;
-    int64_t request_ns = line->tx_len * line->exchange->character_ns;
+    int64_t request_ns = md_wire_ns(line->exchange, line->tx_len);
     int is_row = since_ns && block && block->count > 0 && now_ns - since_ns < OLDEST_IN_DOUBT;
     md_late_expect(line, 0);
     if (!is_row) {
@@ -148,7 +149,7 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
     md_copy_message(&completion->reply, reply);
     completion->skipped -= (uint32_t)used;
     completion->sent_ns = since_ns - request_ns;
-    md_counters_answer(line->exchange->drive, 0, request_ns + used * line->exchange->character_ns);
+    md_counters_answer(line->exchange->drive, 0, request_ns + md_wire_ns(line->exchange, used));
     return (struct md_ending){used, at, (size_t)used};
 }
 
@@ -156,34 +157,42 @@ static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
 
 enum found { NOTHING, SKIPPED, ENDED }; /* SKIPPED: look at the same place again, or behind an echo */
 
+/* Decide whether it is this exchange's, or a late one. */
+static inline int is_its_reply(struct md_line *line, size_t at, int used, const struct md_message *reply,
+                               int64_t now_ns, struct md_ending *ending)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int64_t since_ns;
+    int is_late = !exchange->insists && exchange->drive->owed_count &&
+                  md_late_take(line, at, now_ns, &since_ns) > 0;
+    if (!is_late) {
+        accept(line, at, used, reply);
+        *ending = (struct md_ending){used, at, (size_t)used};
+        return 1;
+    }
+    /* Whichever request it answers, it took that long. */
+    md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
+    md_reply_extend(line);
+    if (md_is_read(exchange->framing, exchange->request.function)) {
+        *ending = end_in_doubt(line, at, used, reply, now_ns, since_ns);
+        return 1;
+    }
+    md_reply_cut_out(line, at, (size_t)used);
+    return 0;
+}
+
 /* The bytes there could be the reply: decide whether they are its echo or a late reply instead. */
 static enum found judge(struct md_line *line, size_t *at, int used, const struct md_message *reply,
                         int64_t now_ns, struct md_ending *ending)
 {
-    const struct md_exchange *exchange = line->exchange;
-    int64_t since_ns;
     if (line->echo_due && md_echo_is_copy(line, *at)) {
         line->echo_due = 0; /* the adapter's, or it cannot be told from that */
         *at += line->tx_len;
         return SKIPPED;
     }
-    int is_late = !exchange->insists && exchange->drive->owed_count &&
-                  md_late_take(line, *at, now_ns, &since_ns) > 0;
-    if (!is_late) {
-        accept(line, *at, used, reply);
-        *ending = (struct md_ending){used, *at, (size_t)used};
-        return ENDED;
-    }
-    /* Whichever request it answers, it took that long. */
-    md_learn_lateness(exchange->drive, now_ns - line->quiet_ns, 0);
-    extend(line);
-    if (md_is_read(exchange->framing, exchange->request.function)) {
-        *ending = end_in_doubt(line, *at, used, reply, now_ns, since_ns);
-        return ENDED;
-    }
-    cut_out(line, *at, (size_t)used);
-    return SKIPPED;
+    return is_its_reply(line, *at, used, reply, now_ns, ending) ? ENDED : SKIPPED;
 }
+
 
 /* Look at every place where the reply may still begin. A late reply is looked for only where what precedes it
  * cannot be the reply's beginning: it may be the inside of the reply. */
@@ -192,7 +201,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
     struct md_message reply;
     size_t at = line->rx_from, first_open = SIZE_MAX;
     while (at < line->rx_len) {
-        int used = parse_at(line, at, &reply);
+        int used = md_reply_parse(line, at, &reply);
         if (used > 0 && line->echo_due && md_echo_may_follow(line, at))
             used = MD_INCOMPLETE;
         if (used > 0) {
@@ -206,8 +215,8 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
         if (used != MD_INCOMPLETE && first_open == SIZE_MAX)
             used = md_late_take(line, at, now_ns, NULL);
         if (used > 0) {
-            extend(line);
-            cut_out(line, at, (size_t)used);
+            md_reply_extend(line);
+            md_reply_cut_out(line, at, (size_t)used);
             continue;
         }
         if (used == MD_INCOMPLETE && first_open == SIZE_MAX)
@@ -216,6 +225,19 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
     }
     line->rx_from = first_open < line->rx_len ? (uint16_t)first_open : line->rx_len;
     return 0;
+}
+
+/* ---- the same for frames that were found by their headers ---- */
+
+int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
+                   struct md_ending *ending)
+{
+    return is_its_reply(line, at, used, reply, now_ns, ending);
+}
+
+void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply)
+{
+    accept(line, at, used, reply);
 }
 
 /* ---- no reply ---- */
@@ -239,8 +261,8 @@ struct md_ending md_reply_missed(struct md_line *line)
     struct md_message reply;
     size_t begin = md_echo_is_copy(line, 0) ? line->tx_len : 0; /* the adapter's echo says nothing */
     int is_alone = begin > 0 && begin == line->rx_len;
-    int is_doubtful = is_alone && md_echo_learn_alone(line, parse_at(line, 0, &reply) > 0);
-    int first = begin == line->rx_len ? MD_NO_REPLY : parse_at(line, begin, &reply);
+    int is_doubtful = is_alone && md_echo_learn_alone(line, md_reply_parse(line, 0, &reply) > 0);
+    int first = begin == line->rx_len ? MD_NO_REPLY : md_reply_parse(line, begin, &reply);
     /* With others outstanding it may be the answer to one of them. */
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))
         md_late_expect(line, md_window_ns(exchange));

@@ -21,6 +21,8 @@ static size_t end_of_run(const struct md_stream *stream, size_t piece)
 
 static int is_start(int framing, uint8_t first)
 {
+    if (framing == MD_TCP)
+        return 1;
     return framing == MD_RTU ? first <= MD_MOST_ADDRESS : first == ':';
 }
 
@@ -49,7 +51,7 @@ static int find_request(int framing, const uint8_t *bytes, size_t len, struct md
         return used;
     if (framing == MD_DELIXI && !is_delixi_request(message))
         return MD_BAD_FUNCTION;
-    return message->address > MD_MOST_ADDRESS ? MD_BAD_ADDRESS : used;
+    return framing != MD_TCP && message->address > MD_MOST_ADDRESS ? MD_BAD_ADDRESS : used;
 }
 
 enum { HEAD = 6 };
@@ -58,6 +60,11 @@ enum { HEAD = 6 };
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
     memset(head, 0, HEAD);
+    if (framing == MD_TCP) {
+        for (size_t i = 0; i < HEAD && MD_TCP_HEAD + i < len; i++)
+            head[i] = bytes[MD_TCP_HEAD + i];
+        return;
+    }
     for (size_t i = 0; framing == MD_RTU && i < HEAD && i < len; i++) /* memcpy() would be slower */
         head[i] = bytes[i];
     for (size_t i = 0; framing != MD_RTU && i < HEAD && 2 * i + 2 < len; i++) {
@@ -92,10 +99,12 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
 
 /* Find the frame that begins here: return its length, and set its kind, framing and message in `span`.
  * `least` is MD_INCOMPLETE as long as more bytes may come, and 1 when these are all. */
-static int find_frame(const struct md_splitter *splitter, int side, const uint8_t *bytes, size_t len,
-                      int least, struct md_span *span)
+static int find_frame(const struct md_splitter *splitter, int is_tcp, int side, const uint8_t *bytes,
+                      size_t len, int least, struct md_span *span)
 {
-    static const int framings[] = {MD_ASCII, MD_DELIXI, MD_RTU};
+    static const int serial[] = {MD_ASCII, MD_DELIXI, MD_RTU}, network[] = {MD_TCP};
+    const int *framings = is_tcp ? network : serial;
+    int count = is_tcp ? 1 : 3;
     struct md_message *message = &span->message;
     int used, may_be_copy = !splitter->is_in_step && side != MD_ASKING;
     if (splitter->awaited && side != MD_ASKING) {
@@ -105,7 +114,7 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
         if (used >= least)
             return used;
     }
-    for (int i = 0; i < 3 && side != MD_ANSWERING; i++) {
+    for (int i = 0; i < count && side != MD_ANSWERING; i++) {
         int framing = span->framing = framings[i];
         if (is_start(framing, bytes[0]) && (used = find_request(framing, bytes, len, message)) >= least) {
             int is_either = used > 0 && may_be_copy && is_echoed(framing, message->function);
@@ -114,7 +123,7 @@ static int find_frame(const struct md_splitter *splitter, int side, const uint8_
         }
     }
     span->kind = MD_STRAY;
-    for (int i = 0; i < 3 && side != MD_ASKING; i++) {
+    for (int i = 0; i < count && side != MD_ASKING; i++) {
         int framing = span->framing = framings[i];
         if (is_start(framing, bytes[0]) && (used = find_reply(framing, bytes, len, message)) >= least)
             return used;
@@ -133,7 +142,7 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
         return;
     md_copy_message(&splitter->request, &span->message);
     splitter->framing = span->framing;
-    splitter->awaited = span->message.address != 0;
+    splitter->awaited = span->message.address != 0 || span->framing == MD_TCP;
 }
 
 /* Whoever captured these bytes says that they are no frames. */
@@ -151,7 +160,7 @@ static int look_at(const struct md_splitter *splitter, const struct md_stream *s
     int is_due = (at == splitter->at && splitter->junk == 0) || (piece->at == at && piece->is_after_pause);
     size_t limit = is_due ? stream->len : end;
     int least = limit < stream->len || stream->is_all ? 1 : MD_INCOMPLETE;
-    return find_frame(splitter, piece->side, stream->bytes + at, limit - at, least, span);
+    return find_frame(splitter, stream->is_tcp, piece->side, stream->bytes + at, limit - at, least, span);
 }
 
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span)

@@ -3,13 +3,18 @@
  * The blocks that describe a pcapng file's interfaces are rare, and the caller's to read. */
 #include "internal.h"
 
+#include <string.h>
+
 enum {
     RECORD_HEAD = 16, /* of pcap */
     LEAST_BLOCK = 12, /* of pcapng */
     MOST_PACKET = 1 << 16,
     RTAC_HEADER = 12,
+    TAG_DISSECTOR = 12,
     TAG_PORT_OF_SENDER = 25
 };
+
+static const char tcp_dissector[] = "mbtcp"; /* Wireshark's name for Modbus TCP */
 
 /* The senders' ports in captures of ours. */
 static const struct { uint32_t port; uint8_t side; } senders[] = {
@@ -25,9 +30,10 @@ static uint32_t number(const struct md_capture *capture, const uint8_t *at)
     return value;
 }
 
-/* Skip what a link type puts before a frame; its tags tell who sent it. */
-static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint8_t *side)
+/* Skip what a link type puts before a frame; its tags tell who sent it, and by what rules. */
+static size_t skip_header(struct md_channel *channel, const uint8_t *packet, size_t len, uint8_t *side)
 {
+    uint32_t link = channel->link;
     if (link == MD_LINK_RTAC) {
         if (len > RTAC_HEADER && (packet[8] == 1 || packet[8] == 2)) /* data sent, data received */
             *side = packet[8] == 1 ? MD_ASKING : MD_ANSWERING;
@@ -40,6 +46,9 @@ static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint
         at += 4;
         if (tag == 0)
             return at;
+        if (tag == TAG_DISSECTOR && size >= sizeof tcp_dissector - 1 && at + size <= len &&
+            memcmp(packet + at, tcp_dissector, sizeof tcp_dissector - 1) == 0)
+            channel->stream.is_tcp = 1;
         for (size_t i = 0; tag == TAG_PORT_OF_SENDER && size == 4 && at + 4 <= len && i < 4; i++)
             if (((uint32_t)md_get16(packet + at) << 16 | md_get16(packet + at + 2)) == senders[i].port)
                 *side = senders[i].side;
@@ -52,7 +61,7 @@ static size_t skip_header(uint32_t link, const uint8_t *packet, size_t len, uint
 static int put(struct md_channel *channel, const uint8_t *packet, size_t len, uint64_t ticks)
 {
     struct md_piece piece = {.is_after_pause = 1};
-    size_t header = skip_header(channel->link, packet, len, &piece.side);
+    size_t header = skip_header(channel, packet, len, &piece.side);
     if (header >= len)
         return 1;
     if (!channel->has_sides)

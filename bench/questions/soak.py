@@ -24,12 +24,13 @@ from bench.players import plants
 from bench.support import tables
 from multidrop.bus import Bus
 from multidrop.errors import BusError
-from multidrop.plant.loader import load_plant, parse_duration
+from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Batch, Row
 from multidrop.recording import open_reader, open_writer
 from multidrop.sim import load_faults
+from multidrop.toml_check import parse_duration
 
 PLAYERS = Path(__file__).parents[1] / "players"
 MOST_GROWTH_KB = 2048  # of resident memory, from the end of the first period on

@@ -12,6 +12,7 @@ from docutils.parsers.rst import Directive
 
 from multidrop.cli import COMMANDS, main
 from multidrop.drives import MODELS
+from multidrop.drives.registry import SHIPPED
 
 WIDTH = "92"
 
@@ -73,7 +74,7 @@ class Models(Sections):
     """Each family's register table."""
 
     def names(self) -> list[str]:
-        return list(MODELS)
+        return [*MODELS, *SHIPPED]
 
     def title(self, name: str) -> str:
         return name

@@ -19,7 +19,6 @@ from multidrop.drive import Option as Option
 from multidrop.drive import Script as Script
 from multidrop.drive import State as State
 from multidrop.drive import insist as insist
-from multidrop.drive import read as read
 from multidrop.drive import until as until
 from multidrop.drive import verb as verb
 from multidrop.drive import wait as wait
@@ -38,6 +37,8 @@ from multidrop.drive.register import Table as Table
 from multidrop.drive.register import command as command
 from multidrop.drive.register import reading as reading
 from multidrop.drive.register import setting as setting
+from multidrop.drive.text import Text as Text
+from multidrop.drive.text import text as text
 from multidrop.drives import YD1000 as YD1000
 from multidrop.drives import DelixiModbus as DelixiModbus
 from multidrop.drives import DelixiNative as DelixiNative
@@ -53,11 +54,14 @@ from multidrop.errors import NoReply as NoReply
 from multidrop.errors import NoSuchPort as NoSuchPort
 from multidrop.errors import NotAttached as NotAttached
 from multidrop.errors import NotDone as NotDone
+from multidrop.errors import NoValue as NoValue
 from multidrop.errors import Overtaken as Overtaken
 from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
+from multidrop.family_file.loader import FamilyError as FamilyError
+from multidrop.family_file.loader import load_family as load_family
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant
 from multidrop.plant.model import Plant as Plant
@@ -67,9 +71,12 @@ from multidrop.plant.model import PolledDrive as PolledDrive
 from multidrop.poller import Poller as Poller
 from multidrop.polling.batch import Batch as Batch
 from multidrop.polling.batch import Row as Row
+from multidrop.polling.wide import WideRows as WideRows
 from multidrop.recording import convert as convert
 from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer
+from multidrop.recording.format import RecordingReader as RecordingReader
+from multidrop.recording.reading import read as read
 from multidrop.transport.statistics import Delays as Delays
 from multidrop.transport.statistics import Diagnostics as Diagnostics
 from multidrop.transport.statistics import LineStatistics as LineStatistics

@@ -17,15 +17,16 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import check_own
+from multidrop.control.rules import check_own, check_own_text
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
-from multidrop.core import Echo, Message, Peer
+from multidrop.core import Echo, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
+from multidrop.drive.text import Text
 from multidrop.errors import BusError
 from multidrop.transport.exchange import READ_ATTEMPTS, Exchanges
 from multidrop.transport.line import Line
@@ -40,7 +41,9 @@ _log = logging.getLogger("multidrop.bus")
 class Bus:
     """A line and the drives on it, which may differ in family, baud rate and format.
 
-    `port` is a device such as /dev/ttyUSB0 or any pyserial URL; `baudrate` and `format` replace the
+    `port` is a device such as /dev/ttyUSB0, any pyserial URL, or tcp://10.0.0.7:502 for Modbus TCP, which all
+    drives on such a port then speak; `transaction` is "ignore" where its gateway replies with transaction ids
+    of its own. `baudrate` and `format` replace the
     families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
     t3.5 between frames, if all of them bear it. `echo` says that the adapter repeats what it sends: "on",
     "off" (until it does), or "auto", to find out. Raises LineError when the port cannot be opened. Writes
@@ -65,6 +68,7 @@ class Bus:
         format: str | None = None,
         silence: float | None = None,
         echo: str = "auto",
+        transaction: str = "match",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = 1.0,
@@ -77,7 +81,7 @@ class Bus:
         self.format = format
         self.silence = silence
         self.drives: list[Drive] = []
-        self.line = Line(port, Echo(echo))
+        self.line = Line(port, Echo(echo), TransactionIds(transaction))
         try:
             log = AuditLog(audit) if audit else None
         except OSError:
@@ -164,6 +168,7 @@ class Bus:
         on another bus.
         """
         made = self._made(drive, address, details)
+        made.take_framing_of(self.line.port)
         with self._attaching:
             for other in self.drives:
                 if other.address == made.address:
@@ -231,7 +236,7 @@ class Bus:
     def read(self, drive: Drive, register: Register[T]) -> T:
         """Return the register's value in engineering units.
 
-        Raises NoReply, BadReply, DriveRefused or LineError; ValueError if it cannot be read.
+        Raises NoReply, NoValue, BadReply, DriveRefused or LineError; ValueError if it cannot be read.
         """
         return cast(T, self.read_many(drive, [register])[register.name])
 
@@ -241,6 +246,14 @@ class Bus:
         for register in registers:
             check_own(drive, register)
         return self._exchanges.values(drive, registers, READ_ATTEMPTS)
+
+    def read_text(self, drive: Drive, text: Text) -> str:
+        """Return a text of the drive, such as its serial number.
+
+        Raises NoReply, BadReply, DriveRefused or LineError; ValueError for another family's text.
+        """
+        check_own_text(drive, text)
+        return self._exchanges.text(drive, text)
 
     # ---- writing ----
 

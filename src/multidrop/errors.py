@@ -5,7 +5,11 @@ A mistake of the caller is a ValueError or TypeError at the call; everything els
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+_NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 class BusError(Exception):
@@ -33,9 +37,10 @@ class NoSuchPort(LineError, ValueError):
 class NoReply(BusError, TimeoutError):
     """The drive said nothing within its time-out."""
 
-    def __init__(self, drive: str) -> None:
+    def __init__(self, drive: str, where: str = "", hint: str = "") -> None:
         super().__init__(
-            f"{drive} does not answer: check its address, baud rate, format, wiring, and that it has power"
+            f"{drive} does not answer{where}: check its address, baud rate, format, wiring, and that it has "
+            f"power{hint}"
         )
         self.drive = drive
 
@@ -48,6 +53,19 @@ class BadReply(BusError):
         self.drive = drive
         self.reason = reason
         self.frame = frame
+
+
+class NoValue(BadReply):
+    """A good reply holds what means "no value" in place of a value: a NaN, or a count declared as invalid.
+
+    `values` has those of the registers that were read with it and have one.
+    """
+
+    def __init__(self, drive: str, register: str, values: Mapping[str, Any] = _NONE) -> None:
+        super().__init__(drive, f"{register} holds no valid value", b"")
+        self.args = (f"{drive}: {register} holds no valid value at present",)
+        self.register = register
+        self.values = values
 
 
 class DriveRefused(BusError):

@@ -6,8 +6,9 @@ Rows gather in the core, in chunks of bounded number, and are taken from there, 
 
 from __future__ import annotations
 
+import difflib
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,14 @@ from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import RowQueue
 from multidrop.core.fork import register_at_fork
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
 from multidrop.plant.model import Plant, PolledDrive
 from multidrop.polling.batch import Batch
+from multidrop.polling.batch_caller import BatchCaller
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
+from multidrop.toml_check import check_period
 from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
 from multidrop.transport.wakeup import WakeUp
@@ -56,12 +61,20 @@ class Poller:
         self._taken_ns = 0  # the newest rows
         self._lines: list[PolledLine] = []
         self._closing = False
+        self._over = threading.Event()  # all lines are closed, and no row comes any more
+        self._caller: BatchCaller | None = None
         self._changing = threading.Lock()  # one drive comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         register_at_fork(self)
         try:
             for number, declared in enumerate(plant.lines):
-                bus = Bus(declared.port, echo=declared.echo, ledger=ledger, audit=audit)
+                bus = Bus(
+                    declared.port,
+                    echo=declared.echo,
+                    transaction=declared.ids,
+                    ledger=ledger,
+                    audit=audit,
+                )
                 self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._names))
         except BaseException:
             self.close()
@@ -70,6 +83,8 @@ class Poller:
     def forked(self) -> None:
         """Be closed in the child, without rows."""
         self._closing = True
+        self._over, self._caller = threading.Event(), None
+        self._over.set()
         self._changing = threading.Lock()
         self._wakeup.close()
 
@@ -85,13 +100,22 @@ class Poller:
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._end()
+        if error[0] is not None:  # it goes on; a failure of the caller's function was logged
+            self._caller = None
         self.close()
 
     def close(self) -> None:
         """Stop polling and close the ports; rows not yet taken can still be.
 
         Exchanges under way are waited for, for a second at most; every slot that is over by now has a row.
+        A function that `on_batch` calls gets its last batches first. Raises its failure, if it had one.
         """
+        self._end()
+        if self._caller:
+            self._caller.raise_failure()
+
+    def _end(self) -> None:
         if self._closing:
             return
         self._closing = True
@@ -110,6 +134,9 @@ class Poller:
         for line in self._lines:
             line.close()
         self._wakeup.close()
+        self._over.set()
+        if self._caller:
+            self._caller.join()
 
     def _poll(self) -> None:
         called: Iterable[PolledLine] = self._lines
@@ -155,6 +182,35 @@ class Poller:
                     return polled.remove(attached)
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
+    def set_rate(self, drive: Drive | str, register: Register[Any] | str | None, every: float | None) -> None:
+        """Read a register of a drive every so many seconds from now on; with None all that are polled of it.
+
+        `every` None is as fast as the line allows. Requests are planned anew; those under way are finished,
+        registers whose rate stays keep their slots, and each changed one has its first slot now. The drive
+        and the register may be given by their names. A recording's metadata keeps the rates that its plant
+        began with. Raises ValueError for a drive or register that is not polled, and for no such time.
+        """
+        if every is not None:
+            check_period(every)
+        with self._changing:
+            if self._closing:
+                raise ValueError("polling has ended: no rate can be set")
+            line, known = self._polled(drive)
+            line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
+
+    def _polled(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
+        """Return a drive that is polled, by itself or by its name, and its line."""
+        drives = {known.name: (line, known) for line in self._lines for known in line.bus.drives}
+        name = drive if isinstance(drive, str) else drive.name
+        line, known = drives.get(name, (None, None))
+        if line is None or known is None or drive not in (name, known):
+            near = difflib.get_close_matches(name, drives, n=2)
+            hint = (
+                f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(drives) or 'none'}"
+            )
+            raise ValueError(f"{name} is not polled here; {hint}")
+        return line, known
+
     def _line(self, name: str) -> PolledLine:
         for line in self._lines:
             if line.name == name:
@@ -196,13 +252,34 @@ class Poller:
         return Batch(columns, self._names.drives, self._names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
-        """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops."""
+        """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.
+
+        Once the poller is closed what is left comes at once, and then no more.
+        """
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
-        while end_ns is None or clock.now_ns() < end_ns:
+        is_over = False
+        while not is_over and (end_ns is None or clock.now_ns() < end_ns):
             left = every if end_ns is None else max(0.0, (end_ns - clock.now_ns()) / 1e9)
-            clock.sleep(min(every, left))
+            is_over = self._over.wait(min(every, left))
             while batch := self.take():
                 yield batch
+
+    def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
+        """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
+
+        It holds no line up, however slow it is: rows gather meanwhile, as many as `take` leaves, and further
+        ones are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
+        raises, that is logged at once, it is called no more, and closing raises the same. A batch goes to
+        one taker: do not take others beside it. Raises ValueError for a second function.
+        """
+        if not callable(function):
+            raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
+        with self._changing:
+            if self._caller:
+                raise ValueError("on_batch has a function already, which gets every batch")
+            if self._closing:
+                raise ValueError("polling has ended: no batches come any more")
+            self._caller = BatchCaller(self.batches(every=every), function)
 
     # ---- how it went ----
 

@@ -1,8 +1,8 @@
 /* The C core against the documents' frames and against hostile lengths, without any framework.
  *
  *   cc -std=c11 -D_DEFAULT_SOURCE -g -O1 -fsanitize=address,undefined -fno-sanitize-recover=all \
- *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c
-  * csrc/reply.c \
+ *      -Icsrc tests/c/test_core.c csrc/checksum.c csrc/frame.c csrc/reason.c csrc/tap.c csrc/line.c \
+ *      csrc/reply.c csrc/tcp.c \
  *      csrc/echo.c csrc/late.c csrc/delay.c csrc/counters.c csrc/columns.c -lm -o test_core
  *   ./test_core tests/data/frames.csv
  *
@@ -360,7 +360,7 @@ static void check_impossible_counts(void)
 
 static const struct {
     const char *name;
-    uint8_t data[4];
+    uint8_t data[8];
     size_t len, at;
     int format;
     double value;
@@ -370,12 +370,26 @@ static const struct {
     {"second word", {0, 0, 0x13, 0x88}, 4, 1, MD_U16, 5000},
     {"unsigned long", {0xFF, 0xFF, 0xFF, 0xFE}, 4, 0, MD_U32, 4294967294.0},
     {"signed long", {0xFF, 0xFF, 0xFF, 0xFE}, 4, 0, MD_I32, -2},
-    {"low word first", {0x00, 0x01, 0x00, 0x02}, 4, 0, MD_U32_SWAPPED, 131073},
-    {"signed, low word first", {0xFF, 0xFE, 0xFF, 0xFF}, 4, 0, MD_I32_SWAPPED, -2},
+    {"low word first", {0x00, 0x01, 0x00, 0x02}, 4, 0, MD_U32 | MD_LOW_WORD_FIRST, 131073},
+    {"signed, low word first", {0xFF, 0xFE, 0xFF, 0xFF}, 4, 0, MD_I32 | MD_LOW_WORD_FIRST, -2},
     {"either word", {0x00, 0x00, 0x00, 0x02}, 4, 0, MD_U32_EITHER, 2},
     {"the other word", {0x00, 0x02, 0x00, 0x00}, 4, 0, MD_U32_EITHER, 2},
     {"float", {0x42, 0x48, 0x00, 0x00}, 4, 0, MD_F32, 50},
-    {"float, low word first", {0x00, 0x00, 0x42, 0x48}, 4, 0, MD_F32_SWAPPED, 50},
+    {"float, low word first", {0x00, 0x00, 0x42, 0x48}, 4, 0, MD_F32 | MD_LOW_WORD_FIRST, 50},
+    {"float, low byte first", {0x48, 0x42, 0x00, 0x00}, 4, 0, MD_F32 | MD_LOW_BYTE_FIRST, 50},
+    {"float, the wrong way round", {0x00, 0x00, 0x48, 0x42}, 4, 0,
+     MD_F32 | MD_LOW_WORD_FIRST | MD_LOW_BYTE_FIRST, 50},
+    {"low byte first", {0x34, 0x12}, 2, 0, MD_U16 | MD_LOW_BYTE_FIRST, 0x1234},
+    {"a signed byte", {0x7F, 0xFE}, 2, 0, MD_I8, -2},
+    {"the other byte", {0xFE, 0x7F}, 2, 0, MD_I8 | MD_LOW_BYTE_FIRST, -2},
+    {"unsigned, 64 bit", {0, 0x20, 0, 0, 0, 0, 0, 0}, 8, 0, MD_U64, 9007199254740992.0},
+    {"signed, 64 bit", {0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFE}, 8, 0, MD_I64, -2},
+    {"64 bit, low word first", {0, 4, 0, 3, 0, 2, 0, 1}, 8, 0, MD_U64 | MD_LOW_WORD_FIRST, 281483566841860.0},
+    {"double", {0xC0, 0x49, 0, 0, 0, 0, 0, 0}, 8, 0, MD_F64, -50},
+    {"decimal", {0x12, 0x34}, 2, 0, MD_BCD16, 1234},
+    {"long decimal", {0x98, 0x76, 0x54, 0x32}, 4, 0, MD_BCD32, 98765432},
+    {"no decimal", {0x12, 0x3A}, 2, 0, MD_BCD16, NAN},
+    {"half a double", {0, 0, 0, 0, 0, 0, 0}, 7, 0, MD_F64, NAN},
     {"first bit", {0x01}, 1, 0, MD_BIT, 1},
     {"last bit", {0x00, 0x80}, 2, 15, MD_BIT, 1},
     {"a bit too far", {0xFF}, 1, 8, MD_BIT, NAN},
@@ -384,7 +398,8 @@ static const struct {
     {"half a long", {0xFF, 0xFF}, 2, 0, MD_U32, NAN},
     {"so far that it wraps around", {0xFF, 0xFF}, 2, SIZE_MAX / 2 + 1, MD_U16, NAN},
     {"the last bit there is", {0xFF}, 1, SIZE_MAX, MD_BIT, NAN},
-    {"no such wire", {0xFF, 0xFF}, 2, 0, MD_BIT + 1, NAN},
+    {"no such wire", {0xFF, 0xFF}, 2, 0, MD_BCD32 + 1, NAN},
+    {"a bit has no order", {0xFF, 0xFF}, 2, 0, MD_BIT | MD_LOW_BYTE_FIRST, NAN},
     {"less than no wire", {0xFF, 0xFF}, 2, 0, -1, NAN},
 };
 
@@ -406,7 +421,7 @@ static void check_columns(void)
     double value[ROOM];
     uint8_t *valid = page_end() - 1;
     struct md_columns columns = {time, sent, uncertainty, drive, reg, status, value, valid, 0, ROOM};
-    const struct md_field fields[] = {{0, MD_U16, 8, 1, 10}, {1, MD_U16, 9, 1, 1}};
+    const struct md_field fields[] = {{0, MD_U16, 8, 0, 1, 10}, {1, MD_U16, 9, 0, 1, 1}};
     struct md_completion completion = {
         .result = 7, .sent_ns = 100, .first_ns = 130, .reply = {.data_len = 2, .data = {0, 3}}};
     row = "columns";

@@ -17,6 +17,7 @@ from multidrop.cli import COMMANDS, main
 from multidrop.cli.support.signals import noting_signals
 from multidrop.drive import Advice, Refused, carry_out
 from multidrop.drives import MODELS, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.drives.registry import SHIPPED
 
 
 def test_help_lists_every_command(run: Run) -> None:
@@ -108,14 +109,15 @@ def test_help_imports_no_command_and_nothing_heavy() -> None:
         ),
         (
             ["read", "sockt://10.0.0.7:4001", TOY, "1"],
-            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as socket://10.0.0.7:4001 or "
-            "rfc2217://10.0.0.7:4001",
+            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as tcp://10.0.0.7, "
+            "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
         ),
         (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
         (
             ["models", "innovert-ibt"],
-            "there is no model 'innovert-ibt'; did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "there is no model 'innovert-ibt'; did you mean innovert-ibd? "
+            "(or write path/to/file.toml or file.py:Class)",
         ),
     ],
 )
@@ -284,9 +286,9 @@ def test_a_port_that_fails_is_a_sentence_and_status_1(run: Run, port: str, sente
 def test_models_lists_the_families(run: Run) -> None:
     status, out, _ = run("models")
     assert status == 0
-    assert [line.split()[0] for line in out.splitlines()[1:-2]] == list(MODELS)
+    assert [line.split()[0] for line in out.splitlines()[1:-2]] == [*MODELS, *SHIPPED]
     _, out, _ = run("models", "--json")
-    assert [family["model"] for family in json.loads(out)] == list(MODELS)
+    assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
 
 
 def test_a_family_s_sheet_has_every_fact(run: Run) -> None:

@@ -316,9 +316,17 @@ def test_a_drive_s_not_a_number_is_told_as_such(run: Run, tmp_path: Path) -> Non
     plant = tmp_path / "plant.toml"
     plant.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
     frames = [frame(True, 1, 0x03, 7, 2), frame(False, 1, 0x03, 0, 0, bytes.fromhex("7F C0 00 00"))]
-    assert told(run, tmp_path / "a.pcapng", frames, "--plant", plant)[0] == "meter  reads power ?  (1.0 ms)"
+    assert (
+        told(run, tmp_path / "a.pcapng", frames, "--plant", plant)[0]
+        == "meter  reads power: no valid value  (1.0 ms)"
+    )
     (line, _) = run("decode", tmp_path / "a.pcapng", "--plant", plant, "--json")[1].splitlines()
     assert json.loads(line)["values"] == {"power": None}
+    out = tmp_path / "a.csv"
+    assert run("decode", tmp_path / "a.pcapng", "--plant", plant, "--out", out)[0] == 0
+    assert [(row.register, row.value, row.status) for row in recorded(out)] == [
+        ("power", None, "no valid value")
+    ]
 
 
 def test_a_replay_can_be_written_anew(run: Run, capture: Path) -> None:

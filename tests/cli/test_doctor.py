@@ -80,8 +80,11 @@ def sysfs(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def port(request: pytest.FixtureRequest) -> Iterator[str]:
-    drives = [simulated(InvtCHE(1)), simulated(InnovertIBD(2, framing="ascii"))]
-    with Simulator([Wire(drives, unpaced=True, port=getattr(request, "param", "pty"))]) as sim:
+    kind = getattr(request, "param", "pty")
+    drives = [simulated(InvtCHE(1))]
+    if not kind.startswith("tcp"):
+        drives.append(simulated(InnovertIBD(2, framing="ascii")))
+    with Simulator([Wire(drives, unpaced=True, port=kind)]) as sim:
         yield sim.wires[0].path
 
 
@@ -378,3 +381,33 @@ def test_mistakes_are_one_sentence(run: Run, words: tuple[str, ...], status: int
     assert (found, out) == (status, "")
     assert sentence in err
     assert len(err.splitlines()) == 1
+
+
+# ---- Modbus TCP and RTU over TCP ----
+
+
+@pytest.mark.parametrize("port", ["tcp://127.0.0.1:0"], indirect=True)
+def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
+    status, said, _ = run("doctor", port, "--model", "invt-che", "--address", "1")
+    assert status == 0
+    told = " ".join(said.split())
+    assert "is a Modbus TCP connection" in told
+    assert "begins to answer after" in told
+    assert "other way" not in told
+
+
+@pytest.mark.parametrize(
+    ("port", "asked", "spoken", "other"),
+    [
+        ("tcp://127.0.0.1:0", "socket", "Modbus TCP", "tcp"),
+        ("socket://127.0.0.1:0", "tcp", "RTU over TCP", "socket"),
+    ],
+    indirect=["port"],
+)
+def test_what_was_mixed_up_is_told(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
+    place = port.partition("://")[2]
+    status, said, _ = run("doctor", f"{asked}://{place}", "--model", "invt-che", "--address", "1")
+    assert status == 1
+    told = " ".join(said.split())
+    assert f"the far end speaks {spoken}, and not" in told
+    assert f"name the port {other}://{place} in place of {asked}://{place}" in told

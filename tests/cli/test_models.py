@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,95 @@ def test_a_file_that_failed_is_read_anew(tmp_path: Path) -> None:
     assert "ZeroDivisionError" in refused("later.py:Fan", tmp_path)
     path.write_text(FAN + "# now without the mistake\n")
     assert find_model("later.py:Fan", tmp_path).model == "fan"
+
+
+# ---- modules beside a file ----
+
+USES_SCALES = """\
+from multidrop import Drive, reading
+from scales import STEP
+import scales as table
+
+class Fan(Drive):
+    speed = reading(1, "rpm", step=STEP)
+
+    def later(self):
+        import scales
+        return scales
+"""
+
+
+def with_scales(directory: Path, step: float, source: str = USES_SCALES) -> Path:
+    directory.mkdir()
+    (directory / "fan.py").write_text(source)
+    (directory / "scales.py").write_text(f"STEP = {step}\n")
+    return directory
+
+
+def test_a_file_imports_the_modules_beside_it_and_no_other_directory_s(tmp_path: Path) -> None:
+    before, names = list(sys.path), {*sys.modules}
+    one, two = (
+        find_model("fan.py:Fan", with_scales(tmp_path / f"plant-{step}", step)) for step in (0.1, 0.5)
+    )
+    assert (one.registers["speed"].step, two.registers["speed"].step) == (0.1, 0.5)
+    later = [family.later(None) for family in (one, two)]  # type: ignore[attr-defined]
+    assert [module.STEP for module in later] == [0.1, 0.5]
+    assert sys.path == before
+    assert {name for name in {*sys.modules} - names if not name.startswith("multidrop")} == set()
+
+
+def test_a_module_beside_a_file_is_run_once(tmp_path: Path) -> None:
+    directory = with_scales(tmp_path / "plant", 0.1)
+    (directory / "other.py").write_text(USES_SCALES)
+    families = [find_model(f"{name}.py:Fan", directory) for name in ("fan", "other")]
+    assert len({id(family.later(None)) for family in families}) == 1  # type: ignore[attr-defined]
+
+
+def test_modules_beside_a_file_may_import_each_other(tmp_path: Path) -> None:
+    directory = with_scales(tmp_path / "plant", 0.1)
+    (directory / "scales.py").write_text("import units\nSTEP = units.STEP\n")
+    (directory / "units.py").write_text("import scales\nSTEP = 0.25\n")
+    assert find_model("fan.py:Fan", directory).registers["speed"].step == 0.25
+
+
+@pytest.mark.parametrize("name", ["json", "multidrop"])
+def test_no_file_stands_in_for_a_module_of_python_s_own_or_ours(tmp_path: Path, name: str) -> None:
+    source = f"import {name}\nOURS = {name}\n{FAN}"
+    (tmp_path / "fan.py").write_text(source)
+    (tmp_path / f"{name}.py").write_text("1 / 0\n")
+    find_model("fan.py:Fan", tmp_path)
+    loaded = [module for module in sys.modules.values() if hasattr(module, "OURS")]
+    assert sys.modules[name] in [module.OURS for module in loaded]
+
+
+def test_what_the_program_has_imported_from_there_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = with_scales(tmp_path / "plant", 0.1)
+    monkeypatch.syspath_prepend(str(directory))
+    import scales  # type: ignore[import-not-found]
+
+    try:
+        family = find_model("fan.py:Fan", directory)
+    finally:
+        del sys.modules["scales"]
+    assert family.registers["speed"].step == 0.1
+    assert {id(vars(module)["table"]) for module in sys.modules.values() if "table" in vars(module)} >= {
+        id(scales)
+    }
+
+
+def test_a_module_beside_a_file_that_fails_is_told_with_its_line_and_read_anew(tmp_path: Path) -> None:
+    directory = with_scales(tmp_path / "plant", 0.1)
+    (directory / "scales.py").write_text("\n1 / 0\n")
+    sentence = f"{directory}/scales.py, line 2: ZeroDivisionError: division by zero"
+    assert refused("fan.py:Fan", directory) == sentence
+    (directory / "scales.py").write_text("STEP = 2.0  # now without the mistake\n")
+    assert find_model("fan.py:Fan", directory).registers["speed"].step == 2.0
+
+
+def test_a_module_that_is_nowhere_is_told(tmp_path: Path) -> None:
+    directory = with_scales(tmp_path / "plant", 0.1)
+    (directory / "scales.py").unlink()
+    ending = "fan.py, line 2: ModuleNotFoundError: No module named 'scales'"
+    assert refused("fan.py:Fan", directory).endswith(ending)

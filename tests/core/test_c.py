@@ -9,7 +9,7 @@ from c_programs import build_and_run
 
 @pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
-    line = ("line", "reply", "echo", "late", "delay", "counters")
+    line = ("line", "reply", "tcp", "echo", "late", "delay", "counters")
     core = ("checksum", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 

@@ -14,6 +14,8 @@ from line_driver import MS, LineDriver
 
 from multidrop.core import (
     EXCEPTION_STATUS,
+    LOW_BYTE_FIRST,
+    LOW_WORD_FIRST,
     STATUSES,
     Columns,
     Exchange,
@@ -39,23 +41,34 @@ NUMBERS = [
     (NumberFormat.I16, "FF FE", -2),
     (NumberFormat.U32, "FF FF FF FE", 4294967294),
     (NumberFormat.I32, "FF FF FF FE", -2),
-    (NumberFormat.U32_SWAPPED, "00 01 00 02", 0x20001),
-    (NumberFormat.I32_SWAPPED, "FF FE FF FF", -2),
+    (NumberFormat.U32 | LOW_WORD_FIRST, "00 01 00 02", 0x20001),
+    (NumberFormat.I32 | LOW_WORD_FIRST, "FF FE FF FF", -2),
     (NumberFormat.U32_EITHER, "00 00 02 00", 512),
     (NumberFormat.U32_EITHER, "02 00 00 00", 512),
     (NumberFormat.F32, "42 47 00 00", 49.75),
-    (NumberFormat.F32_SWAPPED, "00 00 42 47", 49.75),
+    (NumberFormat.F32 | LOW_WORD_FIRST, "00 00 42 47", 49.75),
+    (NumberFormat.F32 | LOW_BYTE_FIRST, "47 42 00 00", 49.75),
+    (NumberFormat.F32 | LOW_WORD_FIRST | LOW_BYTE_FIRST, "00 00 47 42", 49.75),
+    (NumberFormat.U16 | LOW_BYTE_FIRST, "34 12", 0x1234),
+    (NumberFormat.I8, "7F FE", -2),
+    (NumberFormat.I8 | LOW_BYTE_FIRST, "FE 7F", -2),
+    (NumberFormat.U64, "00 20 00 00 00 00 00 00", 2**53),
+    (NumberFormat.I64, "FF FF FF FF FF FF FF FE", -2),
+    (NumberFormat.I64 | LOW_WORD_FIRST, "FF FE FF FF FF FF FF FF", -2),
+    (NumberFormat.F64, "40 48 E0 00 00 00 00 00", 49.75),
+    (NumberFormat.BCD16, "12 34", 1234),
+    (NumberFormat.BCD32, "98 76 54 32", 98765432),
     (NumberFormat.BIT, "01", 1),
 ]
 
 
 @pytest.mark.parametrize(("wire", "data", "value"), NUMBERS)
-def test_number(wire: NumberFormat, data: str, value: float) -> None:
+def test_number(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
 def test_every_wire_is_tested() -> None:
-    assert {wire for wire, _, _ in NUMBERS} == set(NumberFormat)
+    assert {wire & (LOW_WORD_FIRST - 1) for wire, _, _ in NUMBERS} == set(NumberFormat)
 
 
 def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:

@@ -209,7 +209,7 @@ def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
 
 def test_framings_may_change_from_frame_to_frame() -> None:
     by_framing = {it.framing: it for it in REPLIES}
-    assert set(by_framing) == set(Framing)
+    assert set(by_framing) == {*Framing} - {Framing.TCP}  # which has ports of its own
     frames = [it.request_frame + it.frame for it in by_framing.values()]
     assert [span.framing for span in split(*frames, *frames)] == [
         framing for framing in (*by_framing, *by_framing) for _ in range(2)

@@ -57,6 +57,27 @@ WRONG: dict[str, dict[str, Any]] = {
     "number_format = U32_EITHER leaves the order of its words open": {
         "number_format": NumberFormat.U32_EITHER
     },
+    "offset = '-40' is no number, such as -40": {"offset": "-40"},
+    "offset = inf is no number": {"offset": float("inf")},
+    "order = 'DCAB' is none of AB, BA, ABCD, CDAB, BADC, DCBA": {"order": "DCAB"},
+    "order = 'BA' is for one word, and this has 2: CDAB, BADC or DCBA": {
+        "order": "BA",
+        "number_format": NumberFormat.U32,
+    },
+    "order is for numbers in words, and a coil holds none": {"order": "CDAB", "table": COIL},
+    "invalid = '7FFF' is no tuple of raw counts, such as (0x7FFF,)": {"invalid": "7FFF"},
+    "invalid has 5 counts, and the most is 4": {"invalid": (1, 2, 3, 4, 5)},
+    "invalid = 65536 is no count of 16 bits": {"invalid": 65536},
+    "invalid = inf is no count of 16 bits": {"invalid": float("inf")},
+    "invalid = 1.5 is no count of 16 bits": {"invalid": 1.5},
+    "invalid = nan is for floats, and this is a whole number": {"invalid": float("nan")},
+    "a part is never written, as the other bits of its word would be too: declare a reading": {
+        "part": (0, 3)
+    },
+    "number_format = I8 is one byte of a word, whose other byte is not known": {
+        "number_format": NumberFormat.I8
+    },
+    "its scale register exponent is not declared": {"scale_register": "exponent"},
     "span = (60, 0) is the wrong way round": {"span": (60, 0)},
     "span = 60 is not two numbers": {"span": 60},
     "span = (0, inf) is not two numbers": {"span": (0, float("inf"))},
@@ -80,6 +101,94 @@ WRONG: dict[str, dict[str, Any]] = {
 def test_a_mistake_is_told_with_the_register_s_name(mistake: str) -> None:
     (sentence,) = told(speed=setting(5, "rpm", **WRONG[mistake]))
     assert sentence.startswith(f"speed: {mistake}")
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "part = (7, 4) is the wrong way round, or below bit 0": {"part": (7, 4)},
+    "part = (-1, 4) is the wrong way round, or below bit 0": {"part": (-1, 4)},
+    "part = 3 is not the lowest and the highest bit, such as (0, 7)": {"part": 3},
+    "part = (0, 16) is beyond the 16 bits of its number": {"part": (0, 16)},
+    "part is for whole numbers, not for number_format = F32": {
+        "part": (0, 3),
+        "number_format": NumberFormat.F32,
+    },
+    "part is for numbers in words, and a coil holds none": {"part": (0, 0), "table": COIL},
+    "number_format = U32_EITHER leaves its words open": {
+        "invalid": 1,
+        "number_format": NumberFormat.U32_EITHER,
+    },
+    "number_format = U32_EITHER leaves the order of its words open: it has no order": {
+        "order": "CDAB",
+        "number_format": NumberFormat.U32_EITHER,
+    },
+}
+
+
+@pytest.mark.parametrize("mistake", PARTS)
+def test_a_mistake_of_a_reading_is_told(mistake: str) -> None:
+    (sentence,) = told(level=reading(5, **PARTS[mistake]))
+    assert sentence.startswith(f"level: {mistake}")
+
+
+POWER = reading(12, number_format=NumberFormat.I16)
+SCALED: dict[str, dict[str, Register[Any]]] = {
+    "its scale register power is no I16 that can be read: it holds a power of ten": {"power": reading(12)},
+    "its scale register power is no plain count: it holds a power of ten": {
+        "power": reading(12, number_format=NumberFormat.I16, step=0.1)
+    },
+    "its scale register power is in another table: one request reads both": {
+        "power": reading(12, number_format=NumberFormat.I16, table=INPUT)
+    },
+    "address 000BH between it and its scale register power is not declared": {
+        "power": reading(12, number_format=NumberFormat.I16)
+    },
+    "one request reads at most 125 registers, and these are 191 registers with its scale register power": {
+        "power": reading(200, number_format=NumberFormat.I16)
+    },
+}
+
+
+@pytest.mark.parametrize("mistake", SCALED)
+def test_a_scale_register_that_no_request_reads_with_it_is_told(mistake: str) -> None:
+    (sentence,) = told(level=reading(10, scale_register="power"), **SCALED[mistake])
+    assert sentence.startswith(f"level: {mistake}")
+
+
+def test_what_has_a_scale_register_is_read_as_a_plain_number() -> None:
+    power = reading(6, number_format=NumberFormat.I16)
+    (sentence,) = told(level=setting(5, scale_register="power"), power=power)
+    assert sentence.startswith("level: a register with a scale register is never written")
+    (sentence,) = told(
+        level=reading(5, Run, scale_register="power"), power=reading(6, number_format=NumberFormat.I16)
+    )
+    assert sentence == "level: a register with a scale register has neither names nor an offset"
+
+
+def test_a_stated_limit_holds_for_a_register_and_its_scale() -> None:
+    registers = {
+        "most_registers": {HOLDING: 2},
+        "level": reading(5, scale_register="power"),
+        "between": reading(6),
+        "power": reading(7, number_format=NumberFormat.I16),
+    }
+    with pytest.raises(DeclarationError, match="one request reads at most 2 registers, and these are 3"):
+        type("Fan", (Drive,), registers)
+
+
+def test_a_scale_register_that_a_subclass_declares_anew_is_told() -> None:
+    first = declare(
+        level=reading(5, scale_register="power"), power=reading(6, number_format=NumberFormat.I16)
+    )
+    with pytest.raises(DeclarationError, match="level: its scale register power was declared anew"):
+        type("Other", (first,), {"power": reading(4, number_format=NumberFormat.I16)})
+    assert first.registers["level"].reach == range(5, 7)
+
+
+def test_parts_and_their_whole_word_may_share_an_address() -> None:
+    fan = declare(
+        status=setting(5), fault=reading(5, part=(0, 7)), runs=reading(5, part=(8, 8)), speed=reading(6)
+    )
+    assert [len(register.reach) for register in fan.registers.values()] == [1, 1, 1, 1]
 
 
 def test_all_mistakes_of_a_class_are_told_at_once() -> None:

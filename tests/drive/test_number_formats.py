@@ -22,16 +22,12 @@ from multidrop.sim import SimulatedDrive
 
 SEVERAL = Table("holding register, several at once", 0x03, 0x10)
 RELAYS = Table("coil, several at once", 0x01, 0x0F, Carrier.BIT)
-LOW_FIRST = (NumberFormat.U32_SWAPPED, NumberFormat.I32_SWAPPED, NumberFormat.F32_SWAPPED)
 PACKED = {  # what a document calls them
     NumberFormat.U16: ">H",
     NumberFormat.I16: ">h",
     NumberFormat.U32: ">I",
     NumberFormat.I32: ">i",
-    NumberFormat.U32_SWAPPED: ">I",
-    NumberFormat.I32_SWAPPED: ">i",
     NumberFormat.F32: ">f",
-    NumberFormat.F32_SWAPPED: ">f",
 }
 
 
@@ -42,10 +38,10 @@ class Meter(Drive):
     i16 = setting(1, "V", number_format=NumberFormat.I16, kept=Kept.RAM)
     u32 = setting(2, "V", number_format=NumberFormat.U32, kept=Kept.RAM)
     i32 = setting(4, "V", number_format=NumberFormat.I32, kept=Kept.RAM)
-    u32_swapped = setting(6, "V", number_format=NumberFormat.U32_SWAPPED, kept=Kept.RAM)
-    i32_swapped = setting(8, "V", number_format=NumberFormat.I32_SWAPPED, kept=Kept.RAM)
+    u32_swapped = setting(6, "V", number_format=NumberFormat.U32, order="CDAB", kept=Kept.RAM)
+    i32_swapped = setting(8, "V", number_format=NumberFormat.I32, order="CDAB", kept=Kept.RAM)
     f32 = setting(10, "V", number_format=NumberFormat.F32, kept=Kept.RAM)
-    f32_swapped = setting(12, "V", number_format=NumberFormat.F32_SWAPPED, kept=Kept.RAM)
+    f32_swapped = setting(12, "V", number_format=NumberFormat.F32, order="CDAB", kept=Kept.RAM)
 
     scaled = setting(14, "V", number_format=NumberFormat.F32, step=0.1, kept=Kept.RAM)
     narrow = setting(16, "V", number_format=NumberFormat.F32, span=(0, 0.1), kept=Kept.RAM)
@@ -58,7 +54,10 @@ class Meter(Drive):
     control = command(30, span=(0, 7), moves=False)
 
 
-FORMATS = [Meter.register(wire.name.lower()) for wire in PACKED]
+FORMATS = [
+    *(Meter.register(wire.name.lower()) for wire in PACKED),
+    *(Meter.u32_swapped, Meter.i32_swapped, Meter.f32_swapped),
+]
 formats = pytest.mark.parametrize("register", FORMATS, ids=lambda it: it.name)
 
 
@@ -72,9 +71,9 @@ def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
     return st.integers(low, high)
 
 
-def on_the_wire(wire: NumberFormat, number: float) -> bytes:
-    data = struct.pack(PACKED[wire], number)
-    return data[2:] + data[:2] if wire in LOW_FIRST else data
+def on_the_wire(register: Register[Any], number: float) -> bytes:
+    data = struct.pack(PACKED[register.number_format], number)
+    return data[2:] + data[:2] if register.order == "CDAB" else data
 
 
 @formats
@@ -82,7 +81,7 @@ def on_the_wire(wire: NumberFormat, number: float) -> bytes:
 def test_a_number_is_packed_as_its_format_says(register: Register[float], data: st.DataObject) -> None:
     number = data.draw(numbers(register))
     request = write_request(Meter(1), register, register.encode(number))
-    assert request.data == on_the_wire(register.number_format, number or 0)  # a zero has no sign
+    assert request.data == on_the_wire(register, number or 0)  # a zero has no sign
     function, count = (0x10, 2) if register.words == 2 else (0x06, 0)
     assert (request.function, request.start, request.count) == (function, register.address, count)
 

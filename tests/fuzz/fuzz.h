@@ -43,6 +43,11 @@ static inline uint8_t *exact_copy(const uint8_t *bytes, size_t len)
 /* framing, address, function, start, count, first two of the request's data: nine bytes */
 enum { REQUEST_BYTES = 9 };
 
+static inline int framing_of(uint8_t byte)
+{
+    return byte % 16 == 15 ? MD_TCP : byte % 3;
+}
+
 static inline struct md_message request_of(const uint8_t bytes[REQUEST_BYTES])
 {
     struct md_message request = {
@@ -58,7 +63,7 @@ static inline struct md_message request_of(const uint8_t bytes[REQUEST_BYTES])
     case 0x10: request.data_len = (uint16_t)(2 * request.count % 251); break;
     default: break;
     }
-    if (bytes[0] % 3 == MD_DELIXI)
+    if (framing_of(bytes[0]) == MD_DELIXI)
         request.data_len = 4;
     return request;
 }

@@ -19,16 +19,17 @@ from readers import read
 
 import multidrop.capture
 import multidrop.drives.registry
+import multidrop.family_file
 import multidrop.plant.model
-import multidrop.plant.toml_check
 import multidrop.recording
 import multidrop.sim.faults
+import multidrop.toml_check
 from multidrop.capture import decoding
 
-PACKAGES = (multidrop.capture, multidrop.recording)
+PACKAGES = (multidrop.capture, multidrop.family_file, multidrop.recording)
 MODULES = (
     multidrop.plant.model,
-    multidrop.plant.toml_check,
+    multidrop.toml_check,
     multidrop.drives.registry,
     multidrop.sim.faults,
     tomllib._parser,

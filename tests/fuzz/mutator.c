@@ -32,7 +32,12 @@ static size_t take_body(const uint8_t *bytes, size_t len, int framing, uint8_t b
 {
     size_t have = 0;
     memset(body, 0, MOST_BODY);
-    if (framing == MD_RTU || len == 0 || bytes[0] != ':') {
+    if (framing == MD_TCP) {
+        size_t head = len < MD_TCP_HEAD ? len : MD_TCP_HEAD;
+        bytes += head;
+        len -= head;
+    }
+    if (framing == MD_RTU || framing == MD_TCP || len == 0 || bytes[0] != ':') {
         have = len > MOST_BODY - 2 ? MOST_BODY - 2 : len;
         if (have)
             memcpy(body, bytes, have);
@@ -159,6 +164,12 @@ static size_t close_frame(int framing, uint8_t *body, size_t len, uint8_t *frame
         frame[len + 1] = (uint8_t)(crc >> 8);
         return len + 2;
     }
+    if (framing == MD_TCP) {
+        put16(frame + 2, 0);
+        put16(frame + 4, (unsigned)len);
+        memcpy(frame + MD_TCP_HEAD, body, len);
+        return MD_TCP_HEAD + len;
+    }
     body[len] = framing == MD_ASCII ? (uint8_t)-sum_of(body, len) : sum_of(body, len);
     uint8_t *at = frame;
     *at++ = ':';
@@ -197,7 +208,7 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
         framing = draw(&seed, 2) ? MD_ASCII : MD_DELIXI;
     if (framing < 0)
         framing = draw(&seed, 6) ? MD_RTU : draw(&seed, 2) ? MD_ASCII : MD_DELIXI;
-    size_t junk = draw(&seed, 8) ? 0 : draw(&seed, 4);
+    size_t junk = draw(&seed, 8) || framing == MD_TCP ? 0 : draw(&seed, 4); /* a stream has none */
     if (junk < wire.len && !wire.is_fixed) { /* it stays in front of the frame */
         wire.at += junk;
         wire.len -= junk;
@@ -207,6 +218,8 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
     size_t len = framing == MD_DELIXI ? mend_delixi(body, &wire, &seed)
         : mend_modbus(body, have, &wire, &seed);
     len = close_frame(framing, body, len, frame);
+    if (framing == MD_TCP) /* its transaction stays */
+        put16(frame, wire.len < 2 ? 0 : md_get16(data + wire.at));
     if (is_rare(&seed))
         frame[draw(&seed, (unsigned)len)] ^= (uint8_t)(1u << draw(&seed, 8));
     size_t grown = replace(data, size, most, &wire, frame, len);

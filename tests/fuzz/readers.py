@@ -14,6 +14,8 @@ from pathlib import Path
 
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
+from multidrop.family_file.loader import FamilyError, load_family
+from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row, Rows
@@ -69,6 +71,21 @@ def read_plant(path: Path) -> None:
         names = [polled.drive.name for line in plant.lines for polled in line.drives]
         assert len(names) == len(set(names)) > 0
         json.dumps(plant.metadata())
+
+
+def read_family(path: Path) -> None:
+    """Read a family's file; what follows a line with a zero byte is its CSV file."""
+    toml, _, csv = path.read_bytes().partition(b"\n\0\n")
+    path.write_bytes(toml)
+    path.with_suffix(".csv").write_bytes(csv)
+    with refused(FamilyError, path.with_suffix("")):
+        family = load_family(path)
+        assert load_family(path) is family
+        drive = family(family.addresses[0])
+        for register in drive.readings():
+            (block,) = blocks(drive, [register])
+            assert block.offset(register) >= 0
+            register.format(register.decode(1))
 
 
 def read_faults(path: Path) -> None:
@@ -143,6 +160,7 @@ def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Ro
 
 READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix, and who reads it
     "plant": (".toml", read_plant),
+    "family": (".toml", read_family),
     "faults": (".toml", read_faults),
     "arrows": (".arrows", read_recording),
     "csv": (".csv", read_recording),

@@ -14,14 +14,17 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from batches import counting, example
+from families import METER, METER_CSV
 from frames import PRINTED, Printed
 from readers import PLANT
 
 from multidrop.capture import CaptureWriter, Side
-from multidrop.core import Message
+from multidrop.core import Framing, Message
 from multidrop.recording import open_writer
 
 EXCHANGES = [it for it in PRINTED if it.request is not None]
+RTU = [it for it in EXCHANGES if it.framing is Framing.RTU]
+TCP = 15  # as fuzz.h has a framing in a byte
 WAKE, TAKE, NOISE = 2, 3, 4  # steps of fuzz_line.c
 TIME = 1_700_000_000
 
@@ -36,10 +39,29 @@ def asked(it: Printed) -> bytes:
     )
 
 
+def over_tcp(it: Printed, transaction: int) -> Iterator[bytes]:
+    """The request as a harness has it, and both frames."""
+    yield bytes([TCP]) + asked(it)[1:]
+    for frame in (it.request_frame, it.frame):
+        yield struct.pack(">HHH", transaction, 0, len(frame) - 2) + frame[:-2]
+
+
 def frame() -> Iterator[bytes]:
     for it in EXCHANGES:
         yield asked(it) * 2 + it.frame
         yield asked(it) * 2 + it.request_frame
+    for it in RTU:
+        request, sent, answered = over_tcp(it, 7)
+        yield request * 2 + answered
+        yield request * 2 + sent
+
+
+def tcp() -> Iterator[bytes]:
+    for header in (bytes([0, 20]), bytes([1, 20])):
+        for it in RTU:
+            request, _, answered = over_tcp(it, 1)
+            yield header + b"\0" + request + bytes([3, len(answered)]) + answered
+            yield header + b"\0" + request + bytes([2, 2, 0]) + request + bytes([3, len(answered)]) + answered
 
 
 def line() -> Iterator[bytes]:
@@ -103,6 +125,13 @@ def plant() -> Iterator[bytes]:
     yield b'[[line]]\nname = "a"\nport = "b"\n[[line.drive]]\nname = "c"\nmodel = "yd1000"\naddress = 1\n'
 
 
+def family() -> Iterator[bytes]:
+    for path in sorted((Path(__file__).parents[1] / "data" / "families").glob("*.toml")):
+        yield path.read_bytes()
+    meter = METER.replace("meter.csv", "fuzzed.csv")
+    yield meter.encode() + b"\n\0\n" + METER_CSV.encode()
+
+
 def faults() -> Iterator[bytes]:
     yield b'seed = 7\ndrop = 0.01\nflip = 0.5\nlate = "100 ms"\nburst = 32\nhang_up = 0\naway = "1 s"\n'
 
@@ -125,10 +154,12 @@ def captures() -> Iterator[bytes]:
 SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "frame": frame,
     "line": line,
+    "tcp": tcp,
     "split": split,
     "capture": capture,
     "columns": columns,
     "plant": plant,
+    "family": family,
     "faults": faults,
     "arrows": lambda: recorded(".arrows"),
     "csv": lambda: recorded(".csv"),

@@ -33,7 +33,10 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 LANGUAGES = {"python", "toml", "sh", "console", "text", "c"}  # text and c are shown, and not run
-PACKAGES = ("multidrop", *(f"multidrop.{name}" for name in ("drive", "sim", "recording", "capture", "scan")))
+PACKAGES = (
+    "multidrop",
+    *(f"multidrop.{name}" for name in ("drive", "profiles", "sim", "recording", "capture", "scan")),
+)
 
 # Commands that are not run, and why: those that begin so.
 NOT_RUN = {
@@ -239,6 +242,7 @@ PLACEHOLDERS = {
     "COMMAND": "poll",
     "FILE": "plant.toml",
     "HZ": "10",
+    "DRIVE": "pump-1",
 }
 MENTIONED = sorted(
     {

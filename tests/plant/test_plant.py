@@ -11,8 +11,9 @@ import pytest
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.timing import Settings
-from multidrop.plant.loader import PlantError, load_plant, parse_duration
+from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
+from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing, Option
@@ -111,6 +112,16 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
         return [sentence.removeprefix(start) for sentence in refusal.value.mistakes]
 
     return mistakes
+
+
+@pytest.mark.parametrize(
+    "text", ["a." * 300 + "b = 1", "a = " + "[" * 300 + "]" * 300, "a." * 100_000 + "b=1"]
+)
+def test_what_is_nested_too_deeply_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(text)
+    with pytest.raises(PlantError):
+        load_plant(path)
 
 
 def test_lines_drives_and_polls_are_read(load: Load) -> None:
@@ -222,6 +233,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             "line = [3]",
             "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
+            "transaction, "
             "drive",
         ),
         (
@@ -273,8 +285,13 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (HEAD + TOY + "baudrate = 0", 'line "L", drive "D": baud rate 0 is not one of TOY T1: 9600, 19200'),
         (HEAD + TOY + 'format = "8O1"', 'line "L", drive "D": format \'8O1\' is not one of TOY T1: 8N1, 8E1'),
         (
+            HEAD + TOY + 'framing = "udp"',
+            'line "L", drive "D": framing \'udp\' is not one of TOY T1: rtu, ascii',
+        ),
+        (
             HEAD + TOY + 'framing = "tcp"',
-            'line "L", drive "D": framing \'tcp\' is not one of TOY T1: rtu, ascii',
+            'line "L", drive "D": framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, '
+            "and /dev/a is none",
         ),
         (
             HEAD + "baudrate = 9600\n" + FIXED,
@@ -289,7 +306,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
             'line "L", drive "D": there is no model \'innovert-ibt\'; '
-            "did you mean innovert-ibd? (or write path/to/file.py:Class)",
+            "did you mean innovert-ibd? (or write path/to/file.toml or file.py:Class)",
         ),
         (
             HEAD + TOY + 'poll = ["control"]',
@@ -471,3 +488,40 @@ def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_pat
     path.write_text(path.read_text().replace('["acceleration"]', "[3]"))
     with pytest.raises(PlantError, match="ram takes names of registers, not 3"):
         load_plant(path)
+
+
+# ---- other ports, and names ----
+
+
+def two_lines(directory: Path) -> Path:
+    path = directory / "plant.toml"
+    line = '[[line]]\nname = "{0}"\nport = "/dev/{0}"\n[[line.drive]]\nname = "pump-{1}"\n'
+    rest = 'model = "yd1000"\naddress = 1\n'
+    path.write_text(line.format("hall", 1) + rest + line.format("roof", 2) + rest)
+    return path
+
+
+def test_a_line_gets_another_port_and_all_else_stays(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    changed = plant.with_ports({"roof": "ports/roof"})
+    assert [line.port for line in changed.lines] == ["/dev/hall", "ports/roof"]
+    assert changed.lines[1].drives == plant.lines[1].drives
+    assert [line.port for line in plant.lines] == ["/dev/hall", "/dev/roof"]
+    assert plant.with_ports({"roof": "/dev/hall", "hall": "/dev/roof"}).lines[0].port == "/dev/roof"
+
+
+def test_ports_that_cannot_be_given(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
+        plant.with_ports({"rof": "x"})
+    with pytest.raises(ValueError, match="lines hall and roof would both be at /dev/hall"):
+        plant.with_ports({"roof": "/dev/hall"})
+
+
+def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
+    plant = load_plant(two_lines(tmp_path))
+    assert plant.find_line("roof") is plant.lines[1]
+    line, drive = plant.find_drive("pump-2")
+    assert (line.name, drive.name) == ("roof", "pump-2")
+    with pytest.raises(ValueError, match=r"has no drive 'fan'; there are pump-1, pump-2"):
+        plant.find_drive("fan")

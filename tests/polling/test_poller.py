@@ -151,8 +151,8 @@ def test_a_rate_is_kept_on_its_grid_and_never_in_a_burst(port: str) -> None:
         polling.until("ok", 100)
     for name, every in periods.items():
         mine = [row for row in polling.rows if row.register == name]
-        sent = [row.monotonic_ns for row in mine if row.status not in NOT_SENT]
-        assert sent == sorted(sent)
+        # A reply that came too late has a row of its own, with the time of its request.
+        sent = sorted({row.monotonic_ns for row in mine if row.status not in NOT_SENT})
         # The n-th is not sent before its slot: none is made up for, and none is early.
         assert all(at >= before_ns + number * every * 1e9 for number, at in enumerate(sent))
     summary = polling.poller.summary()["lines"]["line"]

@@ -33,7 +33,9 @@ class Own(Drive):
     output_frequency = reading(0x01, "Hz", step=0.1, table=INPUT)
     temperature = reading(0x02, "°C", number_format=NumberFormat.I16, table=INPUT)
     energy = reading(0x03, "kWh", step=0.01, number_format=NumberFormat.U32, table=INPUT)
-    energy_swapped = reading(0x05, "kWh", step=0.01, number_format=NumberFormat.U32_SWAPPED, table=INPUT)
+    energy_swapped = reading(
+        0x05, "kWh", step=0.01, number_format=NumberFormat.U32, order="CDAB", table=INPUT
+    )
     power = reading(0x07, "kW", number_format=NumberFormat.F32, table=INPUT)
     acceleration_time = setting(
         0x10, "s", step=0.1, span=(0.1, 600), default=5, kept=Kept.EEPROM, ram_address=0x8010

@@ -16,9 +16,9 @@ from multidrop.cli import main
 from multidrop.core import STATUSES, Message, Peer
 from multidrop.drives import YD1000
 from multidrop.errors import LineError
-from multidrop.plant.loader import parse_duration
 from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
+from multidrop.toml_check import parse_duration
 from multidrop.transport.exchange import make_exchange
 from multidrop.transport.line import Line
 

@@ -14,6 +14,7 @@ GAP = 3.5e-3
 READ = bytes.fromhex("01 03 00 01 00 04 15 C9")  # ERMAN, section 6
 WRITE = bytes.fromhex("01 10 00 0C 00 02 04 00 C8 01 90 73 F8")  # ERMAN, section 7
 RUN = b":010620000012C7\r\n"  # Delixi, part 2
+OVER_TCP = bytes.fromhex("00 01 00 00 00 06 01 03 00 16 00 01")
 NATIVE = b":010200020000000005\r\n"  # Delixi, part 3
 
 
@@ -120,7 +121,7 @@ def test_scraps_of_text_are_nothing(text: bytes) -> None:
 @pytest.mark.parametrize("framing", list(Framing))
 def test_anything_at_all_is_survived_within_bounds(framing: Framing) -> None:
     randomness = random.Random(1)
-    good = {Framing.RTU: READ, Framing.ASCII: RUN, Framing.DELIXI: NATIVE}[framing]
+    good = {Framing.RTU: READ, Framing.ASCII: RUN, Framing.DELIXI: NATIVE, Framing.TCP: OVER_TCP}[framing]
     receiver = Receiver(framing, CHARACTER, GAP)
     now = 0.0
     for _ in range(300):

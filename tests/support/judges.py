@@ -170,7 +170,11 @@ class Pymodbus:
         framer = require_module("pymodbus.framer")
         self._pdu = require_module("pymodbus.pdu")
         self._failure = require_module("pymodbus.exceptions").ModbusException
-        kind = {Framing.RTU: framer.FramerType.RTU, Framing.ASCII: framer.FramerType.ASCII}[framing]
+        kind = {
+            Framing.RTU: framer.FramerType.RTU,
+            Framing.ASCII: framer.FramerType.ASCII,
+            Framing.TCP: framer.FramerType.SOCKET,
+        }[framing]
         make = framer.FRAMER_NAME_TO_CLASS[kind]
         self._server = make(self._pdu.DecodePDU(True))
         self._client = make(self._pdu.DecodePDU(False))
@@ -199,13 +203,14 @@ class Pymodbus:
     def build_reply(self, reply: Message) -> bytes:
         if reply.exception:
             refusal = self._pdu.ExceptionResponse(reply.function, reply.exception, device_id=reply.address)
+            refusal.transaction_id = reply.transaction
             return bytes(self._server.buildFrame(refusal))
         return bytes(self._client.buildFrame(self._pdu_of(self._client, reply)))
 
     def _pdu_of(self, framer: Any, message: Message) -> Any:
         head = bytes([message.address, message.function, 0, 0])  # 0: the subfunction of 08
         kind = framer.decoder.lookupPduClass(head)
-        return kind(dev_id=message.address, **_fields(message))
+        return kind(dev_id=message.address, transaction_id=message.transaction, **_fields(message))
 
 
 def _fields(message: Message) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from completions import new_completion
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Exchange, Failure, completion
+from multidrop.core import Completion, Exchange, Failure, Transactions, completion
 
 MS = 1_000_000
 
@@ -13,10 +13,11 @@ MS = 1_000_000
 class LineDriver:
     """Carries exchanges out on a struct md_line; `now` is in ns and moves only when told."""
 
-    def __init__(self) -> None:
+    def __init__(self, transactions: Transactions = Transactions.NONE) -> None:
         self.now = 1000 * MS
         self._line = ffi.new("struct md_line *")
         lib.md_line_init(self._line, self.now)
+        self._line.transactions = transactions
         self.found = new_completion()
         self._exchanges: list[Exchange] = []  # the line holds on to them
 
@@ -52,6 +53,11 @@ class LineDriver:
     def tell_echo(self, known: int) -> None:
         """Set the echo as its user does."""
         self.echo, self._line.echo_is_told = known, known == lib.MD_ECHO
+
+    @property
+    def is_out_of_step(self) -> bool:
+        """True once what came was no header of Modbus TCP: the engine then loses the port."""
+        return bool(self._line.is_out_of_step)
 
     @property
     def completion(self) -> Completion:

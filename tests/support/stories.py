@@ -35,12 +35,14 @@ class Story:
 
     wires: type[WorldWire] = WorldWire
 
-    def __init__(self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY) -> None:
+    def __init__(
+        self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY, port: str = "pty"
+    ) -> None:
         self.every = every
         self.asked = [_polls(drive, every) for drive in drives]
         self.motor = YD1000(31, name="motor")
         sims = [*(EncodedDrive(drive) for drive in drives), simulated(self.motor)]
-        self.wire: Any = self.wires(sims, Faults(seed=seed))
+        self.wire: Any = self.wires(sims, Faults(seed=seed), port=port)
         motor = polled(self.motor, self.motor.readings()[:1], every)
         self.world = World(self.wire, [*self.asked, motor])
         self.truth = proofs(*self.asked)

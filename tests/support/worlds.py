@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,8 +18,17 @@ from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import Completion, Exchange, Message, RowQueue, completion
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Message,
+    RowQueue,
+    TransactionIds,
+    Transactions,
+    completion,
+)
 from multidrop.drive import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
@@ -33,8 +43,17 @@ NEVER = 1 << 62
 ENODEV = 19
 
 
+def transactions_of(line: Any) -> Transactions:
+    """The use of ids on such a line, as transport/line.py tells the core."""
+    if not line.is_tcp:
+        return Transactions.NONE
+    return Transactions.MATCHED if line.ids is TransactionIds.MATCH else Transactions.IGNORED
+
+
 class WorldWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
+
+    ids = TransactionIds.MATCH  # of its gateway, on tcp://
 
     def open(self) -> None:
         path = "world"
@@ -69,7 +88,7 @@ class WorldPort:
     room = 256
     switching = 0.0
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, transactions: Transactions = Transactions.NONE) -> None:
         self._world = world
         self._slots = ffi.new("struct md_slot[]", self.room)
         self._turn = ffi.new("struct md_turn *")
@@ -78,6 +97,9 @@ class WorldPort:
         self._kept: list[object] = []  # the core may still look at it
         self._heard = b""
         lib.md_turn_init(self._turn, self._slots, self.room, world.now)
+        self._turn.line.transactions = transactions
+        if transactions:
+            lib.md_turn_tell_echo(self._turn, lib.MD_NO_ECHO)
 
     # ---- the clients' side ----
 
@@ -159,6 +181,7 @@ class WorldPort:
     def _receive(self) -> None:
         heard, self._heard = self._heard, b""
         lib.md_line_received(ffi.addressof(self._turn.line), heard, len(heard), self._world.now)
+        assert not self._turn.line.is_out_of_step
 
     def _send(self) -> None:
         line, now = self._turn.line, self._world.now
@@ -171,8 +194,10 @@ class WorldPort:
 class WorldLine:
     """A line as the bus sees it (line.Line)."""
 
-    def __init__(self, world: World) -> None:
-        self.port = "world"
+    def __init__(self, world: World, port: str, ids: TransactionIds) -> None:
+        self.port = port
+        self.is_tcp = speaks_tcp(port)
+        self.ids = ids
         self._world = world
         self.queue: WorldPort | None = None
         self.reopen()
@@ -192,7 +217,7 @@ class WorldLine:
         self.close()
         if self._world.wire.port is None:
             raise LineError(self.port, "it is not there")
-        self.queue = self._world.port = WorldPort(self._world)
+        self.queue = self._world.port = WorldPort(self._world, transactions_of(self))
 
     regain = reopen  # it is lost: the poller has dropped it
     is_lost = False  # nobody stops a motor here
@@ -211,12 +236,13 @@ class World:
         self._turn = threading.Condition()
         self._threads = {*threading.enumerate()}
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", lambda port, echo: WorldLine(self))
+        patch.setattr(bus, "Line", lambda port, echo, ids: WorldLine(self, port, ids))
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
         patch.setattr(poller, "RowQueue", self._row_queue)
         wire.open()
-        self.poller = Poller(plant(line("world", *drives)))
+        declared = line(wire.where if speaks_tcp(wire.where) else "world", *drives)
+        self.poller = Poller(plant(replace(declared, ids=wire.ids)))
 
     def __enter__(self) -> World:
         self.poller.__enter__()

@@ -168,7 +168,8 @@ def test_a_port_without_a_descriptor_has_one_kind_of_settings(server: SerialServ
         ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
         (
             "sokcet://127.0.0.1:4001",
-            "there is no sokcet://; a URL is such as socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
+            "there is no sokcet://; a URL is such as tcp://10.0.0.7, socket://10.0.0.7:4001 or "
+            "rfc2217://10.0.0.7:4001",
         ),
         ("socket://[fe80::1%nowhere]:4001", "Name or service not known"),
         ("spy://{tmp}/absent", "there is no such port"),

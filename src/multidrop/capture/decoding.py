@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from fractions import Fraction
 
 from multidrop.capture.lookup import RegisterLookup, RequestTarget, line_of
 from multidrop.capture.pcapng_reader import Capture
-from multidrop.core import Columns, Decoded, Decoder, Field, Names, RowLayout, Stream
+from multidrop.core import Columns, Decoded, Decoder, Field, Framing, Names, RowLayout, Stream
+from multidrop.drive.row_field import row_field
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
 
@@ -74,14 +74,17 @@ class _LineDecoding:
         if len(self._registers) > _MOST_NAMES:
             return False
         target = self._lookup.find(framing, request)
-        block = self._layout(target) if request.address else None  # nobody answers a broadcast
+        is_broadcast = request.address == 0 and framing is not Framing.TCP  # nobody answers one
+        block = None if is_broadcast else self._layout(target)
         return self.decoder.know(block)
 
     def _layout(self, target: RequestTarget) -> RowLayout:
         drive = self._drives.number(target.drive)
         fields = []
         for place in target.places:
-            scale = place.register.scale if place.register else Fraction(1)
-            name = self._registers.number(place.name)
-            fields.append(Field(place.at, place.number_format, name, scale.numerator, scale.denominator))
+            code = self._registers.number(place.name)
+            if place.register is None:
+                fields.append(Field(place.at, place.number_format, code, 1, 1))
+            else:
+                fields.append(row_field(place.register, place.at, code))
         return RowLayout(drive, fields)

@@ -84,13 +84,13 @@ def _known(
 
 
 def _offset(register: Register[Any], request: Message) -> int | None:
-    """Return the register's offset in the data; None unless the request covers all of it."""
+    """Return the register's offset in the data; None unless the request covers all that its value needs."""
     if register.table.carrier is Carrier.NUMBER:
         return 0
-    end = request.start + max(request.count, 1)
-    for address in (register.address, register.ram_address):
-        if address is not None and request.start <= address and address + register.words <= end:
-            return address - request.start
+    end, reach = request.start + max(request.count, 1), register.reach
+    for start in (reach.start, register.ram_address):
+        if start is not None and request.start <= start and start + len(reach) <= end:
+            return start - request.start + register.address - reach.start
     return None
 
 

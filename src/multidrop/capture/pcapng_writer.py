@@ -1,4 +1,4 @@
-"""Write captures: pcapng whose RTU frames Wireshark decodes without settings."""
+"""Write captures: pcapng whose frames of Modbus RTU and TCP Wireshark decodes without settings."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _head(dissector: bytes, sender: tuple[bytes, int] | None, target: tuple[byte
     return tags + _tag(_END, b"")
 
 
-_RTU, _BYTES = b"mbrtu", b"data"  # Wireshark's dissectors
+_RTU, _TCP_FRAME, _BYTES = b"mbrtu", b"mbtcp", b"data"  # Wireshark's dissectors
 _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
@@ -120,10 +120,21 @@ _PACKETS = {  # side: dissector of a frame that is no text, sender, target, opti
     Side.FAILED: (_RTU, _FAILED, _MASTER, [(_COMMENT, b"came in place of a reply"), _INBOUND]),
     Side.NOISE: (_BYTES, _NOISE, _MASTER, [(_COMMENT, b"part of no exchange"), _INBOUND]),
 }
-WRAPPINGS = Wrappings(
-    {
-        (side, is_text): (_head(_BYTES if is_text else dissector, sender, target), _options(*options))
-        for side, (dissector, sender, target, options) in _PACKETS.items()
-        for is_text in (False, True)
-    }
-)
+
+
+def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
+    """Return those of lines whose frames these dissectors take; others begin with ':' and are texts."""
+    return Wrappings(
+        {
+            (side, is_text): (
+                _head((texts if is_text else frames) if dissector == _RTU else dissector, sender, target),
+                _options(*options),
+            )
+            for side, (dissector, sender, target, options) in _PACKETS.items()
+            for is_text in (False, True)
+        }
+    )
+
+
+WRAPPINGS = _wrappings(_RTU, _BYTES)
+TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # of tcp:// ports, whose ids may begin like a text

@@ -7,7 +7,7 @@ from typing import Protocol, Self
 
 from multidrop.bus import Bus
 from multidrop.capture.anomalies import AnomalyWatch
-from multidrop.capture.pcapng_writer import WRAPPINGS
+from multidrop.capture.pcapng_writer import TCP_WRAPPINGS, WRAPPINGS
 from multidrop.core import Tap, utc_minus_monotonic_ns
 
 
@@ -35,6 +35,7 @@ class Tapped:
         self._sinks = sinks
         self._watches = [AnomalyWatch(name, bus) for name, bus in buses.items()]
         self._taps = [Tap() for _ in buses]
+        self._wrappings = [TCP_WRAPPINGS if bus.line.is_tcp else WRAPPINGS for bus in buses.values()]
         for bus, tap in zip(buses.values(), self._taps, strict=True):
             bus.line.tap(tap)
 
@@ -47,8 +48,8 @@ class Tapped:
 
     def _hand_on(self) -> None:
         offset = utc_minus_monotonic_ns()
-        for interface, tap in enumerate(self._taps):
-            for packets in tap.take(WRAPPINGS, interface, offset):
+        for interface, (tap, wrappings) in enumerate(zip(self._taps, self._wrappings, strict=True)):
+            for packets in tap.take(wrappings, interface, offset):
                 for sink in self._sinks:
                     sink.append(packets)
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from multidrop.capture.lookup import RegisterLookup, RegisterPlace, RequestTarget
 from multidrop.capture.pairing import Junk, Sniffed, SniffedExchange
-from multidrop.core import Framing, Message, raw_value
+from multidrop.core import Framing, Message, Status, raw_value
+from multidrop.drive.number_format import bits_in
 from multidrop.iso_time import format_time
 
 _MOST_SHOWN = 16  # raw registers in a line of text
@@ -111,20 +112,20 @@ def _hex(raw: bytes) -> str:
 
 
 def _number(place: RegisterPlace, data: bytes) -> float | int | None:
+    if place.register is not None:
+        number = place.register.number_in(data, place.at)
+        return number if number is None or place.register.values is None else int(number)
     raw = raw_value(data, place.at, place.number_format)
-    if raw != raw:  # NaN: the data ends before it
-        return None
-    if place.register is None or place.register.values is not None:
-        return int(raw)
-    scale = place.register.scale
-    return raw * scale.numerator / scale.denominator
+    return int(raw) if raw == raw else None  # NaN: the data ends before it
 
 
 def _shown(place: RegisterPlace, data: bytes) -> str:
-    raw = raw_value(data, place.at, place.number_format)
-    if raw != raw:
-        return f"{place.name} ?"
     register = place.register
+    raw = raw_value(data, place.at, place.number_format)
     if register is None:
-        return f"{place.name} = {int(raw)}"
-    return f"{register.name} = {register.format(register.decode(raw))}"
+        return f"{place.name} = {int(raw)}" if raw == raw else f"{place.name} ?"
+    value = register.value_in(data, place.at)
+    if value is not None:
+        return f"{register.name} = {register.format(value)}"
+    is_there = bits_in(data, place.at, register.number_format, register.order) is not None
+    return f"{register.name}: {Status.NO_VALUE}" if is_there else f"{register.name} ?"

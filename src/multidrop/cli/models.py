@@ -5,38 +5,48 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned, wrapped
-from multidrop.core import Framing
+from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit, stated_limit
 from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
-from multidrop.drives.registry import find_model, is_users_own
+from multidrop.drives.registry import SHIPPED, find_model, is_users_own, shipped_family
 from multidrop.planning.reading_gain import ReadingGain, reading_gain
+from multidrop.plant.loader import load_plant
 
 INDENT = 16  # of a family's facts
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", metavar="MODEL", nargs="?", help="one family; or path/to/file.py:Class")
+    parser.add_argument(
+        "model", metavar="MODEL", nargs="?", help="one family; or path/to/file.toml, or path/to/file.py:Class"
+    )
+    parser.add_argument("drive", metavar="DRIVE", nargs="?", help="of the plant file in place of MODEL")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.model is None:
-        families = list(MODELS.values())
+        families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
     else:
-        family = find_model(arguments.model)
-        print_text(json.dumps(_facts(family), indent=2) if arguments.json else _sheet(family))
+        family = _family(arguments.model, arguments.drive)
+        print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
     return 0
+
+
+def _family(model: str, drive: str | None) -> type[Drive]:
+    return find_model(model) if drive is None else type(load_plant(model).find_drive(drive)[1])
 
 
 def _list(families: list[type[Drive]]) -> str:
@@ -61,7 +71,7 @@ def _range(numbers: range) -> str:
 # ---- one family as text ----
 
 
-def _sheet(family: type[Drive]) -> str:
+def sheet(family: type[Drive]) -> str:
     lines = [family.title or family.__name__, *wrapped(family.manual), ""]
     for name, text in _lines_of(family):
         lines += wrapped(text, f"{name:<{INDENT}}", " " * INDENT)
@@ -74,6 +84,8 @@ def _sheet(family: type[Drive]) -> str:
                 lines += wrapped(meaning, f"  {name}  ", " " * 8)
     for table in dict.fromkeys(register.table for register in family.registers.values()):
         lines += ["", _table_heading(table, family), *_registers(family, table)]
+    if family.texts:
+        lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<")]
     if family.__doc__:
         lines.append("")
         for line in inspect.cleandoc(family.__doc__).splitlines():
@@ -83,6 +95,8 @@ def _sheet(family: type[Drive]) -> str:
 
 def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     yield "model", family.model or "(a file of your own)"
+    if family.declared_in:
+        yield "origin", f"declared by its file, not tested by us; see `multidrop check {family.declared_in}`"
     yield "addresses", _range(family.addresses)
     default = " (the first is the default)" if len(family.baudrates) > 1 else ""
     yield "baud rates", ", ".join(map(str, family.baudrates)) + default
@@ -184,13 +198,16 @@ def _row(register: Register[Any]) -> tuple[str, ...]:
     return f"{register.address:04X}H", register.name, register.access.value, what.strip(), span
 
 
+def _text_row(text: Text) -> tuple[str, ...]:
+    return f"  {text.address:04X}H", text.name, f"{2 * text.length} characters", text.place
+
+
 def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.access is Access.SETTING or register.kept is not Kept.UNKNOWN:
         yield f"kept: {register.kept.value}"
     if register.ram_address is not None:
         yield f"written at {register.ram_address:04X}H, in RAM"
-    if register.words > 1:
-        yield f"{register.words} words, {register.number_format.name}"
+    yield from _number(register)
     if register.at_least:
         yield f"at least {register.at_least}"
     if register.at_most:
@@ -215,6 +232,27 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
 
 
+def _number(register: Register[Any]) -> Iterator[str]:
+    if register.words > 1:
+        order = "" if register.order in ("AB", "ABCD") else f" in the order {register.order}"
+        yield f"{register.words} words, {register.number_format.name}{order}"
+    elif register.number_format in (NumberFormat.I8, NumberFormat.BCD16):
+        yield register.number_format.name
+    if register.part:
+        low, high = register.part
+        yield f"bit {low} of its word" if low == high else f"bits {low} to {high} of its word"
+    if register.offset:
+        yield f"{register.offset:+g} {register.unit}".rstrip()
+    if register.scale_register:
+        yield f"times ten to the power of {register.scale_register}"
+    if register.invalid:
+        yield "no value: " + ", ".join(_count(register, count) for count in register.invalid)
+
+
+def _count(register: Register[Any], count: float) -> str:
+    return f"{count:g}" if register.is_float or count < 0 else f"{int(count):04X}H"
+
+
 def _bits(register: Register[Any], mask: int) -> str:
     return register.format(register.decode(mask)).replace("|", " and ")
 
@@ -226,13 +264,14 @@ def _summary(family: type[Drive]) -> dict[str, Any]:
     return {
         "model": family.model,
         "title": family.title,
+        "declared_in": family.declared_in or None,
         "framings": [str(framing) for framing in family.framings],
         "addresses": [family.addresses[0], family.addresses[-1]],
         "register_count": len(family.registers),
     }
 
 
-def _facts(family: type[Drive]) -> dict[str, Any]:
+def facts(family: type[Drive]) -> dict[str, Any]:
     return _summary(family) | {
         "manual": family.manual,
         "baudrates": family.baudrates,
@@ -265,6 +304,10 @@ def _facts(family: type[Drive]) -> dict[str, Any]:
         "remote": family.remote,
         "watchdog": family.watchdog,
         "registers": [_register(register) for register in family.registers.values()],
+        "texts": [
+            {"name": text.name, "table": text.table.name, "address": text.address, "length": text.length}
+            for text in family.texts.values()
+        ],
         "notes": inspect.cleandoc(family.__doc__ or ""),
     }
 
@@ -277,6 +320,11 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "access": register.access.value,
         "at_least": register.at_least or None,
         "at_most": register.at_most or None,
+        "part": register.part,
+        "invalid": [count if math.isfinite(count) else str(count) for count in register.invalid],
+        "offset": register.offset,
+        "order": register.order,
+        "scale_register": register.scale_register or None,
         "values": None if names is None else {member.name: member.value for member in names},
         "wire": register.number_format.name,
         "kept": register.kept.value,
@@ -284,7 +332,8 @@ def _register(register: Register[Any]) -> dict[str, Any]:
 
 
 _REGISTER_KEYS = (  # in this order
-    *("name", "table", "address", "access", "unit", "step", "span", "at_least", "at_most", "values", "wire"),
+    *("name", "table", "address", "access", "unit", "step", "offset", "span", "at_least", "at_most"),
+    *("values", "wire", "order", "part", "invalid", "scale_register"),
     *("kept", "ram_address", "default", "while_running", "broadcast", "moves", "harmless", "never_together"),
     *("never", "place", "outside", "note"),
 )

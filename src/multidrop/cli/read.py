@@ -7,53 +7,73 @@ import json
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, drive_of
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.target import add_target_arguments, target_of
 from multidrop.cli.support.values import Row, aligned, as_json, as_row
+from multidrop.core import Status
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.errors import DriveRefused
+from multidrop.drive.text import Text
+from multidrop.errors import DriveRefused, NoValue
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_target_arguments(parser)
-    parser.add_argument(
-        "registers", metavar="REGISTER", nargs="*", default=[], help="all readings and settings if none"
-    )
+    add_target_arguments(parser, "[REGISTER ...]")
+    parser.description = f"{parser.description} Without a REGISTER: all that can be read."
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = drive_of(arguments)
-    wanted = [drive.register(name) for name in arguments.registers]
+    target, names = target_of(arguments)
+    drive = target.drive
+    texts = [drive.texts[name] for name in names if name in drive.texts]
+    wanted = [drive.register(name) for name in names if name not in drive.texts]
     for register in wanted:
         if not register.readable:
-            raise ValueError(f"{register.name} can only be written; see `multidrop models {arguments.model}`")
-    wanted = wanted or [register for register in drive.registers.values() if register.readable]
-    with Bus(arguments.port) as bus:
-        bus.attach(drive)
+            raise ValueError(f"{register.name} can only be written; see `multidrop models {target.model}`")
+    if not names:
+        texts = list(drive.texts.values())
+        wanted = [register for register in drive.registers.values() if register.readable]
+    with target.open_bus() as bus:
         values = _read(bus, drive, wanted)
+        read_texts = {text: _read_text(bus, drive, text) for text in texts}
     if arguments.json:
         record = {"drive": drive.name, "model": drive.model, "address": drive.address}
         shown = {register.name: _as_json(register, value) for register, value in values.items()}
+        shown |= {text.name: _text_as_json(answer) for text, answer in read_texts.items()}
         print_text(json.dumps(record | {"values": shown}, indent=2))
     else:
-        print_text("\n".join(aligned([_row(*answer) for answer in values.items()], "<><")))
-    return 1 if any(isinstance(value, DriveRefused) for value in values.values()) else 0
+        lines = aligned([_row(*answer) for answer in values.items()], "<><")
+        lines += aligned([_text_row(*answer) for answer in read_texts.items()], "<<")
+        print_text("\n".join(lines))
+    answers = (*values.values(), *read_texts.values())
+    return 1 if any(isinstance(answer, DriveRefused) for answer in answers) else 0
 
 
 def _read(bus: Bus, drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Return each register's value, or the drive's refusal."""
+    """Return each register's value, the drive's refusal, or None where it has no valid value."""
     try:
         found = bus.read_many(drive, wanted)
+    except NoValue as lack:
+        found = dict(lack.values)
     except DriveRefused:  # which register, only single reads show
         return {register: _read_one(bus, drive, register) for register in wanted}
-    return {register: found[register.name] for register in wanted}
+    return {register: found.get(register.name) for register in wanted}
 
 
 def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
     try:
         return bus.read(drive, register)
+    except NoValue:
+        return None
+    except DriveRefused as refusal:
+        return refusal
+
+
+def _read_text(bus: Bus, drive: Drive, text: Text) -> str | DriveRefused:
+    try:
+        return bus.read_text(drive, text)
     except DriveRefused as refusal:
         return refusal
 
@@ -61,10 +81,24 @@ def _read_one(bus: Bus, drive: Drive, register: Register[Any]) -> Any:
 def _row(register: Register[Any], value: Any) -> Row:
     if isinstance(value, DriveRefused):
         return register.name, "", f"refused: {value.meaning}"
+    if value is None:
+        return register.name, "", str(Status.NO_VALUE)
     return as_row(register, value)
+
+
+def _text_row(text: Text, answer: str | DriveRefused) -> Row:
+    return text.name, f"refused: {answer.meaning}" if isinstance(answer, DriveRefused) else answer
+
+
+def _text_as_json(answer: str | DriveRefused) -> dict[str, Any]:
+    if isinstance(answer, DriveRefused):
+        return {"value": None, "refused": answer.meaning, "code": answer.code}
+    return {"value": answer}
 
 
 def _as_json(register: Register[Any], value: Any) -> dict[str, Any]:
     if isinstance(value, DriveRefused):
         return {"value": None, "refused": value.meaning, "code": value.code}
+    if value is None:
+        return {"value": None, "reason": str(Status.NO_VALUE)}
     return as_json(register, value)

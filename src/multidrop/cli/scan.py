@@ -10,10 +10,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument, add_port_argument
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 from multidrop.scan import (
@@ -26,6 +28,7 @@ from multidrop.scan import (
     Sweep,
     Untried,
     one_of_each_framing,
+    over_tcp,
     plant_text,
     scan,
     sweeps,
@@ -36,7 +39,7 @@ _CLEAR_LINE = "\r\x1b[K"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_port_argument(parser)
+    add_line_arguments(parser)
     parser.add_argument("--model", action="append", default=[], help="only these; all families without it")
     parser.add_argument(
         "--addresses",
@@ -57,6 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.out:
         check_writable(arguments.out)
+    if plant := plant_at(arguments):
+        arguments.port = line_of(plant, arguments.name).port
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
     found: list[Finding] = []
@@ -72,17 +77,17 @@ def run(arguments: argparse.Namespace) -> int:
         line.close()
     seconds = round(time.monotonic() - begun, 3)
     drives = [finding for finding in found if isinstance(finding, Found)]
-    plant = None
+    written = None
     if arguments.out and any(drive.models for drive in drives):
         arguments.out.write_text(plant_text(arguments.port, drives, families), "utf-8")
-        plant = str(arguments.out)
+        written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}
-        print_text(json.dumps(record | _as_json(found) | {"plant": plant}, indent=2))
+        print_text(json.dumps(record | _as_json(found) | {"plant": written}, indent=2))
     else:
         print_text(_summary(len(drives), seconds, arguments.addresses))
-        if plant:
-            print_text(f"{plant} is ready: multidrop poll {plant}")
+        if written:
+            print_text(f"{written} is ready: multidrop poll {written}")
     if not finished:
         raise KeyboardInterrupt
     return 0 if drives else 1
@@ -94,7 +99,12 @@ def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
     for text in models or MODELS:
         path, colon, name = text.rpartition(":")
         whole = f"{Path(path).resolve()}:{name}" if colon and path.endswith(".py") else text
+        if text.endswith(".toml"):
+            whole = str(Path(text).resolve())
         named[whole] = find_model(text)
+    models = [family.model for family in named.values() if family.model]
+    if twice := sorted({model for model in models if models.count(model) > 1}):
+        raise ValueError(f"two files are called {twice[0]}: scan for one of them at a time, or rename it")
     return named
 
 
@@ -110,6 +120,8 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     )
     if arguments.quick:
         planned = planned[: len(planned) // 2]
+    if speaks_tcp(arguments.port):
+        return over_tcp(planned)
     return one_of_each_framing(planned) if fixed else planned
 
 

@@ -6,14 +6,19 @@ import argparse
 from pathlib import Path
 
 from multidrop.cli.support.output import print_text
+from multidrop.drive.network import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, Simulator, Wire, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 
+ANY_TCP = "tcp://127.0.0.1:0"  # for a line on tcp://: any free port of this machine
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("plant", metavar="PLANT.toml", help="the drives; each line's port is ignored")
+    parser.add_argument(
+        "plant", metavar="PLANT.toml", help="the drives; each line's port is ignored, but for tcp://"
+    )
     parser.add_argument(
         "--ports", metavar="DIR", type=Path, required=True, help="where a link to each line's port is put"
     )
@@ -42,7 +47,8 @@ def _wire(line: PlantLine, directory: Path, faults: Faults, unpaced: bool) -> Wi
     if link.is_symlink() or link.exists():
         raise ValueError(f"{link} is there already: remove it, or choose another directory with --ports")
     drives = [simulated(polled.drive) for polled in line.drives]
-    return FaultyWire(drives, faults, name=line.name, port=str(link), unpaced=unpaced)
+    port = ANY_TCP if speaks_tcp(line.port) else str(link)
+    return FaultyWire(drives, faults, name=line.name, port=port, unpaced=unpaced)
 
 
 def _announce(simulator: Simulator) -> None:

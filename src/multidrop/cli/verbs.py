@@ -9,16 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from multidrop.bus import Bus
-from multidrop.cli.support.arguments import (
-    add_json_argument,
-    add_target_arguments,
-    add_writing_arguments,
-    drive_of,
-    duration,
-)
+from multidrop.cli.support.arguments import add_json_argument, add_writing_arguments, duration
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.target import Target, add_target_arguments, check_words, number_of, target_of
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Script, Write
@@ -26,6 +20,7 @@ from multidrop.drive.state import Direction, State
 from multidrop.errors import Unsupported
 
 _DIRECTED = ("start", "jog")
+_FURTHER = {"set-frequency": ("HZ",)}  # arguments of commands behind the drive
 _STOPS = ("stop", "coast", "emergency-stop")
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # they print what the motor does when the client dies
 _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
@@ -37,16 +32,14 @@ _QUESTIONS = {  # asked before anything is sent; a stop needs no confirmation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_target_arguments(parser)
     command = parser.get_default("command")
+    add_target_arguments(parser, *_FURTHER.get(command, ()))
     if command in _DIRECTED:
         parser.add_argument(
             "--direction",
             choices=[direction.value for direction in Direction],
             help="the one in force if not given",
         )
-    if command == "set-frequency":
-        parser.add_argument("frequency", metavar="HZ", type=float, help="the setpoint in Hz")
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=float, help="write this setpoint first")
     if command in _STOPS:
@@ -62,7 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = drive_of(arguments)
+    target, words = target_of(arguments)
+    check_words(arguments, words, _FURTHER.get(arguments.command, ()))
+    if words:
+        arguments.frequency = number_of(arguments, "HZ", words[0])
+    drive = target.drive
     verb = getattr(drive, arguments.command.replace("-", "_"))
     parameters = _parameters(arguments)
     _rehearse(verb.script(*parameters))
@@ -70,10 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
     setpoint = None if hz is None else _setpoint(drive, hz)
     if arguments.command in _QUESTIONS:
         drive.check_confirmed(arguments.command)
-        confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {arguments.port}?", arguments)
+        confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in _STOPS else {}
-    with Bus(arguments.port, audit=getattr(arguments, "audit", None)) as bus, _annotating(arguments) as known:
-        bus.attach(drive)
+    audit = getattr(arguments, "audit", None)
+    with target.open_bus(audit) as bus, _annotating(arguments.command, target) as known:
         if hz is not None and arguments.command != "set-frequency":
             drive.set_frequency(hz)
         state = verb(*parameters, **limit)
@@ -101,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _annotating(arguments: argparse.Namespace) -> Iterator[list[str]]:
+def _annotating(command: str, target: Target) -> Iterator[list[str]]:
     """Add to an interruption what is known of the verb, and the command that stops the motor."""
     known: list[str] = []
     try:
@@ -109,18 +106,9 @@ def _annotating(arguments: argparse.Namespace) -> Iterator[list[str]]:
     except KeyboardInterrupt as interruption:
         for text in known:
             interruption.add_note(text)
-        if arguments.command != "state":
-            interruption.add_note(f"to stop it, type: {_stop_line(arguments)}")
+        if command != "state":
+            interruption.add_note(f"to stop it, type: {shlex.join(('multidrop', 'stop', *target.words))}")
         raise
-
-
-def _stop_line(arguments: argparse.Namespace) -> str:
-    words = ["multidrop", "stop", arguments.port, arguments.model, str(arguments.address)]
-    for name in ("baudrate", "format", "framing"):
-        if getattr(arguments, name) is not None:
-            words += [f"--{name}", str(getattr(arguments, name))]
-    words += [f"--option={name}={value:g}" for name, value in arguments.option]
-    return shlex.join(words)
 
 
 def _setpoint(drive: Drive, hz: float) -> Write | None:

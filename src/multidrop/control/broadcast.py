@@ -14,6 +14,7 @@ from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
 from multidrop.control.rules import is_harmless, raw_count
 from multidrop.control.writer import Writer
+from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.state import State
@@ -32,6 +33,14 @@ class Broadcaster:
         self, drives: Sequence[Drive], register: Register[Any], value: Any
     ) -> dict[str, State | BusError]:
         """Write to all; then read each one's state, or why it says none. Raises Refused."""
+        if drives and drives[0].framing is Framing.TCP:
+            raise Refused(
+                f"{register.name} cannot be broadcast over Modbus TCP: unit id 0 is the gateway or the "
+                "device itself, and what it does with a write is its maker's choice; write to one after "
+                "another",
+                register=register.name,
+                rule="Modbus TCP has no broadcast",
+            )
         if not _are_alike(drives):
             raise Refused(
                 f"{register.name} cannot be broadcast: the drives on this line differ in family or settings, "
@@ -63,7 +72,7 @@ class Broadcaster:
         """Broadcast a stop where all drives are known and have one; True where it was sent."""
         known = all(self._writer.identity_check.is_known(drive) for drive in drives)
         control = drives[0].registers.get("control") if drives else None
-        if len(drives) < 2 or not _are_alike(drives) or not known:
+        if len(drives) < 2 or not _are_alike(drives) or not known or drives[0].framing is Framing.TCP:
             return False
         if control is None or not control.broadcast:
             return False

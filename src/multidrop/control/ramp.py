@@ -88,10 +88,7 @@ def _own_rate(drive: Drive) -> Script[float | None]:
 
 def _present(drive: Drive, register: Register[float]) -> Script[float]:
     """Return the setpoint in force, in Hz."""
-    if not register.readable:
-        held = drive.commanded
-        if held is None:
-            raise Refused(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
-        return held
-    held = yield from read(register)
+    held = (yield from read(register)) if register.readable else drive.commanded
+    if held is None:
+        raise Refused(f"{drive.name} cannot say its setpoint: call set_frequency before a ramp")
     return held * drive.option["maximum_frequency"] / 100 if register.unit == "%" else held

@@ -101,8 +101,9 @@ class WriteRecords:
             _log.warning("a stop was not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
-        model = drive.model or type(drive).__name__
-        return LedgerCell(self._line.identity, drive.address, model, register.name, self._line.port)
+        return LedgerCell(
+            self._line.identity, drive.address, drive.ledger_name, register.name, self._line.port
+        )
 
     def close(self) -> None:
         self.catch_up()

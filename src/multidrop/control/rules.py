@@ -11,6 +11,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Kept, Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
+from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.errors import Advice, Refused, Unsupported
 
@@ -56,14 +57,29 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
         raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
 
 
+def check_own_text(drive: Drive, text: Text) -> None:
+    """Raise ValueError for another family's text, TypeError for what is none."""
+    if not isinstance(drive, Drive):
+        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
+    if not isinstance(text, Text):
+        raise TypeError(f"{text!r} is no text of {drive.name}: use its attribute, or drive.texts[NAME]")
+    if drive.texts.get(text.name) is not text:
+        family = drive.title or type(drive).__name__
+        raise ValueError(f"this {text.name} is no text of {drive.name}, which is a {family}")
+
+
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise Refused unless a plain write may do this: only a verb moves a motor or resets a fault.
 
-    A command that moves nothing by itself is sent to a drive that is known to be of its class.
+    A command that moves nothing by itself is sent to a drive that is known to be of its class. What a file
+    calls harmless is believed where its stop was checked with it.
     """
+    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
     if is_harmless(register, raw):
+        if is_unproven and not _has(drive, "stop"):
+            drive.check_confirmed(register.name)
         return
-    if register.access is Access.COMMAND and not register.commands:
+    if (register.access is Access.COMMAND or is_unproven) and not register.commands:
         drive.check_confirmed(register.name)
     if not register.commands:
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     NotAttached,
+    NoValue,
     Overtaken,
     Unconfirmed,
 )
@@ -54,7 +55,8 @@ class Writer:
         kept = wears(drive, register)
         if kept is not Kept.RAM:
             if register.readable:
-                with call.look():
+                held = None
+                with call.look(), suppress(NoValue):
                     held = self._exchanges.value(drive, register)
                 if held == asked:
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)

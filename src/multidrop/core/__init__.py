@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from multidrop.core.columns import COLUMNS, Columns, Field, Names, NumberFormat, RowLayout, raw_value, spell
+from multidrop.core.columns import (
+    COLUMNS,
+    LOW_BYTE_FIRST,
+    LOW_WORD_FIRST,
+    MOST_INVALID,
+    Columns,
+    Extra,
+    Field,
+    Names,
+    NumberFormat,
+    RowLayout,
+    raw_value,
+    spell,
+)
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
 from multidrop.core.exchange import Completion, Exchange, Peer, completion
 from multidrop.core.frame import (
+    MODBUS,
     Framing,
     Message,
     build_reply,
     build_request,
+    characters_on_wire,
     crc16,
     lrc,
     parse_reply,
@@ -18,7 +33,7 @@ from multidrop.core.frame import (
     sum8,
 )
 from multidrop.core.latch import Latch, Permit
-from multidrop.core.port import Echo, Port, now_ns, utc_minus_monotonic_ns
+from multidrop.core.port import Echo, Port, TransactionIds, Transactions, now_ns, utc_minus_monotonic_ns
 from multidrop.core.port_settings import (
     REFUSALS,
     CharacterFormat,
@@ -48,6 +63,10 @@ __all__ = [
     "COLUMNS",
     "DELAY_BUCKETS",
     "EXCEPTION_STATUS",
+    "LOW_BYTE_FIRST",
+    "LOW_WORD_FIRST",
+    "MODBUS",
+    "MOST_INVALID",
     "REFUSALS",
     "STATUSES",
     "STREAM_ROOM",
@@ -60,6 +79,7 @@ __all__ = [
     "Decoder",
     "Echo",
     "Exchange",
+    "Extra",
     "Failure",
     "Field",
     "FrameFault",
@@ -80,11 +100,14 @@ __all__ = [
     "Status",
     "Stream",
     "Tap",
+    "TransactionIds",
+    "Transactions",
     "Unpacked",
     "Unpacker",
     "Wrappings",
     "build_reply",
     "build_request",
+    "characters_on_wire",
     "completion",
     "crc16",
     "delay_edge",

@@ -13,47 +13,112 @@ from multidrop._core import ffi, lib
 
 
 class NumberFormat(IntEnum):
-    """The format of a number in a reply's data; words are big-endian, SWAPPED has the low word first."""
+    """The format of a number in a reply's data, the most significant byte first; `order` changes that."""
 
     U16 = lib.MD_U16
     I16 = lib.MD_I16
     U32 = lib.MD_U32
     I32 = lib.MD_I32
-    U32_SWAPPED = lib.MD_U32_SWAPPED
-    I32_SWAPPED = lib.MD_I32_SWAPPED
     U32_EITHER = lib.MD_U32_EITHER
     F32 = lib.MD_F32
-    F32_SWAPPED = lib.MD_F32_SWAPPED
     BIT = lib.MD_BIT
+    I8 = lib.MD_I8  # the low byte of a word
+    U64 = lib.MD_U64
+    I64 = lib.MD_I64
+    F64 = lib.MD_F64
+    BCD16 = lib.MD_BCD16
+    BCD32 = lib.MD_BCD32
 
 
-def raw_value(data: bytes, at: int, number_format: NumberFormat) -> float:
-    """Read the number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it."""
+LOW_WORD_FIRST: int = lib.MD_LOW_WORD_FIRST  # added to a format
+LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # within each word
+MOST_INVALID: int = lib.MD_MOST_INVALID
+
+_MAY_LACK = frozenset({NumberFormat.F32, NumberFormat.F64, NumberFormat.BCD16, NumberFormat.BCD32})
+
+
+def raw_value(data: bytes, at: int, number_format: int) -> float:
+    """Read the number at word (BIT: bit) `at` of a reply's data; NaN where the data ends before it.
+
+    The order of words and bytes is added to the format.
+    """
     return float(lib.md_value(data, len(data), at, number_format))
+
+
+class Extra(NamedTuple):
+    """Rest of a field (struct md_extra): value = (raw * multiplier + addend) / divisor."""
+
+    addend: float = 0.0
+    low: int = 0  # raw is so many bits of the number, from this one on
+    bits: int = 0  # 0: all
+    scale_at: int | None = None  # place of the power of ten
+    scale_format: int = NumberFormat.I16  # of which the low 16 bits are a signed number
+    invalid: tuple[tuple[int, int], ...] = ()  # mask and pattern of bits that mean no value
+    scale_invalid: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def may_lack(self) -> bool:
+        """True where a good reply may hold no value."""
+        return bool(self.invalid) or self.scale_at is not None
 
 
 class Field(NamedTuple):
     """A register's place in a block's reply, its scale, and the code of its name."""
 
     at: int
-    number_format: NumberFormat
+    number_format: int  # with its order
     register: int
     multiplier: float
     divisor: float
+    extra: Extra | None = None
+
+    @property
+    def may_lack(self) -> bool:
+        """True where a good reply may hold no value."""
+        may = self.number_format & (LOW_WORD_FIRST - 1) in _MAY_LACK
+        return may or (self.extra is not None and self.extra.may_lack)
 
 
 @lru_cache(maxsize=1024)
-def _shared(fields: tuple[Field, ...]) -> Any:
-    """Return one array for all drives of a kind: it stays in the processor's cache."""
-    return ffi.new("struct md_field[]", fields)
+def _shared(fields: tuple[Field, ...]) -> tuple[Any, Any]:
+    """Return arrays of the fields and of their extras for all drives of a kind: they stay in the cache."""
+    extras = list(dict.fromkeys(field.extra for field in fields if field.extra is not None))
+    places = {extra: place for place, extra in enumerate(extras, 1)}
+    return (
+        ffi.new("struct md_field[]", [(*f[:3], places[f.extra] if f.extra else 0, *f[3:5]) for f in fields]),
+        ffi.new("struct md_extra[]", list(map(_packed, extras))),
+    )
+
+
+def _packed(extra: Extra) -> dict[str, Any]:
+    return {
+        "addend": extra.addend,
+        "low": extra.low,
+        "bits": extra.bits,
+        "has_scale": extra.scale_at is not None,
+        "scale_at": extra.scale_at or 0,
+        "scale_format": extra.scale_format,
+        "invalid_count": len(extra.invalid),
+        "scale_invalid_count": len(extra.scale_invalid),
+        "invalid": [*extra.invalid, *extra.scale_invalid],
+    }
 
 
 class RowLayout:
     """The fields of one exchange's reply, of a drive given by the code of its name (struct md_block)."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
-        self._fields = _shared(tuple(fields))
-        self.c = ffi.new("struct md_block *", {"fields": self._fields, "count": len(fields), "drive": drive})
+        self._fields, self._extra = _shared(tuple(fields))
+        self.c = ffi.new(
+            "struct md_block *",
+            {
+                "fields": self._fields,
+                "extra": self._extra,
+                "count": len(fields),
+                "may_lack": any(field.may_lack for field in fields),
+                "drive": drive,
+            },
+        )
         self.count = len(fields)
 
     @property

@@ -1,4 +1,4 @@
-"""Frames in three framings: built and parsed."""
+"""Frames in four framings: built and parsed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ class Framing(IntEnum):
     RTU = lib.MD_RTU
     ASCII = lib.MD_ASCII
     DELIXI = lib.MD_DELIXI
+    TCP = lib.MD_TCP  # Modbus TCP (MBAP): of every exchange on a tcp:// port, and of no other
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -32,6 +33,16 @@ class Message:
     count: int = 0
     data: bytes = b""
     exception: int = 0
+    transaction: int = 0  # of Modbus TCP alone
+
+
+MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # they wrap the same bytes
+_LONGER_THAN_RTU = 4  # bytes of a frame of Modbus TCP
+
+
+def characters_on_wire(framing: Framing, length: int) -> int:
+    """Return the characters of a frame on a drive's own wire: behind a gateway it is RTU's."""
+    return length - _LONGER_THAN_RTU if framing is Framing.TCP else length
 
 
 def to_c(message: Message) -> Any:
@@ -44,6 +55,7 @@ def to_c(message: Message) -> Any:
                 "address": message.address,
                 "function": message.function,
                 "exception": message.exception,
+                "transaction": message.transaction,
                 "start": message.start,
                 "count": message.count,
                 "data_len": len(message.data),
@@ -62,6 +74,7 @@ def from_c(found: Any) -> Message:
         found.count,
         bytes(ffi.buffer(found.data, found.data_len)),
         found.exception,
+        found.transaction,
     )
 
 
@@ -95,7 +108,7 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """Parse the reply to `request`, as parse_request does."""
+    """Parse the reply to `request`, whatever its transaction, as parse_request does."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None

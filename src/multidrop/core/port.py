@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from functools import cache
 from typing import Any
 from weakref import finalize
@@ -29,6 +29,25 @@ class Echo(StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> Echo:
         raise ValueError(f'echo {value!r} is none of "auto", "on" and "off"')
+
+
+class TransactionIds(StrEnum):
+    """A gateway's transaction ids: its replies `MATCH` their requests, or it has ids of its own: `IGNORE`."""
+
+    MATCH = "match"
+    IGNORE = "ignore"
+
+    @classmethod
+    def _missing_(cls, value: object) -> TransactionIds:
+        raise ValueError(f'transaction {value!r} is none of "match" and "ignore"')
+
+
+class Transactions(IntEnum):
+    """The use of transaction ids on a port (enum md_transactions)."""
+
+    NONE = lib.MD_NO_TRANSACTIONS  # it has none: any framing but Modbus TCP
+    MATCHED = lib.MD_MATCHED  # a reply has its request's id, and any other is late or foreign
+    IGNORED = lib.MD_IGNORED  # a gateway replies with ids of its own
 
 
 _ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
@@ -62,11 +81,14 @@ class Port:
     """A line driven on a descriptor by the core's thread (struct md_port).
 
     `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings. `room` is
-    how many exchanges may be queued, a power of two. OSError where the descriptor cannot be waited for.
+    how many exchanges may be queued, a power of two. With `transactions` all of them are of Modbus TCP,
+    and without them none is. OSError where the descriptor cannot be waited for.
     """
 
-    def __init__(self, fd: int, must_take: int, room: int = 256) -> None:
-        self.c = lib.md_port_open(_engine().c, fd, must_take, room)
+    def __init__(
+        self, fd: int, must_take: int, room: int = 256, *, transactions: Transactions = Transactions.NONE
+    ) -> None:
+        self.c = lib.md_port_open(_engine().c, fd, must_take, transactions, room)
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self.room = room

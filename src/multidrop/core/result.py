@@ -55,6 +55,7 @@ class Status(IntEnum):
     NOT_ASKED = lib.MD_NOT_ASKED
     POLL_ENDED = -Failure.POLL_ENDED
     MAYBE_ECHO = -Failure.MAYBE_ECHO
+    NO_VALUE = lib.MD_NO_VALUE
 
     def __str__(self) -> str:
         return STATUSES[self]
@@ -79,6 +80,7 @@ _WORDS: dict[int, str] = {
     Status.NOT_ASKED: "not asked: drive is silent",
     Status.POLL_ENDED: "poll ended",
     Status.MAYBE_ECHO: "maybe the adapter's echo",
+    Status.NO_VALUE: "no valid value",
 }
 
 UNASKED = "not "  # begins the statuses of values for which no request left

@@ -46,14 +46,15 @@ _MOST_PIECES = 1 << 15
 
 
 class Stream:
-    """Bytes of one line in the pieces in which they came (struct md_stream)."""
+    """Bytes of one line in the pieces in which they came (struct md_stream); of Modbus TCP, or of none."""
 
-    def __init__(self, place: Any = None) -> None:
+    def __init__(self, place: Any = None, *, is_tcp: bool = False) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
         self._bytes = ffi.new("uint8_t[]", STREAM_ROOM)
         self._pieces = ffi.new("struct md_piece[]", _MOST_PIECES)
         self.c.bytes, self.c.room = self._bytes, STREAM_ROOM
         self.c.pieces, self.c.most = self._pieces, _MOST_PIECES
+        self.c.is_tcp = is_tcp or self.c.is_tcp
 
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False

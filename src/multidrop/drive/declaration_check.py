@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import IntEnum, IntFlag
-from itertools import combinations
 from numbers import Real
 from typing import Any
 
-from multidrop.core import NumberFormat
+from multidrop.core import MOST_INVALID, NumberFormat
+from multidrop.drive.number_check import number_errors
+from multidrop.drive.number_format import ORDERS, WORDS
 from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 
 LAST_ADDRESS = 0xFFFF
-_TEXTS = ("unit", "at_least", "at_most", "never", "place", "outside", "note")
+_TEXTS = ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")
 _TRUTHS = ("while_running", "moves")
 _COUNTS = ("broadcast", "harmless", "never_together")
 # Function codes that write the same registers: one at a time, and several at once.
@@ -54,6 +55,8 @@ def declaration_errors(
 def _kinds(register: Register[Any]) -> Iterator[str]:
     if not isinstance(register.table, Table):
         yield f"table = {register.table!r} is no table: HOLDING, INPUT, COIL, DISCRETE or a Table(…)"
+    if register.order not in ORDERS:
+        yield f"order = {register.order!r} is none of {', '.join(ORDERS)}"
     if not isinstance(register.number_format, NumberFormat):
         given = register.number_format
         yield f"number_format = {given!r} is no number format: write {' or '.join(_near(given))}"
@@ -90,6 +93,10 @@ def _is_whole(number: object) -> bool:
     return isinstance(number, int) and not isinstance(number, bool)
 
 
+def _is_real(number: object) -> bool:
+    return isinstance(number, Real) and not isinstance(number, bool)
+
+
 def _is_number(number: object) -> bool:
     return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
 
@@ -100,6 +107,29 @@ def _step(register: Register[Any]) -> Iterator[str]:
         yield f"step = {step!r} is no number, such as 0.1; where the manual does not state it, it is None"
     elif step == 0:
         yield "step = 0: every value would be 0; where the manual does not state it, it is None"
+
+
+def _offset(register: Register[Any]) -> Iterator[str]:
+    if not _is_number(register.offset):
+        yield f"offset = {register.offset!r} is no number, such as -40"
+
+
+def _invalid(register: Register[Any]) -> Iterator[str]:
+    counts = register.invalid
+    if not isinstance(counts, (tuple, list, frozenset)) or not all(_is_real(count) for count in counts):
+        yield f"invalid = {counts!r} is no tuple of raw counts, such as (0x7FFF,)"
+    elif len(counts) > MOST_INVALID // 2:
+        yield f"invalid has {len(counts)} counts, and the most is {MOST_INVALID // 2}"
+
+
+def _part(register: Register[Any]) -> Iterator[str]:
+    part = register.part
+    if part is None:
+        return
+    if not isinstance(part, (tuple, list)) or len(part) != 2 or not all(_is_whole(bit) for bit in part):
+        yield f"part = {part!r} is not the lowest and the highest bit, such as (0, 7)"
+    elif not 0 <= part[0] <= part[1]:
+        yield f"part = ({part[0]}, {part[1]}) is the wrong way round, or below bit 0"
 
 
 def _span(register: Register[Any]) -> Iterator[str]:
@@ -131,7 +161,9 @@ def _places(register: Register[Any]) -> Iterator[str]:
             yield f"{name} {shown} is outside 0 to FFFFH"
 
 
-_CHECKS: tuple[Callable[[Register[Any]], Iterator[str]], ...] = (_kinds, _step, _span, _default, _places)
+_CHECKS: tuple[Callable[[Register[Any]], Iterator[str]], ...] = (
+    *(_kinds, _step, _offset, _invalid, _part, _span, _default, _places),
+)
 
 
 # ---- one register, its facts together ----
@@ -153,7 +185,7 @@ def _format(register: Register[Any]) -> Iterator[str]:
     carrier, number_format = register.table.carrier, register.number_format
     wanted = {
         Carrier.BIT: (NumberFormat.BIT,),
-        Carrier.WORD: tuple(set(NumberFormat) - {NumberFormat.BIT}),
+        Carrier.WORD: tuple(WORDS),
     }.get(carrier, (NumberFormat.U32,))
     if number_format not in wanted:
         yield f"number_format = NumberFormat.{number_format.name} does not fit a {register.table.name}"
@@ -161,6 +193,7 @@ def _format(register: Register[Any]) -> Iterator[str]:
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
             yield f"{name} {at:04X}H: its {register.words} words reach beyond FFFFH"
+    yield from number_errors(register)
     if register.is_float and register.values is not None:
         names = register.values.__name__
         yield f"number_format = {number_format.name} is for numbers, and {names} names whole ones"
@@ -208,14 +241,17 @@ def _shared(registers: list[Register[Any]]) -> Iterator[str]:
     A reading may share its address with anything, and different tables may use the same addresses.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
-    for one, other in combinations(written, 2):
-        if _space(one.table) != _space(other.table) or not set(_addresses(one)) & set(_addresses(other)):
-            continue
-        if _meaning(one) != _meaning(other):
-            yield (
-                f"{other.name}: {one.name} is written at the same address "
-                f"with another format, step or access; one of the two is wrong"
-            )
+    at: dict[tuple[object, int], list[Register[Any]]] = {}
+    for other in written:
+        places = [(_space(other.table), address) for address in _addresses(other)]
+        for one in dict.fromkeys(one for place in places for one in at.get(place, ())):
+            if _meaning(one) != _meaning(other):
+                yield (
+                    f"{other.name}: {one.name} is written at the same address "
+                    f"with another format, step or access; one of the two is wrong"
+                )
+        for place in places:
+            at.setdefault(place, []).append(other)
 
 
 def _space(table: Table) -> object:
@@ -228,4 +264,5 @@ def _addresses(register: Register[Any]) -> range:
 
 
 def _meaning(register: Register[Any]) -> object:
-    return register.address, register.number_format, register.step, register.access, register.commands
+    coding = register.coding
+    return register.address, coding.core_format, coding.factors, register.access, register.commands

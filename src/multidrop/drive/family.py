@@ -9,37 +9,46 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
-from multidrop.core import Framing
+from multidrop.core import MODBUS, Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.read_limits import limit_errors
 from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.text import Text, text_errors
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb
 from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
+A = TypeVar("A")
 LONGEST_SILENCE = 1.0  # s
+SERIAL_ADDRESSES = range(1, 248)  # 0 is a broadcast there
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
 _CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
+_CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop check` of its file was read")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
 
 class Drive:
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, as far as the family goes; baud rate, format and framing default to the
-    family's. `silence`, in s, takes the place of the standard's t3.5 where all drives on the line bear
-    it; what the family's document demands is kept all the same. Options are facts that only the owner
-    knows (see `options`); `ram` names registers that the owner knows to be kept in RAM although the
-    document does not say so. Raises ValueError for anything the family's document does not allow.
+    `address` is 1 to 247, as far as the family goes; on a tcp:// port it is a unit id, which may be 0 to
+    255 where the family has them. Baud rate, format and framing default to the family's; on a tcp:// port
+    the framing is TCP, and baud rate and format are those of the wire behind the gateway. `silence`, in s,
+    takes the place of the standard's t3.5 where all drives on the line bear it; what the family's document
+    demands is kept all the same. Options are facts that only the owner knows (see `options`); `ram` names
+    registers that the owner knows to be kept in RAM although the document does not say so. Raises
+    ValueError for anything the family's document does not allow.
     """
 
     model: ClassVar[str] = ""
+    declared_in: ClassVar[str] = ""  # name of the file that declares it; nobody tested such a family
     title: ClassVar[str] = ""
     manual: ClassVar[str] = ""
 
@@ -81,52 +90,73 @@ class Drive:
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
+    texts: ClassVar[Mapping[str, Text]] = {}
 
     bus: Any = None  # that it is attached to
 
     def __init_subclass__(cls) -> None:
         """Collect the registers. Raises DeclarationError with all that is wrong with them."""
         super().__init_subclass__()
-        found: dict[str, Register[Any]] = {}
-        for owner in reversed(cls.__mro__):
-            for name, attribute in vars(owner).items():
-                if isinstance(attribute, Register):
-                    found[name] = attribute
-                else:
-                    found.pop(name, None)  # a subclass has something else of this name
+        found = cls._declared(Register)
         cls.registers = found
+        cls.texts = cls._declared(Text)
         cls.options = cls._all_options()
-        if wrong := declaration_errors(found, _NAMES, cls.options) or list(limit_errors(cls)):
+        wrong = declaration_errors(found, TAKEN_NAMES, cls.options) + text_errors(cls.texts, TAKEN_NAMES)
+        if wrong := wrong or scale_errors(cls) or list(limit_errors(cls)):
             raise DeclarationError(cls.__name__, wrong)
         if not cls.formats:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
 
     @classmethod
+    def _declared(cls, kind: type[A]) -> dict[str, A]:
+        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
+        found: dict[str, A] = {}
+        for owner in reversed(cls.__mro__):
+            for name, attribute in vars(owner).items():
+                if isinstance(attribute, kind):
+                    found[name] = attribute
+                else:
+                    found.pop(name, None)
+        return found
+
+    @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, and `confirmed` where it commands a motor but cannot identify it."""
+        """Return the class's options, and `confirmed` where it commands a motor untested or unidentified."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
-        if cls.identify is not Drive.identify or not (commands or verbs):
+        if not (commands or verbs) or not (cls.declared_in or cls.identify is Drive.identify):
             return cls.options
-        return {"confirmed": _CONFIRMED, **cls.options}
+        return {"confirmed": _CHECKED if cls.declared_in else _CONFIRMED, **cls.options}
 
     def check_confirmed(self, what: str) -> None:
-        """Raise Refused where the class cannot identify its drives, and the owner has not confirmed this one.
+        """Raise Refused where nobody has confirmed a drive of a class that needs it.
 
-        The same address means different things to different makes, and may start their motor.
+        That is a class that cannot identify its drives, since the same address means different things to
+        different makes, and may start their motor; and one from a file, which nobody has tested.
         """
         family = type(self)
-        if family.identify is Drive.identify and not self.option.get("confirmed"):
-            kind = self.title or family.__name__
-            raise Refused(
-                f"{what} is not sent to {self.name}: its class has no `identify` that could tell a {kind} "
-                "from another drive, to which the same may mean a start; look at its name plate, and declare "
-                "confirmed = 1",
-                rule="nobody has confirmed what it is",
-                advice=Advice.declare("confirmed", 1),
+        if "confirmed" not in self.options or self.option.get("confirmed"):
+            return
+        if family.declared_in:
+            reason = (
+                f"{family.declared_in} declares it, which nobody has tested: read `multidrop check "
+                f"{family.declared_in}` against the manual and look at its name plate"
             )
+        elif family.identify is Drive.identify:
+            kind = self.title or family.__name__
+            reason = (
+                f"its class has no `identify` that could tell a {kind} from another drive, to which the same "
+                "may mean a start; look at its name plate"
+            )
+        else:
+            return
+        raise Refused(
+            f"{what} is not sent to {self.name}: {reason}, and declare confirmed = 1",
+            rule="nobody has confirmed what it is",
+            advice=Advice.declare("confirmed", 1),
+        )
 
     def __init__(
         self,
@@ -142,7 +172,8 @@ class Drive:
     ) -> None:
         self.address = self._checked("address", address, self.addresses)
         self.framing = self._framing(framing)
-        formats = self.formats[self.framing]
+        self._declared_framing = None if framing is None else self.framing
+        formats = self.formats_in(self.framing)
         self.settings = Settings(
             self._checked("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
             self._checked("format", formats[0] if format is None else format, formats),
@@ -195,7 +226,48 @@ class Drive:
             return cls.framings[0]
         if isinstance(framing, str):
             framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
+        if framing is Framing.TCP and cls.speaks(framing):
+            return framing
         return cast(Framing, cls._checked("framing", framing, cls.framings))
+
+    @classmethod
+    def speaks(cls, framing: Framing) -> bool:
+        """Return True for the document's framings, and for TCP where one is Modbus: a gateway translates."""
+        return framing in cls.framings or (
+            framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
+        )
+
+    @classmethod
+    def formats_in(cls, framing: Framing) -> tuple[str, ...]:
+        """Return the formats of a framing; with TCP those of the wire behind the gateway."""
+        return cls.formats.get(framing) or cls.formats[cls.framings[0]]
+
+    def take_framing_of(self, port: str) -> None:
+        """Take the framing that this port has: TCP on tcp://, and what was declared on any other.
+
+        Raises ValueError where the drive cannot have it.
+        """
+        is_tcp, declared = speaks_tcp(port), self._declared_framing or self.framings[0]
+        if is_tcp and self._declared_framing not in (None, Framing.TCP):
+            raise ValueError(
+                f"framing {declared} is a serial line's, and {port} speaks Modbus TCP: leave "
+                "framing out, or name the port socket:// where the far end passes serial bytes on"
+            )
+        if is_tcp and not self.speaks(Framing.TCP):
+            raise ValueError(
+                f"{self.title or type(self).__name__} does not speak Modbus, and {port} carries "
+                "nothing else: name the port socket://, and have the far end pass serial bytes on"
+            )
+        if not is_tcp and declared is Framing.TCP:
+            raise ValueError(
+                f"framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, and {port} is none"
+            )
+        if not is_tcp and self.address not in SERIAL_ADDRESSES:
+            raise ValueError(
+                f"address {self.address} is a unit id of Modbus TCP; on {port} it is to be "
+                f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
+            )
+        self.framing = Framing.TCP if is_tcp else declared
 
     @classmethod
     def _options(cls, given: dict[str, float]) -> dict[str, float]:
@@ -241,6 +313,13 @@ class Drive:
         )
 
     @property
+    def ledger_name(self) -> str:
+        """Name under which writes to its EEPROM are counted: files of one name are told by their titles."""
+        if self.declared_in:
+            return f"{self.model}: {self.title}"
+        return self.model or type(self).__name__
+
+    @property
     def echo_probe(self) -> Register[Any] | None:
         """Register whose reply is never a copy of its request, where a family has others; else None.
 
@@ -259,6 +338,8 @@ class Drive:
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:
             raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
+        if name in self.texts:
+            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
         super().__setattr__(name, value)
 
     def exception(self, code: int) -> str:
@@ -272,6 +353,8 @@ class Drive:
     def needed_silence(self) -> float:
         """Return the silence in s that this drive needs before a request and after its reply."""
         own = max(self.silence, self.silence_characters * self.settings.character)
+        if self.framing is Framing.TCP:  # the gateway keeps it
+            return 0.0
         if self.framing is not Framing.RTU:
             return own
         return max(self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence, own)
@@ -410,7 +493,7 @@ class Drive:
 
 
 # Names that a register cannot have.
-_NAMES = frozenset(
+TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
     | {"option", "ram", "commanded", "perform", "check_identity"}
 )

@@ -1,4 +1,4 @@
-"""Number formats: the numbers that fit them, and arithmetic with float32 (IEEE 754 binary32)."""
+"""Number formats: their width, order and span, and how their bits become numbers and back."""
 
 from __future__ import annotations
 
@@ -6,22 +6,115 @@ import math
 import struct
 from fractions import Fraction
 
-from multidrop.core import NumberFormat
+from multidrop.core import LOW_BYTE_FIRST, LOW_WORD_FIRST, NumberFormat
 
-FLOATS = (NumberFormat.F32, NumberFormat.F32_SWAPPED)
-LONGS = frozenset(NumberFormat) - {NumberFormat.BIT, NumberFormat.U16, NumberFormat.I16}  # of two words
+WORDS = {  # of 16 bits
+    NumberFormat.U16: 1,
+    NumberFormat.I16: 1,
+    NumberFormat.I8: 1,
+    NumberFormat.BCD16: 1,
+    NumberFormat.U32: 2,
+    NumberFormat.I32: 2,
+    NumberFormat.U32_EITHER: 2,
+    NumberFormat.F32: 2,
+    NumberFormat.BCD32: 2,
+    NumberFormat.U64: 4,
+    NumberFormat.I64: 4,
+    NumberFormat.F64: 4,
+}
+FLOATS = {NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
+WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # numbers that a float does not hold exactly
+# The bytes as they come on the wire, A the most significant; in a single word only their swap counts.
+ORDERS = {
+    "AB": 0,
+    "BA": LOW_BYTE_FIRST,
+    "ABCD": 0,
+    "CDAB": LOW_WORD_FIRST,
+    "BADC": LOW_BYTE_FIRST,
+    "DCBA": LOW_WORD_FIRST | LOW_BYTE_FIRST,
+}
 MOST_DIGITS = 9  # enough to tell any two float32 apart
-_SIGNED = (NumberFormat.I16, NumberFormat.I32, NumberFormat.I32_SWAPPED)
-_LARGEST_FLOAT = float.fromhex("0x1.fffffep127")
+SIGNED = frozenset({NumberFormat.I8, NumberFormat.I16, NumberFormat.I32, NumberFormat.I64})
+DECIMAL = frozenset({NumberFormat.BCD16, NumberFormat.BCD32})
+_LARGEST = {
+    NumberFormat.F32: float.fromhex("0x1.fffffep127"),
+    NumberFormat.F64: float.fromhex("0x1.fffffffffffffp1023"),
+}
+
+
+def width(number_format: NumberFormat) -> int:
+    """Return the bits of a number."""
+    if number_format in (NumberFormat.BIT, NumberFormat.I8):
+        return 1 if number_format is NumberFormat.BIT else 8
+    return 16 * WORDS[number_format]
 
 
 def raw_span(number_format: NumberFormat) -> tuple[Fraction, Fraction]:
     """Return the least and the greatest raw count of a format."""
     if number_format in FLOATS:
-        return Fraction(-_LARGEST_FLOAT), Fraction(_LARGEST_FLOAT)
-    bits = 1 if number_format is NumberFormat.BIT else 32 if number_format in LONGS else 16
-    least = -(1 << bits - 1) if number_format in _SIGNED else 0
+        return Fraction(-_LARGEST[number_format]), Fraction(_LARGEST[number_format])
+    bits = width(number_format)
+    if number_format in DECIMAL:
+        return Fraction(0), Fraction(10 ** (bits // 4) - 1)
+    least = -(1 << bits - 1) if number_format in SIGNED else 0
     return Fraction(least), Fraction(least + (1 << bits) - 1)
+
+
+# ---- bytes, bits and numbers ----
+
+
+def arranged(data: bytes, order: str) -> bytes:
+    """Return the bytes of a number from the wire with the most significant first, or the other way round."""
+    flags = ORDERS[order]
+    words = [data[at : at + 2] for at in range(0, len(data), 2)]
+    if flags & LOW_BYTE_FIRST:
+        words = [word[::-1] for word in words]
+    return b"".join(reversed(words) if flags & LOW_WORD_FIRST else words)
+
+
+def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
+    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None where it ends before."""
+    if number_format is NumberFormat.BIT:
+        return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
+    size = 2 * WORDS[number_format]
+    found = data[2 * at : 2 * at + size] if at >= 0 else b""
+    return int.from_bytes(arranged(found, order)) if len(found) == size else None
+
+
+def number_of(bits: int, number_format: NumberFormat) -> float | None:
+    """Return the number that these bits mean; None where they mean none."""
+    if number_format in FLOATS:
+        (number,) = struct.unpack(FLOATS[number_format], bits.to_bytes(2 * WORDS[number_format]))
+        return None if math.isnan(number) else float(number)
+    if number_format in DECIMAL:
+        digits = f"{bits:x}"
+        return int(digits) if digits.isdecimal() else None
+    if number_format is NumberFormat.U32_EITHER:
+        return (bits >> 16 | bits) & 0xFFFF
+    if number_format in SIGNED:
+        return signed(bits, width(number_format))
+    return bits
+
+
+def signed(bits: int, count: int) -> int:
+    """Return the two's complement number in the lowest `count` bits."""
+    sign = 1 << count - 1
+    return ((bits & (2 * sign - 1)) ^ sign) - sign
+
+
+def bits_of(number: float, number_format: NumberFormat) -> int:
+    """Return the bits that mean this number; of a whole one those that do not fit are lost."""
+    if number_format in FLOATS:
+        if number_format is NumberFormat.F32:
+            number = nearest_or_infinite(number)
+        return int.from_bytes(struct.pack(FLOATS[number_format], number))
+    bits = width(number_format)
+    if number_format in DECIMAL:
+        return int(str(int(number) % 10 ** (bits // 4)), 16)
+    return int(number) & ((1 << bits) - 1)
+
+
+# ---- float32 ----
 
 
 def nearest(value: float | Fraction) -> float:

@@ -36,7 +36,7 @@ def stated_gaps(family: Any, table: Table) -> list[range]:
 
 def read_span(family: Any, register: Register[Any]) -> range:
     """Return the addresses that a request for this register reads."""
-    return range(register.address, register.address + register.words)
+    return register.reach
 
 
 @lru_cache(maxsize=256)
@@ -46,7 +46,7 @@ def readable_addresses(family: Any, table: Table) -> frozenset[int]:
         address
         for register in family.registers.values()
         if register.table.read_space == table.read_space and register.readable
-        for address in read_span(family, register)
+        for address in range(register.address, register.address + register.words)
     )
 
 

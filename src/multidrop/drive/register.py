@@ -17,7 +17,8 @@ from functools import cached_property
 from typing import Any, Generic, Protocol, TypedDict, TypeVar, Unpack, cast, overload
 
 from multidrop.core import NumberFormat as NumberFormat
-from multidrop.drive.number_format import FLOATS, LONGS, nearest, raw_span, shortest
+from multidrop.drive.coding import MOST_POWER, Coding
+from multidrop.drive.number_format import FLOATS, WHOLE, WORDS, bits_of, shortest
 
 T = TypeVar("T", bound=float)
 E = TypeVar("E", bound=IntEnum | IntFlag)
@@ -73,10 +74,18 @@ class Details(TypedDict, total=False):
     """Facts of a declaration besides address and unit; each may be left out."""
 
     step: float | None  #: value of one raw count; None where the document does not state it
+    offset: float  #: value of the raw count 0: value = raw * step + offset
+    #: Raw counts that mean "no value". One beyond the format's span is the bits: 0x8000 of an I16.
+    invalid: float | tuple[float, ...]
+    #: Lowest and highest bit, of the number in its words, of a reading that is a part of it. `invalid` counts
+    #: that do not fit into the part are those of the whole number.
+    part: tuple[int, int]
+    order: str  #: bytes as they come on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
+    scale_register: str  #: reading whose signed count is the power of ten of this one, read in one request
     span: tuple[float, float]  #: smallest and largest value that may be written
     at_least: str  #: register or option whose present value is the least that may be written
     at_most: str  #: register or option whose present value is the most
-    number_format: NumberFormat  #: width, sign and word order in the frame
+    number_format: NumberFormat  #: width, sign and kind of the number in the frame
     table: Table  #: address space and function codes
     kept: Kept  #: RAM or EEPROM; that of the table where the table has one
     ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
@@ -105,6 +114,11 @@ class Register(Generic[T]):
     unit: str = ""
     values: type[T] | None = None
     step: float | None = 1
+    offset: float = 0
+    invalid: tuple[float, ...] = ()
+    part: tuple[int, int] | None = None
+    order: str = "ABCD"
+    scale_register: str = ""
     span: tuple[float, float] | None = None
     at_least: str = ""
     at_most: str = ""
@@ -123,6 +137,7 @@ class Register(Generic[T]):
     outside: str = ""
     note: str = ""
     name: str = field(default="", init=False)
+    scaled_by: Register[float] | None = field(default=None, init=False)  # of the class that it is in
 
     def __post_init__(self) -> None:
         carrier = getattr(self.table, "carrier", Carrier.WORD)  # the class reports a wrong table
@@ -147,7 +162,22 @@ class Register(Generic[T]):
     @cached_property
     def words(self) -> int:
         """Addresses that it takes in its table."""
-        return 2 if self.table.carrier is Carrier.WORD and self.number_format in LONGS else 1
+        return WORDS[self.number_format] if self.table.carrier is Carrier.WORD else 1
+
+    @cached_property
+    def reach(self) -> range:
+        """Addresses that one request reads for its value: its own, and to those of its scale register."""
+        own = range(self.address, self.address + self.words)
+        if self.scaled_by is None:
+            return own
+        other = self.scaled_by.address
+        return range(min(own.start, other), max(own.stop, other + 1))
+
+    @cached_property
+    def coding(self) -> Coding:
+        """Its place in the words, with its exact scale."""
+        offset = Fraction(str(self.offset))
+        return Coding(self.number_format, self.order, self.part, self.invalid, self.scale, offset)
 
     @property
     def readable(self) -> bool:
@@ -155,11 +185,17 @@ class Register(Generic[T]):
 
     @property
     def writable(self) -> bool:
-        return self.access is not Access.READING and self.table.write is not None and not self.never
+        return (
+            self.access is not Access.READING
+            and self.table.write is not None
+            and not self.never
+            and self.part is None
+            and not self.scale_register
+        )
 
     @property
     def is_float(self) -> bool:
-        """True where the raw count is a float32."""
+        """True where the raw count is a float."""
         return self.table.carrier is Carrier.WORD and self.number_format in FLOATS
 
     @property
@@ -176,9 +212,26 @@ class Register(Generic[T]):
 
     @property
     def decimals(self) -> int:
-        """Digits that the step needs after the point."""
-        exponent = Decimal(f"{float(self.scale):.6g}").normalize().as_tuple().exponent
-        return max(0, -int(exponent))
+        """Digits that step and offset need after the point."""
+        parts = (Decimal(f"{float(part):.6g}") for part in (self.scale, self.coding.offset))
+        return max(0, *(-int(part.normalize().as_tuple().exponent) for part in parts))
+
+    def number_in(self, data: bytes, at: int) -> float | None:
+        """Return the number at word (coils: bit) `at` of a reply's data, as a row has it; None: no value."""
+        raw = self.coding.raw_in(data, at)
+        if raw is None or self.scaled_by is None:
+            return None if raw is None else self.coding.value_of(raw)
+        power = self.scaled_by.coding.raw_in(data, at + self.scaled_by.address - self.address)
+        if power is None or abs(power) > MOST_POWER:
+            return None
+        return self.coding.value_of(raw, int(power))
+
+    def value_in(self, data: bytes, at: int) -> T | None:
+        """Return the value at word (coils: bit) `at` of a reply's data; None where there is none."""
+        number = self.number_in(data, at)
+        if number is None:
+            return None
+        return cast(T, number) if self.values is None else self.decode(number)
 
     def decode(self, raw: float) -> T:
         """Return the value of a raw count; a number where the enumeration has no name for it."""
@@ -187,7 +240,7 @@ class Register(Generic[T]):
                 return self.values(int(raw))
             except ValueError:
                 return cast(T, int(raw))
-        return cast(T, raw * self.scale.numerator / self.scale.denominator + 0.0)  # never -0.0
+        return cast(T, self.coding.value_of(raw))
 
     def encode(self, value: T) -> float:
         """Return the raw count of a value: a whole number, or in a float register the nearest float32.
@@ -205,27 +258,29 @@ class Register(Generic[T]):
             raise ValueError(
                 f"{self.name} = {_short(value)} is outside {low:g} to {high:g} {self.unit}".rstrip()
             )
-        bottom, top = raw_span(self.number_format)
+        bottom, top = self.coding.raw_span
         try:
             raw = self._raw(value)
         except OverflowError:
             raw = math.inf
         if not bottom <= raw <= top:
-            least, most = sorted((float(bottom * self.scale), float(top * self.scale)))
+            least, most = sorted(float(end * self.scale + self.coding.offset) for end in (bottom, top))
             raise ValueError(
                 f"{self.name} = {_short(value)} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
             )
+        self._check_valid(raw, value)
         return raw
+
+    def _check_valid(self, raw: float, value: float) -> None:
+        if self.invalid and self.coding.raw_of(bits_of(raw, self.number_format)) is None:
+            raise ValueError(f"{self.name} = {_short(value)} is the count that means no value")
 
     def _raw(self, value: float) -> float:
         if abs(value) > sys.float_info.max:
             raise OverflowError
-        count = Fraction(str(value)) / self.scale
-        if self.is_float:
-            return nearest(count)
-        if count.denominator != 1 and self._counts:
+        if self._counts and not self.is_float and self.coding.exact_count(value).denominator != 1:
             raise ValueError(f"{self.name} takes a whole number, not {value:g}")
-        return round(count)
+        return self.coding.count_of(value)
 
     def takes(self, value: T) -> bool:
         """Return True where a drive may hold this value: it has a name, or is in the span."""
@@ -234,8 +289,8 @@ class Register(Generic[T]):
         if self.span is None:
             return True
         low, high = self.span
-        if self.is_float:  # the drive holds the float32 nearest to an end
-            low, high = (float(self.scale * Fraction(nearest(end / self.scale))) for end in self.span)
+        if self.is_float:  # the drive holds the float nearest to an end
+            low, high = (self.coding.value_of(self.coding.count_of(end)) for end in self.span)
         return low <= value <= high
 
     @property
@@ -255,7 +310,9 @@ class Register(Generic[T]):
                     if cast(Any, value).value & mask == mask:
                         apart = values(mask).name.replace("|", " and ")
                         raise ValueError(f"{self.name}: {apart} are never written together")
-            return int(cast(Any, value).value)
+            raw = int(cast(Any, value).value)
+            self._check_valid(raw, raw)
+            return raw
         choices = ", ".join(member.name for member in values)
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
 
@@ -263,7 +320,7 @@ class Register(Generic[T]):
         """Return the value that a person typed: a number, or names joined by "|"; ValueError otherwise."""
         if self.values is None:
             try:
-                return cast(T, float(text))
+                return cast(T, _number_in(text) if self.number_format in WHOLE else float(text))
             except ValueError:
                 unit = self.unit or "counts"
                 raise ValueError(f"{self.name} takes a number in {unit}, not {text!r}") from None
@@ -287,8 +344,24 @@ class Register(Generic[T]):
         if isinstance(value, IntEnum):
             return value.name
         unit = self.unit if self.step is not None else "(scale not stated)"
-        number = shortest(value, self.scale) if self.is_float else f"{value:.{self.decimals}f}"
-        return f"{number} {unit}".rstrip()
+        return f"{self._number(value)} {unit}".rstrip()
+
+    def _number(self, value: float) -> str:
+        if self.number_format in WHOLE and isinstance(value, int) and not self.decimals:
+            return str(value)
+        if self.number_format is NumberFormat.F32 and not self.offset:
+            return shortest(value, self.scale)
+        if self.scale_register:
+            return f"{value:.12g}"
+        return repr(value).removesuffix(".0") if self.is_float else f"{value:.{self.decimals}f}"
+
+
+def _number_in(text: str) -> float:
+    """Return the number, whole ones exactly. Raises ValueError for none."""
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
 
 
 def _short(value: float) -> str:
@@ -328,7 +401,10 @@ def command(address: int, what: str | type = "", /, **details: Unpack[Details]) 
     return _declare(Access.COMMAND, address, what, details)
 
 
-def _declare(access: Access, address: int, what: Any, details: Details) -> Register[Any]:
+def _declare(access: Access, address: int, what: Any, given: Details) -> Register[Any]:
+    details = cast(Any, given)
+    if isinstance(details.get("invalid"), (int, float)):
+        details = {**details, "invalid": (details["invalid"],)}
     if isinstance(what, str):
         return Register(address, access, unit=what, **details)
     return Register(address, access, values=what, **details)

@@ -42,10 +42,7 @@ def write_request(drive: Drive, register: Register[Any], raw: float, address: in
         if table.write == _WRITE_COILS:
             return Message(to, table.write, at, count=1, data=bytes([int(raw)]))
         return Message(to, table.write, at, data=b"\xff\x00" if raw else b"\x00\x00")
+    words = register.coding.pack(raw)
     if register.words == 1:
-        word = struct.pack(">H", int(raw) & 0xFFFF)
-        return Message(to, table.write, at, count=1 if table.write == _WRITE_WORDS else 0, data=word)
-    words = struct.pack(">f", raw) if register.is_float else struct.pack(">I", int(raw) & 0xFFFF_FFFF)
-    if register.number_format.name.endswith("_SWAPPED"):
-        words = words[2:] + words[:2]
-    return Message(to, _WRITE_WORDS, at, count=2, data=words)
+        return Message(to, table.write, at, count=1 if table.write == _WRITE_WORDS else 0, data=words)
+    return Message(to, _WRITE_WORDS, at, count=register.words, data=words)

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 from multidrop.drive.register import Register
+from multidrop.drive.text import Text
 from multidrop.errors import BadReply, BusError, DriveRefused, NoReply, Unconfirmed
 
 MOST_UNANSWERED = 3  # looks in a row
@@ -20,7 +21,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Read:
-    register: Register[Any]
+    register: Register[Any] | Text
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,13 @@ Step = Read | Write | Wait
 Script = Generator[Step, Any, R]
 
 
-def read(register: Register[T]) -> Script[T]:
-    """Read a register's value: `value = yield from read(register)`."""
-    return cast(T, (yield Read(register)))
+@overload
+def read(register: Register[T]) -> Script[T]: ...
+@overload
+def read(register: Text) -> Script[str]: ...
+def read(register: Register[Any] | Text) -> Script[Any]:
+    """Read a register's value, or a text: `value = yield from read(register)`."""
+    return (yield Read(register))
 
 
 def write(register: Register[T], value: T) -> Script[T]:

@@ -14,6 +14,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import may_be_crossed, read_limit, read_span
 from multidrop.drive.register import Carrier, Register, Table
 from multidrop.drive.request import read_request
+from multidrop.drive.text import Text
 from multidrop.planning.bus_time import characters, silence
 
 
@@ -127,6 +128,16 @@ def all_requests(
         for end in range(1, len(neighbours.registers) + 1):
             for begin, count in neighbours.ending_at(end):
                 yield count, neighbours.registers, begin, end
+
+
+def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
+    """Return the blocks that read a text, in order; each within the family's limit."""
+    limit, end = read_limit(drive, text.table), text.address + text.length
+    counts = ((start, min(limit, end - start)) for start in range(text.address, end, limit))
+    return tuple(
+        Block(text.table, start, count, (), read_request(drive, text.table, start, count))
+        for start, count in counts
+    )
 
 
 # ---- registers that may share a request ----

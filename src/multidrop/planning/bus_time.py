@@ -14,16 +14,23 @@ if TYPE_CHECKING:
     from multidrop.planning.blocks import Block
 
 # Characters of a read's request and reply without its data, and of each byte of that.
-_FRAMES = {Framing.RTU: (8 + 5, 1), Framing.ASCII: (17 + 11, 2), Framing.DELIXI: (21 + 21, 0)}
+_FRAMES = {
+    Framing.RTU: (8 + 5, 1),
+    Framing.ASCII: (17 + 11, 2),
+    Framing.DELIXI: (21 + 21, 0),
+    Framing.TCP: (8 + 5, 1),  # RTU on the wire behind the gateway
+}
 
 
 def silence(drive: Drive) -> float:
     """Return the seconds of silence around a drive's exchanges: one bit more, for its second stop bit.
 
     ASCII frames need none. They get 1.5 characters, in which it shows whether more is to come, such as a
-    second copy of the reply, which could otherwise be taken for the next one.
+    second copy of the reply, which could otherwise be taken for the next one. Modbus TCP has none.
     """
     settings = drive.settings
+    if drive.framing is Framing.TCP:
+        return 0.0
     least = 0.0 if drive.framing is Framing.RTU else 1.5 * settings.character
     return max(drive.needed_silence(), least) + settings.bit
 

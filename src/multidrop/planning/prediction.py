@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
-from multidrop.core import build_request, reply_length
+from multidrop.core import build_request, characters_on_wire, reply_length
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Planned
@@ -215,6 +215,6 @@ def _block_metadata(planned: Planned) -> dict[str, Any]:
     return {
         "registers": [register.name for register in planned.block.registers],
         "every_ms": None if planned.every is None else planned.every * 1e3,
-        "request_characters": len(build_request(framing, request)),
-        "reply_characters": reply_length(framing, request),
+        "request_characters": characters_on_wire(framing, len(build_request(framing, request))),
+        "reply_characters": characters_on_wire(framing, reply_length(framing, request)),
     }

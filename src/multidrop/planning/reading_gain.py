@@ -35,15 +35,21 @@ class ReadingGain:
     seconds_now: float
 
     def __str__(self) -> str:
-        gaps = ", ".join(
-            f"{_NAMES.get(table, table.name)}: range(0x{gap.start:X}, 0x{gap.stop:X})"
-            for table, gap in self.gaps
-        )
+        requests = "request" if self.requests == 1 else "requests"
         return (
-            f"{self.requests} {'request' if self.requests == 1 else 'requests'} with readable_gaps = "
-            f"{{{gaps}}} instead of {self.requests_now}: {self.seconds:.3f} s instead of "
-            f"{self.seconds_now:.3f} s; state them if the document allows reading there"
+            f"{self.requests} {requests} with {self._declaration()} instead of {self.requests_now}: "
+            f"{self.seconds:.3f} s instead of {self.seconds_now:.3f} s; "
+            f"state them if the document allows reading there"
         )
+
+    def _declaration(self) -> str:
+        """Return the gaps as the family's file or class would have them."""
+        named = [(_NAMES.get(table, table.name), gap) for table, gap in self.gaps]
+        if self.drive.declared_in:
+            in_file = (f"{name.lower()} = [0x{gap[0]:X}, 0x{gap[-1]:X}]" for name, gap in named)
+            return f"gaps = {{ {', '.join(in_file)} }}"
+        in_class = (f"{name}: range(0x{gap.start:X}, 0x{gap.stop:X})" for name, gap in named)
+        return f"readable_gaps = {{{', '.join(in_class)}}}"
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.core import Echo
+from multidrop.core import Echo, TransactionIds
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
+from multidrop.family_file.loader import FamilyError
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
-from multidrop.plant.toml_check import Key, TomlPlace, read_document
+from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 
 class PlantError(ValueError):
@@ -37,31 +38,6 @@ def load_plant(path: Path | str) -> Plant:
     return Plant(lines, path)
 
 
-def parse_duration(text: str) -> float:
-    """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
-    units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-    seconds = float(match[1]) * units[match[2]] if match else 0
-    if not _SHORTEST <= seconds <= _LONGEST:
-        raise ValueError(f'{text!r} is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"')
-    return seconds
-
-
-def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
-    """Return the duration under this key in s; None where it is not given, or wrong."""
-    return place.attempt(_duration_under, key, given[key]) if key in given else None
-
-
-def _duration_under(key: str, text: str) -> float:
-    try:
-        return parse_duration(text)
-    except ValueError as mistake:
-        raise ValueError(f"{key} = {mistake}") from mistake
-
-
-_SHORTEST, _LONGEST = 100e-6, 86400.0  # s
-
-
 _PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
 
 _LINE = {
@@ -72,6 +48,7 @@ _LINE = {
     "silence": Key(str, 'silence = "500 us"'),
     "switching": Key(str, 'switching = "2 ms"'),
     "echo": Key(str, 'echo = "auto"'),
+    "transaction": Key(str, 'transaction = "match"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 
@@ -108,11 +85,20 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     }
     silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
     echo = place.attempt(Echo, given.get("echo", "auto"))
-    inherited = {**settings, "silence": silence}
+    ids = place.attempt(TransactionIds, given.get("transaction", "match"))
+    if "transaction" in given and not speaks_tcp(port):
+        place.wrong(f"transaction is a fact of tcp:// ports, and {port} is none; leave it out")
+    inherited = {**settings, "silence": silence, "port": port}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
     polled = tuple(filter(None, drives))
     return PlantLine(
-        name, port, **settings, drives=polled, switching=switching or 0.0, echo=echo or Echo.AUTO
+        name,
+        port,
+        **settings,
+        drives=polled,
+        switching=switching or 0.0,
+        echo=echo or Echo.AUTO,
+        ids=ids or TransactionIds.MATCH,
     )
 
 
@@ -129,20 +115,39 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     if model is None:
         return None
     arguments = {key: value for key, value in given.items() if key not in _NOT_ARGUMENTS}
-    inherited = {key: value for key, value in line.items() if value is not None and key not in given}
+    inherited = {
+        key: value for key, value in line.items() if value is not None and key not in given and key != "port"
+    }
     _try_each(model, arguments, inherited, place)
     polls = _polls(given.get("poll"), model, every, place)
     if len(place.config_errors) > before:
         return None
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
+    if drive and place.attempt(partial(_on_port, drive, line["port"])) is None:
+        return None
     return PolledDrive(drive, polls) if drive else None
+
+
+def _on_port(drive: Drive, port: str) -> Drive:
+    drive.take_framing_of(port)
+    return drive
 
 
 def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
     text = table.get("model") if isinstance(table, dict) else None
     if not text or not isinstance(text, str):
         return None
-    return place.attempt(find_model, text, place.path.parent)
+    try:
+        return find_model(text, place.path.parent)
+    except FamilyError as wrong:
+        once = ("family", text)
+        if once not in place.seen:  # else all of its mistakes are there already
+            for mistake in wrong.mistakes:
+                place.wrong(mistake)
+        place.seen.setdefault(once, "")
+    except ValueError as mistake:
+        place.wrong(mistake)
+    return None
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:

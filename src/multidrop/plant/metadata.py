@@ -57,6 +57,6 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
         "values": {member.name: member.value for member in values} if values else None,
         "bits": values is not None and issubclass(values, Flag),
         "function": register.table.read,
-        "address": register.address,
-        "words": register.words,
+        "address": register.reach.start,
+        "words": len(register.reach),
     }

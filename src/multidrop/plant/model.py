@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-from multidrop.core import Echo
+from multidrop.core import Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
@@ -32,6 +34,19 @@ class PolledDrive:
         """Registers and their periods in s, as planning takes them."""
         return [(poll.register, poll.every) for poll in self.polls]
 
+    def at_rate(self, register: Register[Any] | None, every: float | None) -> PolledDrive:
+        """Return the same with another rate, for one register, or with None for all that are polled.
+
+        Raises ValueError for a register that is not polled.
+        """
+        if register is not None and register not in [poll.register for poll in self.polls]:
+            names = ", ".join(poll.register.name for poll in self.polls) or "nothing"
+            raise ValueError(f"{register.name} of {self.drive.name} is not polled: that is {names}")
+        polls = [
+            Polled(poll.register, every) if register in (None, poll.register) else poll for poll in self.polls
+        ]
+        return PolledDrive(self.drive, tuple(polls))
+
 
 @dataclass(frozen=True)
 class PlantLine:
@@ -44,6 +59,7 @@ class PlantLine:
     drives: tuple[PolledDrive, ...]
     switching: float = 0.0  # s that the port takes to change them
     echo: Echo = Echo.AUTO
+    ids: TransactionIds = TransactionIds.MATCH
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,37 @@ class Plant:
 
     lines: tuple[PlantLine, ...]
     path: Path
+
+    def find_line(self, name: str) -> PlantLine:
+        """Return the line of this name; ValueError with the nearest names when there is none."""
+        found = next((line for line in self.lines if line.name == name), None)
+        return found or self._unknown("line", name, (line.name for line in self.lines))
+
+    def find_drive(self, name: str) -> tuple[PlantLine, Drive]:
+        """Return the drive of this name and its line; ValueError with the nearest names for none."""
+        drives = {polled.drive.name: (line, polled.drive) for line in self.lines for polled in line.drives}
+        return drives.get(name) or self._unknown("drive", name, drives)
+
+    def _unknown(self, kind: str, name: str, names: Iterable[str]) -> NoReturn:
+        names = list(names)
+        near = difflib.get_close_matches(name, names, n=2)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names) or 'none'}"
+        raise ValueError(f"{self.path} has no {kind} {name!r}; {hint}")
+
+    def with_ports(self, ports: Mapping[str, str]) -> Plant:
+        """Return the same plant with other ports, by line, such as those of a simulator.
+
+        Raises ValueError for an unknown line, and where two lines would have one port.
+        """
+        for name in ports:
+            self.find_line(name)
+        lines = tuple(replace(line, port=ports.get(line.name, line.port)) for line in self.lines)
+        owners: dict[str, str] = {}
+        for line in lines:
+            if line.port in owners:
+                raise ValueError(f"lines {owners[line.port]} and {line.name} would both be at {line.port}")
+            owners[line.port] = line.name
+        return replace(self, lines=lines)
 
     def metadata(self) -> dict[str, Any]:
         """Return what a reader of a recording must know that its rows do not say."""

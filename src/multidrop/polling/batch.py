@@ -1,22 +1,23 @@
 """Rows of samples and misses: columns for Arrow's users, and single rows for people.
 
-Any library that speaks the Arrow PyCapsule interface takes a batch as it is, and none of them is needed
-here: `pyarrow.record_batch(batch)`, `polars.DataFrame(batch)`, `pandas.DataFrame.from_arrow(batch)`,
-`duckdb.sql("from batch")`; where pandas is older than 3.0, `pyarrow.table(batch).to_pandas()`.
-`pandas.DataFrame(batch)` does not know the interface, and would go through the rows with times as plain
-integers: that is refused. For NumPy, with NaN for every miss:
+`batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library that speaks the Arrow
+PyCapsule interface takes a batch as it is, and none of them is needed here: `pyarrow.record_batch(batch)`,
+`duckdb.sql("from batch")`. `pandas.DataFrame(batch)` does not know the interface, and would go through the
+rows with times as plain integers: that is refused. For NumPy, with NaN for every miss:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
 from multidrop.core import STATUSES, Columns, Names, spell
+from multidrop.polling.table import ArrowTable
+from multidrop.polling.wide import WideRows
 
 _STATUSES = Names(STATUSES)
 
@@ -33,8 +34,8 @@ class Row(NamedTuple):
     status: str  # "ok", or the reason
 
 
-class Rows(ABC):
-    """Rows, wherever they are kept: their number, each one, and Arrow's capsules."""
+class Rows(ArrowTable):
+    """Rows, wherever they are kept: their number, each one, Arrow's capsules, and tables of them."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -46,12 +47,23 @@ class Rows(ABC):
     def arrow(self) -> Any:
         """Return the rows as a nanoarrow array."""
 
+    def wide(self, *columns: str) -> WideRows:
+        """Return a column for each `drive.register`, or for these alone, and a row for each time.
+
+        Registers that were asked in one request share a row; nothing else is joined, and a miss is null, as
+        `WideRows` says. Raises ValueError for a column that cannot be there.
+        """
+        return WideRows(self, columns, self._may_have() if columns else ())
+
+    def _may_have(self) -> Collection[str]:
+        """Return columns of the wide form that are known though they may have no row."""
+        return ()
+
     def __array__(self, *how: object, **details: object) -> NoReturn:
         """Refuse to be one array, which `pandas.DataFrame(batch)` would take. Raises TypeError."""
         raise TypeError(
-            "rows are columns of several types, not one array: take them with "
-            "pandas.DataFrame.from_arrow(batch), where pandas is older than 3.0 with "
-            "pyarrow.table(batch).to_pandas(), or with polars.DataFrame(batch)"
+            "rows are columns of several types, not one array: take them with batch.to_pandas(), "
+            "batch.to_polars(), or what speaks Arrow, such as pyarrow.record_batch(batch)"
         )
 
     def __arrow_c_schema__(self) -> Any:
@@ -85,6 +97,11 @@ class Batch(Rows):
         ):
             sample = (uncertainty, value) if status == 0 else (None, None)
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
+
+    def _may_have(self) -> Collection[str]:
+        registers = [self._registers[number] for number in range(len(self._registers))]
+        drives = [self._drives[number] for number in range(len(self._drives))]
+        return [f"{drive}.{register}" for drive in drives for register in registers]
 
     def __repr__(self) -> str:
         times = self._columns.array("time")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from multidrop.bus import Bus
 from multidrop.control.rules import check_own
-from multidrop.core import Exchange, Field, Names, RowLayout
+from multidrop.core import Exchange, Names, RowLayout
 from multidrop.drive.family import Drive
+from multidrop.drive.row_field import row_field
 from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import kind, sending, silence
 from multidrop.planning.schedule import Job
@@ -28,13 +30,7 @@ class RowNames:
         return RowLayout(
             self.drives.number(drive.name),
             [
-                Field(
-                    block.offset(register),
-                    register.number_format,
-                    self.registers.number(register.name),
-                    register.scale.numerator,
-                    register.scale.denominator,
-                )
+                row_field(register, block.offset(register), self.registers.number(register.name))
                 for register in block.registers
             ],
         )
@@ -72,6 +68,8 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # what was refused stays known at any rate
+        self._skipped = 0  # of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
         """Plan a drive's polls for this response delay in s. Raises ValueError for another's register."""
@@ -88,12 +86,27 @@ class JobMaker:
     def job(self, drive: Drive, block: Block, period_ns: int | None) -> PolledJob:
         key = drive, block, period_ns
         if key not in self._made:
-            self._made[key] = self.make(drive, block, period_ns)
+            if (drive, block) not in self._rows:
+                self._rows[drive, block] = self._names.layout(drive, block)
+            self._made[key] = self.make(drive, block, period_ns, rows=self._rows[drive, block])
         return self._made[key]
 
-    def make(self, drive: Drive, block: Block, period_ns: int | None, *, has_rows: bool = True) -> PolledJob:
+    def forget(self, jobs: Iterable[PolledJob]) -> None:
+        """Keep jobs with a period no longer: rates come and go without number.
+
+        Those without one are kept: the core may hold what it repeats until the port is closed.
+        """
+        for job in jobs:
+            key = job.owner, job.block, job.period_ns
+            if job.period_ns is not None and self._made.get(key) is job:
+                del self._made[key]
+                self._skipped += job.skipped
+
+    def make(
+        self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
+    ) -> PolledJob:
         """Make a job of its own."""
-        rows = self._names.layout(drive, block) if has_rows else RowLayout(0, [])
+        rows = rows or self._names.layout(drive, block)
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(
             drive=drive.address,
@@ -113,4 +126,4 @@ class JobMaker:
     @property
     def skipped(self) -> int:
         """Slots that were left out because the line was busy."""
-        return sum(job.skipped for job in self._made.values())
+        return self._skipped + sum(job.skipped for job in self._made.values())

@@ -13,6 +13,7 @@ from multidrop.bus import Bus
 from multidrop.core import Peer, Port, RowQueue, Status
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
 from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
@@ -20,8 +21,8 @@ from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, RowNames
 from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
+from multidrop.polling.summary import line_summary
 from multidrop.transport import clock
-from multidrop.transport.statistics import Statistics, line_statistics
 
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
@@ -51,6 +52,7 @@ class PolledLine:
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
         self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that left
+        self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
         self._polled: list[tuple[Drive, Peer]] = []
         self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
         self._is_started = False
@@ -84,6 +86,7 @@ class PolledLine:
             except BaseException:
                 self.bus.detach(drive)
                 raise
+            self._present[drive] = polled
             jobs = self._planned[polled].jobs
             if jobs:
                 self._polled.append((drive, self.bus.peer(drive)))
@@ -108,9 +111,47 @@ class PolledLine:
                 self._schedule.remove(job)
             self._schedule.back_off.forget(drive.address)
             self._refusals.forget(drive)
+            self._present.pop(drive, None)
             self._polled = [(other, peer) for other, peer in self._polled if other is not drive]
         self.bus.detach(drive)
         self._row_queue.call(self._number)
+
+    def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
+        """Read a register of a drive, or all that is polled of it, every so many seconds from now on.
+
+        What stays as it was keeps its slots. A rate that is new to the drive begins with a slot now. Raises
+        ValueError for a register that is not polled.
+        """
+        with self._lock:
+            before = self._present[drive]
+            after = before.at_rate(register, every)
+            if after == before:
+                return
+            peer = self.bus.peer(drive)
+            planned = self._maker.plan(after, peer.response_delay or drive.response_delay)
+            if self._is_started:
+                self._change_jobs(drive, planned.jobs, clock.now_ns())
+            self._planned[after] = planned
+            self._planned.pop(before)
+            self._present[drive] = after
+        self._row_queue.call(self._number)
+
+    def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
+        """Put these jobs in the place of those that a drive has; what is queued of it is still asked.
+
+        Refused registers are asked as all others once more.
+        """
+        present = [job for job in self._schedule.jobs if job.owner is drive]
+        dues = {job.period_ns: job.due_ns for job in sorted(present, key=_due, reverse=True)}  # the first
+        self._refusals.forget(drive)
+        old = [job for job in present if job not in wanted]
+        for period_ns in dict.fromkeys(job.period_ns for job in [*wanted, *old]):
+            self._schedule.replace(
+                [job for job in old if job.period_ns == period_ns],
+                [job for job in wanted if job.period_ns == period_ns and job not in present],
+                dues.get(period_ns, now_ns) if period_ns else now_ns,
+            )
+        self._maker.forget(old)
 
     # ---- polling ----
 
@@ -119,9 +160,9 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            jobs = {polled.drive: planned.jobs for polled, planned in self._planned.items()}
             for drive in in_order(self.bus.drives, self.switching):
-                self._add_jobs(drive, jobs[drive], self.started_ns)
+                jobs = self._planned[self._present[drive]].jobs
+                self._add_jobs(drive, jobs, self.started_ns)
             self._is_started = True
 
     def is_steady(self, now_ns: int) -> bool:
@@ -172,8 +213,8 @@ class PolledLine:
         for job in self._schedule.jobs:
             job.duration_ns = job.own_ns + round((delays[job.owner] or job.owner.response_delay) * 1e9)
         self._queue.measure()
-        for polled, planned in self._planned.items():
-            delay = delays.get(polled.drive)
+        for polled in self._present.values():
+            planned, delay = self._planned[polled], delays.get(polled.drive)
             if delay and not planned.plan.suits(delay, MARGIN):
                 self._plan_anew(polled, planned, delay, now_ns)
 
@@ -261,36 +302,17 @@ class PolledLine:
         with self._lock:
             seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
             peers = {drive.name: peer for drive, peer in self.bus.peers.items()}
-            line = line_statistics(seconds, {name: peer.counters() for name, peer in peers.items()}, None)
-            return {
-                "seconds": round(seconds, 3),
-                "exchanges": line.counters.exchanges,
-                "samples": line.samples,
-                "misses": dict(line.misses),
-                "late_replies": line.late_replies,
-                "stray_bytes": line.skipped_bytes,
-                "utilisation": round(line.utilisation, 4),
-                "overrun_slots": self._maker.skipped,
-                "switching_ms": round(self.switching * 1e3, 3),
-                "set_aside": self._refusals.names,
-                "drives": {
-                    name: _drive_summary(line.drives[name], peer.response_delay)
-                    for name, peer in peers.items()
-                },
-            }
+            found = line_summary(seconds, peers)
+        return {
+            **found,
+            "overrun_slots": self._maker.skipped,
+            "switching_ms": round(self.switching * 1e3, 3),
+            "set_aside": self._refusals.names,
+        }
 
 
-def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
-    return {
-        "exchanges": drive.counters.exchanges,
-        "samples": drive.samples,
-        "exchanges_per_second": round(drive.counters.answered / drive.seconds, 2),
-        "samples_per_second": round(drive.samples / drive.seconds, 2),
-        "response_delay_ms": round(response_delay * 1e3, 3),
-        "timeout_ms": round(drive.timeout * 1e3, 3),
-        "p99_delay_ms": round(drive.delays.p99 * 1e3, 3),
-        "misses": dict(drive.misses),
-    }
+def _due(job: PolledJob) -> int:
+    return job.due_ns
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:

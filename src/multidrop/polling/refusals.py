@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 
+from multidrop.core import RowLayout
 from multidrop.drive.family import Drive
 from multidrop.planning.blocks import Block
 from multidrop.planning.schedule import Schedule
@@ -94,7 +95,7 @@ class Refusals:
         """Try now and then whether a block is answered as a whole after all."""
         if whole in self._trials.values():
             return
-        trial = self._maker.make(whole.owner, whole.block, SET_ASIDE_NS, has_rows=False)
+        trial = self._maker.make(whole.owner, whole.block, SET_ASIDE_NS, rows=RowLayout(0, []))
         self._trials[trial] = whole
         self._schedule.add(trial, now_ns + SET_ASIDE_NS)
 
@@ -134,6 +135,7 @@ class Refusals:
     def forget(self, drive: Drive) -> None:
         """Set nothing of this drive aside any more: it leaves."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
+        self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
         self._trials = {trial: job for trial, job in self._trials.items() if trial.owner is not drive}
         self._wholes = {part: job for part, job in self._wholes.items() if part.owner is not drive}
         self._probes.pop(drive.address, None)

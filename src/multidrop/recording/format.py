@@ -10,7 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop.polling.batch import Rows
+from multidrop.polling.batch import Rows, schema
+from multidrop.polling.table import ArrowTable
+from multidrop.polling.wide import WideRows
 from multidrop.recording.append_file import AppendFile
 
 Metadata = Mapping[str, Any]
@@ -99,8 +101,11 @@ _REASONS = {  # a library's own sentence is about its internals
 }
 
 
-class RecordingReader(ABC):
+class RecordingReader(ArrowTable):
     """A recording as it was when it was opened; may be iterated over more than once.
+
+    As a table, in pandas, in polars or in the wide form, all of it is in memory. An Arrow library takes it as
+    it is, such as `pyarrow.table(reader)`.
 
     `truncated` is the number of bytes at its end that are left out: the writer was killed, or the disk
     was full, before their batch was whole.
@@ -115,6 +120,30 @@ class RecordingReader(ABC):
     @abstractmethod
     def __iter__(self) -> Iterator[Rows]:
         """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        from nanoarrow.c_array_stream import CArrayStream
+
+        return CArrayStream.from_c_arrays([rows.arrow() for rows in self], schema()).__arrow_c_stream__()
+
+    def wide(self, *columns: str) -> WideRows:
+        """Return a column for each `drive.register`, or for these alone, and a row for each time.
+
+        Registers that were asked in one request share a row; nothing else is joined, and a miss is null, as
+        `WideRows` says. Raises ValueError for a column that is not in the recording, and where it is damaged.
+        """
+        return WideRows((row for rows in self for row in rows), columns, self._registers())
+
+    def _registers(self) -> list[str]:
+        """Return the columns of the wide form of all that was polled."""
+        drives = self.metadata.get("drives")
+        described = drives.items() if isinstance(drives, dict) else ()
+        return [
+            f"{drive}.{register}"
+            for drive, about in described
+            if isinstance(about, dict) and isinstance(about.get("registers"), dict)
+            for register in about["registers"]
+        ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
         """Return the error that says how many rows can be read, and why no more."""

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from multidrop.core import UNASKED, Framing, Message, build_request
+from multidrop.core import UNASKED, Framing, Message, build_request, characters_on_wire
 from multidrop.drive.timing import Settings
 from multidrop.report.load import Array, Recording, Series
 from multidrop.report.style import (
@@ -71,7 +71,7 @@ def _request_seconds(recording: Recording, drive: str) -> float | None:
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
         return None
     message = Message(1, 7, data=bytes(4)) if framing is Framing.DELIXI else Message(1, 3, 0, 1)
-    return (len(build_request(framing, message)) + 1) * character
+    return (characters_on_wire(framing, len(build_request(framing, message))) + 1) * character
 
 
 def draw_delays(found: Sequence[DelaySeries]) -> Figure:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from multidrop.core import Framing, Message, reply_length
+from multidrop.core import Framing, Message, characters_on_wire, reply_length
 from multidrop.report.load import Array, Recording
 from multidrop.report.style import TimeBins, add_legend, label, line_style, new_figure
 
@@ -121,10 +121,14 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     blocks, which = np.unique(np.stack([function[first], start, end - start]), axis=1, return_inverse=True)
     framing = Framing[recording.about(name)["framing"].upper()]
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
-    characters = np.array([reply_length(framing, request) for request in requests])[which]
+    characters = np.array([_characters(framing, request) for request in requests])[which]
     # The stamps are those of the request's begin and of the reply's first character.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
+
+
+def _characters(framing: Framing, request: Message) -> int:
+    return characters_on_wire(framing, reply_length(framing, request))
 
 
 def draw_utilisation(uses: Sequence[LineUse], recording: Recording) -> Figure:

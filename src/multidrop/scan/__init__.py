@@ -12,4 +12,5 @@ from multidrop.scan.sweep import ADDRESSES as ADDRESSES
 from multidrop.scan.sweep import ScanRequest as ScanRequest
 from multidrop.scan.sweep import Sweep as Sweep
 from multidrop.scan.sweep import one_of_each_framing as one_of_each_framing
+from multidrop.scan.sweep import over_tcp as over_tcp
 from multidrop.scan.sweep import sweeps as sweeps

@@ -9,13 +9,14 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from multidrop.core import Framing, Message, raw_value
+from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, carry_out
+from multidrop.drive.text import Text
 from multidrop.drive.timing import Settings
-from multidrop.errors import BusError, Refused
-from multidrop.planning.blocks import blocks
+from multidrop.errors import BusError, NoValue, Refused
+from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS
 from multidrop.scan.sweep import Sweep
 
@@ -51,11 +52,13 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
     A drive with two stop bits, or on a pseudo-terminal with another parity, answers in the sweep's
     format too: it is given the family's usual one.
     """
-    if framing not in family.framings or address not in family.addresses:
+    if not family.speaks(framing) or address not in family.addresses:
         return None
+    if framing is Framing.TCP:  # the gateway knows the settings
+        return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None
-    format = settings.format if settings.format in family.formats[framing] else None
+    format = settings.format if settings.format in family.formats_in(framing) else None
     return family(address, framing=framing, baudrate=settings.baudrate, format=format)
 
 
@@ -97,7 +100,13 @@ def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
     return carry_out(script, do)
 
 
-def _read(drive: Drive, register: Register[Any], ask: Ask) -> Any:
+def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
+    if isinstance(register, Text):
+        found = text_blocks(drive, register)
+        return register.decode(b"".join(ask(drive, block.request).data for block in found))
     (block,) = blocks(drive, [register])
     reply = ask(drive, block.request)
-    return register.decode(raw_value(reply.data, block.offset(register), register.number_format))
+    value = register.value_in(reply.data, block.offset(register))
+    if value is None:
+        raise NoValue(drive.name, register.name)
+    return value

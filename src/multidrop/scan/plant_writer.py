@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 
+from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.scan.identify import candidate
 from multidrop.scan.results import GUESS, Found
@@ -44,12 +45,13 @@ def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
         yield f"# {device.doubt}"
     if len(device.models) > 1:
         yield f"# it may as well be {' or '.join(device.models[1:])}"
-    yield f'name = "{device.models[0]}-{device.address}"'
+    yield f"name = {_text(f'{device.models[0]}-{device.address}')}"
     yield f"model = {_text(model)}"
     yield f"address = {device.address}"
     yield f'framing = "{device.framing}"'
-    yield f"baudrate = {drive.settings.baudrate}"
-    yield f'format = "{drive.settings.format}"'
+    if device.framing is not Framing.TCP:
+        yield f"baudrate = {drive.settings.baudrate}"
+        yield f'format = "{drive.settings.format}"'
     if GUESS in device.doubt and "confirmed" in family.options:
         yield "# confirmed = 1  # once its name plate says so: before, nothing is written to it"
 

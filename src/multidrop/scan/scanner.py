@@ -112,7 +112,7 @@ class _Scan:
     def ask(self, sweep: Sweep, request: Message, peer: Peer) -> Completion:
         """Carry out an exchange; an echo of the request is no reply."""
         completion = self._once(sweep, sweep.framing, request, peer)
-        if completion.raw == build_request(sweep.framing, request):
+        if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
             # A reply may be a copy of its request here: an exchange in another framing shows an echo.
             other = Framing.ASCII if sweep.framing is Framing.RTU else Framing.RTU
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._sweep_peer(sweep))

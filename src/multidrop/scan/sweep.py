@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from multidrop.core import Framing, Message, build_request
+from multidrop.core import MODBUS, Framing, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.timing import Settings
@@ -20,6 +20,7 @@ from multidrop.transport.exchange import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
+GATEWAY_PATIENCE = 1.0  # s: a gateway says after a while that a drive does not answer
 ADDRESSES = range(1, 32)  # asked unless the caller says otherwise
 _ILLEGAL_ADDRESS = 2  # the exception code
 # A reply with the value 0 looks like an echo of its request there; an address is never 0.
@@ -103,6 +104,16 @@ def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
         if key not in patient or sweep.patience > patient[key].patience:
             patient[key] = sweep
     return [*brisk.values(), *patient.values()]
+
+
+def over_tcp(planned: Sequence[Sweep]) -> list[Sweep]:
+    """Return the sweeps of a port of Modbus TCP: each request once, for as long as a gateway may wait."""
+    once: dict[ScanRequest, Sweep] = {}
+    for sweep in planned:
+        if sweep.framing in MODBUS:
+            asked = replace(sweep, framing=Framing.TCP, silence=0.0, patience=GATEWAY_PATIENCE)
+            once.setdefault(sweep.request, asked)
+    return list(once.values())
 
 
 def _check(what: str, given: Collection[Any], known: set[Any]) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-from multidrop.core import Framing, Message, raw_value
+from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import STANDARD_LIMITS, read_limit
 from multidrop.drive.register import Access, Carrier, Kept
@@ -21,7 +21,8 @@ from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # writes, so that memory stays flat
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # writes have the limit of reads
-GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3}  # s (serial-line guide 2.5.2.1; Delixi, part 3)
+# s: serial-line guide 2.5.2.1; Delixi, part 3; a network may take its time
+GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
 
 
 class Written(NamedTuple):
@@ -51,9 +52,9 @@ class DriveCounters:
 def _most_cells(drive: Drive) -> dict[int, int]:
     """Return the most cells of a request by the code that reads them: at least those of one register."""
     most: dict[int, int] = {}
-    for register in drive.registers.values():
-        table = register.table
-        limit = min(max(read_limit(drive, table), register.words), STANDARD_LIMITS[table.carrier])
+    held = [(register.table, len(register.reach)) for register in drive.registers.values()]
+    for table, words in [*held, *((text.table, 1) for text in drive.texts.values())]:
+        limit = min(max(read_limit(drive, table), words), STANDARD_LIMITS[table.carrier])
         for code in {table.read, _COUNTED_AS.get(table.write or 0)} - {None}:
             most[code or 0] = max(most.get(code or 0, 1), limit)
     return most
@@ -62,7 +63,7 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 class SimulatedDrive:
     """A drive of any class: its registers hold what is written to them.
 
-    `drive[name]` gets and sets a register's value in its own unit.
+    `drive[name]` gets and sets a register's value in its own unit, None for "no value", or a text.
     """
 
     functions: ClassVar[Collection[int] | None] = None  # None: all of its protocol
@@ -83,12 +84,17 @@ class SimulatedDrive:
         return f"<{type(self).__name__} {self.drive.name}>"
 
     def __getitem__(self, name: str) -> Any:
+        if name in self.drive.texts:
+            return self.memory.get_text(self.drive.texts[name])
         register = self.drive.register(name)
         for cell in self.memory.of(register):
             self.refresh(cell)
         return self.memory.get(register)
 
-    def __setitem__(self, name: str, value: float) -> None:
+    def __setitem__(self, name: str, value: Any) -> None:
+        if name in self.drive.texts:
+            self.memory.set_text(self.drive.texts[name], value)
+            return
         register = self.drive.register(name)
         self.memory.set(register, value)
         for cell in self.memory.of(register):
@@ -105,7 +111,8 @@ class SimulatedDrive:
         register = cell.register
         if register is None or register.words > 1:
             return raw
-        if not register.takes(decode(register, raw)):
+        value = decode(register, raw)
+        if value is None or not register.takes(value):
             raise Refusal(Reason.VALUE)
         return raw
 
@@ -115,7 +122,8 @@ class SimulatedDrive:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
                 data = b"".join(pack(cell.table, raws[cell]) for cell in cells)
-                if not register.takes(register.decode(raw_value(data, 0, register.number_format))):
+                value = register.value_in(data, 0)
+                if value is None or not register.takes(value):
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:
@@ -149,9 +157,12 @@ class SimulatedDrive:
             return self._answer_damaged(frame)
         if frame.message is not None:
             return self.answer(frame.message, frame.end)
-        if frame.address and not self._knows(frame.function):
+        if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
         return None  # of a length that its function does not have
+
+    def _is_for_all(self, address: int) -> bool:
+        return address == 0 and self.drive.framing is not Framing.TCP
 
     def _knows(self, function: int) -> bool:
         return function in (self.protocol.answers if self.functions is None else self.functions)
@@ -160,7 +171,7 @@ class SimulatedDrive:
         """Refuse a damaged request, if the family has a code for wrong checksums."""
         code = self._code(Reason.DAMAGED)
         whole = len(frame.body) == self.protocol.octets and self._knows(frame.function)
-        if code is None or not whole or not frame.address:
+        if code is None or not whole or self._is_for_all(frame.address):
             return None
         return self.refused(Message(frame.address, frame.function), code)
 
@@ -172,7 +183,7 @@ class SimulatedDrive:
         if now < self.deaf_until:
             return None
         self.now = now
-        is_broadcast = request.address == 0
+        is_broadcast = self._is_for_all(request.address)
         if is_broadcast and self.takes_broadcast(request):
             self.counters.broadcasts += 1
         elif request.address == self.drive.address:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from multidrop.core import raw_value
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Carrier, Register, Table
 from multidrop.sim.drive import SimulatedDrive
@@ -17,14 +17,13 @@ def encoded(address: int, table: Table, register_address: int) -> int:
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """Return the register's value on an EncodedDrive, as a row has it."""
+    """Return the register's value on an EncodedDrive, as a row has it; NaN: a count that means no value."""
     if register in drive.known_counts():
-        return _known(drive, register) * register.scale.numerator / register.scale.denominator
-    at = range(register.address, register.address + register.words)
+        return register.coding.value_of(_known(drive, register))
     size = 2 if register.table.carrier is Carrier.WORD else 4
-    data = b"".join(encoded(drive.address, register.table, one).to_bytes(size) for one in at)
-    raw = raw_value(data, 0, register.number_format)
-    return raw * register.scale.numerator / register.scale.denominator
+    data = b"".join(encoded(drive.address, register.table, at).to_bytes(size) for at in register.reach)
+    number = register.number_in(data, register.address - register.reach.start)
+    return math.nan if number is None else number
 
 
 def _known(drive: Drive, register: Register[Any]) -> int:

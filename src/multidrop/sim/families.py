@@ -1,4 +1,4 @@
-"""The simulation of each family."""
+"""The simulation of each family, and of each profile."""
 
 from __future__ import annotations
 
@@ -11,11 +11,19 @@ from multidrop.drives.erman_er_g_220 import ErmanERG220
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
 from multidrop.drives.yd1000 import YD1000
+from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
 from multidrop.sim.che import SimulatedCHE
+from multidrop.sim.cia402 import SimulatedCiA402
+from multidrop.sim.danfoss_fc import SimulatedDanfossFC
+from multidrop.sim.declared import SimulatedDeclared
 from multidrop.sim.delixi import SimulatedDelixi, SimulatedDelixiNative
+from multidrop.sim.delta import SimulatedDelta
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.erman import SimulatedERMAN
 from multidrop.sim.ibd import SimulatedIBD
+from multidrop.sim.invt import SimulatedInvt
+from multidrop.sim.optidrive import SimulatedOptidrive
+from multidrop.sim.profidrive import SimulatedProfidrive
 from multidrop.sim.yd1000 import SimulatedYD1000
 
 FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
@@ -25,10 +33,17 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     DelixiModbus: SimulatedDelixi,
     DelixiNative: SimulatedDelixiNative,
     YD1000: SimulatedYD1000,
+    Profidrive: SimulatedProfidrive,
+    CiA402: SimulatedCiA402,
+    DanfossFC: SimulatedDanfossFC,
+    Delta: SimulatedDelta,
+    Invt: SimulatedInvt,
+    Optidrive: SimulatedOptidrive,
 }
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Simulate a drive as its family's document says, or as a class of one's own declares."""
+    """Simulate a drive as its family's document says, or as a class or file of one's own declares."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
-    return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)
+    own = SimulatedDeclared if hasattr(type(drive), "declared_verbs") else SimulatedDrive
+    return next(kinds, own)(drive, response_delay=response_delay)

@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.plant.loader import duration_of
-from multidrop.plant.toml_check import Key, TomlPlace, read_document
+from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 
 def _rate(means: str) -> Any:

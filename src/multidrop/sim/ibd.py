@@ -47,7 +47,7 @@ class SimulatedIBD(MotorDrive):
 
     @property
     def most_gap(self) -> float:
-        return 10e-3 if self.drive.framing is Framing.RTU else super().most_gap
+        return super().most_gap if self.drive.framing is Framing.ASCII else 10e-3
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         register = cell.register
@@ -81,7 +81,7 @@ class SimulatedIBD(MotorDrive):
         return sum(bits, ALWAYS_SEEN)
 
     def _format(self) -> int:
-        first_rtu = len(FORMATS) if self.drive.framing is Framing.RTU else 0
+        first_rtu = 0 if self.drive.framing is Framing.ASCII else len(FORMATS)
         return first_rtu + FORMATS.index(self.drive.settings.format)
 
     obeys = {(0x03, CONTROL): _control}

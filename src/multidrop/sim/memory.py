@@ -6,21 +6,22 @@ space. It holds a bit, a word, or Delixi's four bytes.
 
 from __future__ import annotations
 
-import struct
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 from typing import Any
 
-from multidrop.core import Framing, NumberFormat, raw_value
+from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.number_format import nearest_or_infinite
+from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
+from multidrop.drive.text import Text
 
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # the same cells, several at once
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # not stored, stored
 _DELIXI_STORES = 0x06
-_LOW_WORD_FIRST = (NumberFormat.U32_SWAPPED, NumberFormat.I32_SWAPPED, NumberFormat.F32_SWAPPED)
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
 _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
 
@@ -52,6 +53,8 @@ class Memory:
         self.aliases: set[tuple[int, int]] = set()  # where a write does not reach the EEPROM
         for register in drive.registers.values():
             self._declare(register)
+        for text in drive.texts.values():
+            self.make_readable(text.table, self._addresses(text))
 
     def _cell(self, table: Table, address: int) -> MemoryCell:
         return self._cells.setdefault((_space(table), address), MemoryCell(table, address))
@@ -60,7 +63,7 @@ class Memory:
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
-            if cell.register is None or register.access is not Access.READING:  # a writable one has a span
+            if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
                 self._read.setdefault((table.read, cell.address), None)  # unless a reading is there too
@@ -105,32 +108,68 @@ class Memory:
         return self._written.get((function, address))
 
     def get(self, register: Register[Any]) -> Any:
-        """Return the register's value in its own unit."""
-        data = b"".join(pack(register.table, cell.raw) for cell in self.of(register))
-        return register.decode(raw_value(data, 0, register.number_format))
+        """Return the register's value in its own unit; None where its count means no value."""
+        reach = register.reach
+        cells = [self._cell(register.table, address) for address in reach]
+        data = b"".join(pack(register.table, cell.raw) for cell in cells)
+        return register.value_in(data, register.address - reach.start)
 
-    def set(self, register: Register[Any], value: float) -> None:
-        """Hold this value, rounded to the register's step; bits that do not fit are lost."""
-        if register.is_float:
-            held = nearest_or_infinite(value / register.scale)
-            raw = int.from_bytes(struct.pack(">f", held))
+    def set(self, register: Register[Any], value: float | None) -> None:
+        """Hold this value, rounded to the register's step; bits that do not fit are lost.
+
+        None is what the device gives for no value. Raises ValueError where the register has no such count.
+        """
+        coding = register.coding
+        if value is None:
+            self._put(register, *_no_value(register))
         elif register.values is not None:
-            raw = int(value)
+            self.set_raw(register, _placed(register, int(value)))
+        elif register.is_float:
+            offset = float(coding.offset)
+            self.set_raw(register, bits_of((value - offset) / coding.step, register.number_format))
         else:
-            numerator, denominator = _scale(register)
-            raw = round(value * denominator / numerator)
-        self.set_raw(register, raw)
+            multiplier, addend, divisor = coding.factors
+            power = self._power(register)
+            multiplier, divisor = multiplier * 10 ** max(power, 0), divisor * 10 ** max(-power, 0)
+            count = value * divisor - addend
+            exact = Fraction(count, multiplier) if isinstance(count, int) else count / multiplier
+            self.set_raw(register, _placed(register, round(exact)))
+
+    def _power(self, register: Register[Any]) -> int:
+        return 0 if register.scaled_by is None else int(self.get(register.scaled_by) or 0)
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
+        """Hold these bits, of a register that is a part of its words beside those of the others."""
+        self._put(register, raw, register.coding.mask)
+
+    def _put(self, register: Register[Any], raw: int, mask: int) -> None:
         cells = self.of(register)
-        for cell in cells if register.number_format in _LOW_WORD_FIRST else reversed(cells):
-            cell.raw = raw & _MASKS[register.table.carrier]
-            raw >>= 16
+        size = _BYTES[register.table.carrier]
+        order = "AB" if register.table.carrier is Carrier.BIT else register.coding.order
+        before = arranged(b"".join(pack(cell.table, cell.raw) for cell in cells), order)
+        bits = (int.from_bytes(before) & ~mask) | (raw & mask)
+        data = arranged(bits.to_bytes(len(before)), order)
+        for at, cell in enumerate(cells):
+            cell.raw = int.from_bytes(data[size * at : size * (at + 1)]) & _MASKS[register.table.carrier]
+
+    def get_text(self, text: Text) -> str:
+        """Return a text as it is read."""
+        cells = (self._cell(text.table, address) for address in self._addresses(text))
+        return text.decode(b"".join(pack(cell.table, cell.raw) for cell in cells))
+
+    def set_text(self, text: Text, value: str) -> None:
+        """Hold a text. Raises ValueError for one that does not fit."""
+        data = text.encode(value)
+        for at, address in enumerate(self._addresses(text)):
+            self._cell(text.table, address).raw = int.from_bytes(data[2 * at : 2 * at + 2])
+
+    @staticmethod
+    def _addresses(text: Text) -> range:
+        return range(text.address, text.address + text.length)
 
     def of(self, register: Register[Any]) -> list[MemoryCell]:
         """Return the register's cells, in the order of their addresses."""
-        space = _space(register.table)
-        return [self._cells[space, register.address + at] for at in range(register.words)]
+        return [self._cell(register.table, register.address + at) for at in range(register.words)]
 
 
 @cache
@@ -138,9 +177,27 @@ def _space(table: Table) -> object:
     return table if table.read is None else table.read_space
 
 
-@cache  # needed at every request
-def _scale(register: Register[Any]) -> tuple[int, int]:
-    return register.scale.as_integer_ratio()
+def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
+    """Return True for the register whose name and span a cell has: a writable one, then a whole one."""
+    if known is None or register.access is not Access.READING:
+        return True
+    return known.part is not None and register.part is None
+
+
+def _placed(register: Register[Any], raw: int) -> int:
+    """Return the bits that hold a raw count, at the place of its part."""
+    if register.part is None:
+        return bits_of(raw, register.number_format)
+    return raw << register.part[0] & register.coding.mask
+
+
+def _no_value(register: Register[Any]) -> tuple[int, int]:
+    """Return bits that mean no value, and the mask of those that matter."""
+    for mask, pattern in register.coding.invalid_patterns:
+        return pattern, mask
+    if register.is_float:
+        return bits_of(math.nan, register.number_format), register.coding.mask
+    raise ValueError(f"{register.name} has no count that means no value")
 
 
 def pack(table: Table, raw: int) -> bytes:
@@ -149,5 +206,5 @@ def pack(table: Table, raw: int) -> bytes:
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """Return the value of a raw count that one cell holds."""
-    return register.decode(raw_value(pack(register.table, raw), 0, register.number_format))
+    """Return the value of a raw count that one cell holds; None where it means none."""
+    return register.value_in(pack(register.table, raw), 0)

@@ -72,14 +72,15 @@ class TCPPort:
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
         if parts.hostname is None or parts.port is None:
-            raise ValueError(f"{url!r} is not socket://host:port, such as socket://127.0.0.1:5020")
+            kind = parts.scheme
+            raise ValueError(f"{url!r} is not {kind}://host:port, such as {kind}://127.0.0.1:5020")
         self._listener = socket.create_server((parts.hostname, parts.port))
         self._listener.setblocking(False)
         self._client: socket.socket | None = None
         host, port, *_ = self._listener.getsockname()
         near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
         self._simulated = SimulatedPort(of_address((near, port)), default_path().parent)
-        self.path = f"socket://{parts.hostname}:{self._listener.getsockname()[1]}"
+        self.path = f"{parts.scheme}://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:
         """Return the descriptor to wait for; it changes when a client comes or goes."""
@@ -126,6 +127,6 @@ SimulatedEnd = PtyPort | TCPPort  # neither blocks
 
 def open_port(where: str, settings: Settings) -> SimulatedEnd:
     """Open a port of the kind that `where` names: see Wire."""
-    if where.startswith("socket://"):
+    if where.startswith(("socket://", "tcp://")):
         return TCPPort(where)
     return PtyPort(settings, None if where == "pty" else Path(where))

@@ -163,4 +163,4 @@ DELIXI = DriveProtocol(
     octets=8,
     no_data=NO_DATA,
 )
-PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.DELIXI: DELIXI}
+PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.TCP: MODBUS, Framing.DELIXI: DELIXI}

@@ -6,11 +6,12 @@ Garbage costs the frames that it damages and no others, and buffers are bounded.
 from __future__ import annotations
 
 import binascii
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from multidrop.core import Framing, Message, crc16, lrc, parse_request, sum8
 
 MOST_RTU = 256
+TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id, and of a frame
 MOST_TEXT = 513
 LEAST_RTU = 4  # address, function, CRC
 
@@ -27,6 +28,7 @@ class Frame:
     intact: bool
     begin: float  # of its first bit
     end: float  # of its last bit
+    transaction: int = 0  # of Modbus TCP
 
     @property
     def address(self) -> int:
@@ -49,7 +51,8 @@ class Receiver:
         self.most_gap = most_gap
         self._buffer = bytearray()
         self._end = float("-inf")  # of the last bit received
-        self._cut = self._cut_rtu if framing is Framing.RTU else self._cut_text
+        cuts = {Framing.RTU: self._cut_rtu, Framing.TCP: self._cut_tcp}
+        self._cut = cuts.get(framing, self._cut_text)
 
     @property
     def silent_at(self) -> float | None:
@@ -101,6 +104,22 @@ class Receiver:
             pending = pending or used == 0
         self._buffer = bytearray(data)
         return None
+
+    def _cut_tcp(self) -> Frame | None:
+        """Return the next frame; what is no header leaves nothing to go on with."""
+        data = bytes(self._buffer)
+        if len(data) < TCP_HEAD:
+            return None
+        length = TCP_HEAD + int.from_bytes(data[4:6])
+        if data[2:4] != b"\0\0" or not TCP_HEAD + 2 <= length <= MOST_TCP:
+            self._buffer.clear()
+            return None
+        if len(data) < length:
+            return None
+        self._buffer = bytearray(data[length:])
+        _, message = parse_request(Framing.TCP, data[:length])
+        frame = self._frame(data[TCP_HEAD:length], message, True, len(data) - length, length)
+        return replace(frame, transaction=int.from_bytes(data[:2]))
 
     def _cut_text(self) -> Frame | None:
         data = self._buffer

@@ -8,7 +8,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from multidrop.core import Framing, build_reply
 from multidrop.drive.timing import Settings
@@ -60,7 +60,7 @@ class ReceiverGroup:
         self.drives: dict[int, SimulatedDrive] = {}
 
     def addressed(self, frame: Frame) -> Sequence[SimulatedDrive]:
-        if frame.address == 0:
+        if frame.address == 0 and self.receiver.framing is not Framing.TCP:
             return list(self.drives.values())
         return [self.drives[frame.address]] if frame.address in self.drives else []
 
@@ -68,8 +68,9 @@ class ReceiverGroup:
 class Wire:
     """One line of simulated drives.
 
-    `port` is "pty", a path for a link to the pty, or "socket://host:port" (port 0: any free one). A
-    client opens `path`. An `unpaced` wire has no waits at all.
+    `port` is "pty", a path for a link to the pty, "socket://host:port" (port 0: any free one), or
+    "tcp://host:port" for drives behind a gateway of Modbus TCP. A client opens `path`. An `unpaced` wire
+    has no waits at all.
     """
 
     def __init__(
@@ -83,6 +84,8 @@ class Wire:
         if not drives:
             raise ValueError(f"{name}: a line needs at least one drive")
         self.drives = tuple(drives)
+        for sim in drives:
+            sim.drive.take_framing_of(port)
         self.name = name
         self.where = port
         self.port: SimulatedEnd | None = None  # None while it is closed
@@ -152,6 +155,7 @@ class Wire:
         for frame in frames:
             for sim in group.addressed(frame):
                 if self._keeps_silence(sim, frame) and (reply := sim.receive(frame)) is not None:
+                    reply = replace(reply, transaction=frame.transaction)
                     data = self.distort(build_reply(sim.drive.framing, reply))
                     self._send(data, frame.end + sim.delay * self._pace, group.receiver.character)
 

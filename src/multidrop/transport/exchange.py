@@ -7,16 +7,28 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop import core
-from multidrop.core import STATUSES, Completion, Exchange, Failure, Message, Peer, Permit, raw_value
+from multidrop.core import (
+    STATUSES,
+    Completion,
+    Exchange,
+    Failure,
+    Framing,
+    Message,
+    Peer,
+    Permit,
+    TransactionIds,
+)
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached
-from multidrop.planning.blocks import Block, blocks
+from multidrop.drive.text import Text
+from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached, NoValue
+from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least, may_be_too_long
 from multidrop.transport import clock
 from multidrop.transport.line import Line
+from multidrop.transport.mixed_up import mixed_up, silence_hint
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -65,10 +77,10 @@ class PreparedRead:
         self._places = [(register, block.offset(register)) for register in block.registers]
 
     def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
-        """Yield the name and the value of each register."""
+        """Yield the name and the value of each register; None where the drive gave none."""
         data = reply.data
         for register, at in self._places:
-            yield register.name, register.decode(raw_value(data, at, register.number_format))
+            yield register.name, register.value_in(data, at)
 
 
 class PreparedReads:
@@ -118,6 +130,8 @@ class Exchanges:
                     make_exchange(drive, block.request, made, NO_ROWS, answer=answer)
                     for block, answer in proofs(drive)
                 ]
+                if drive.framing is not Framing.TCP or self.line.ids is TransactionIds.IGNORE
+                else []
             )
         # One that comes back may still owe the answer to what it was asked before it left, and one of
         # another family at its address would get that.
@@ -163,7 +177,8 @@ class Exchanges:
 
         One that insists waits for no earlier answer, which may then pass for its own; and for its own, where
         answers are known to be late, for as long as `timeout` seconds. A block that the drive refuses as a
-        whole, or keeps silent to, is asked for in parts from then on, until the port is opened again.
+        whole, or keeps silent to, is asked for in parts from then on, until the port is opened again. Raises
+        NoValue where a register has none.
         """
         prepared = self._prepare(drive)
         found: dict[str, Any] = {}
@@ -183,7 +198,7 @@ class Exchanges:
                         raise
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
-        return {register.name: found[register.name] for register in registers}
+        return _with_values(drive, {register.name: found[register.name] for register in registers})
 
     def _values(
         self, drive: Drive, read: PreparedRead, attempts: int, insists: bool, timeout: float
@@ -212,10 +227,23 @@ class Exchanges:
         return halves(drive, block)
 
     def value(
-        self, drive: Drive, register: Register[Any], attempts: int = READ_ATTEMPTS, *, insists: bool = False
+        self,
+        drive: Drive,
+        register: Register[Any] | Text,
+        attempts: int = READ_ATTEMPTS,
+        *,
+        insists: bool = False,
     ) -> Any:
-        """Return one register's value."""
+        """Return one register's value, or a text."""
+        if isinstance(register, Text):
+            return self.text(drive, register, attempts, insists=insists)
         return self.values(drive, [register], attempts, insists=insists)[register.name]
+
+    def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
+        """Return a text, read in as many requests as its family's limit makes it."""
+        peer = self.peer(drive)
+        reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
+        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
@@ -233,12 +261,16 @@ class Exchanges:
             prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
         return prepared
 
-    def value_as(self, other: Drive, drive: Drive, register: Register[Any]) -> Any:
+    def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
         """Return what a drive replies to the request of another family, sent once and without waiting."""
+        if isinstance(register, Text):
+            peer, blocks_of = self.peer(drive), text_blocks(other, register)
+            asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
+            return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return dict(read.decode(self._ask(drive, insisting, 1)))[register.name]
+        return _with_values(drive, dict(read.decode(self._ask(drive, insisting, 1))))[register.name]
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
         """Return the reply to a read, which is sent again where it is lost."""
@@ -280,7 +312,7 @@ class Exchanges:
         )
         completion = self._carry_out(made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
-            raise NoReply(drive.name)
+            raise _no_reply(drive, completion)
         return completion
 
     def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
@@ -301,5 +333,26 @@ class Exchanges:
         if result > 0:
             raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
         if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
-            raise NoReply(drive.name)
-        raise BadReply(drive.name, STATUSES[-result], completion.raw)
+            raise _no_reply(drive, completion)
+        advice = mixed_up(_port_of(drive), completion.raw)
+        raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
+
+
+def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
+    """Return what was found; NoValue where the drive gave no value for one."""
+    for name, value in found.items():
+        if value is None:
+            known = {name: value for name, value in found.items() if value is not None}
+            raise NoValue(drive.name, name, known)
+    return found
+
+
+def _port_of(drive: Drive) -> str:
+    return drive.bus.line.port if drive.bus else ""
+
+
+def _no_reply(drive: Drive, completion: Completion) -> NoReply:
+    if drive.framing is Framing.TCP and completion.raw:
+        code = completion.raw[-1]
+        return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
+    return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import logging
 import os
@@ -20,18 +21,26 @@ from multidrop.core import (
     Peer,
     Port,
     Tap,
+    TransactionIds,
+    Transactions,
     build_request,
     must_take,
     refused_names,
 )
 from multidrop.core.fork import register_at_fork
+from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, log_aside
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
+from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
 
 _NO_SETTINGS = -1
+_TRANSACTIONS = {
+    TransactionIds.MATCH: Transactions.MATCHED,
+    TransactionIds.IGNORE: Transactions.IGNORED,
+}
 
 # struct serial_icounter_struct of linux/serial.h
 _TIOCGICOUNT = 0x545D
@@ -46,11 +55,14 @@ _log = logging.getLogger("multidrop.line")
 class Line:
     """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
 
-    `port` is a device or any pyserial URL. Every failure of the port is a LineError.
+    `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
+    requests' transaction ids unless `ids` says otherwise. Every failure of the port is a LineError.
     """
 
-    def __init__(self, port: str, echo: Echo = Echo.AUTO) -> None:
+    def __init__(self, port: str, echo: Echo = Echo.AUTO, ids: TransactionIds = TransactionIds.MATCH) -> None:
         self.port = port
+        self.is_tcp = isinstance(port, str) and speaks_tcp(port)
+        self.ids = ids
         self.identity = port  # see port_identity; known once the port is open
         self._echo = echo
         self._bridge: Bridge | None = None
@@ -95,7 +107,7 @@ class Line:
             port.open()
             self.identity = identity_of(port, self.port)
             core = self._drive(port)
-            core.tell_echo(self._echo)
+            core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
             self._core = core
@@ -117,9 +129,10 @@ class Line:
             return Port(fd, must_take(os.ttyname(fd)))
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
-        if self.port.startswith("socket://"):
+        if self.is_tcp or self.port.startswith("socket://"):
             os.set_blocking(port.fileno(), False)
-            return Port(port.fileno(), _NO_SETTINGS)
+            ids = {"transactions": _TRANSACTIONS[self.ids]} if self.is_tcp else {}
+            return Port(port.fileno(), _NO_SETTINGS, **ids)
         if self._settings:
             set_up(port, self._settings)
         self._bridge = Bridge(port)
@@ -240,7 +253,7 @@ class Line:
         if _log.isEnabledFor(logging.DEBUG):
             self._log_frames(exchange, found)
         if is_lost or found.result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED):
-            failure = self._failure(found.result, found.error)
+            failure = self._failure(found.result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
@@ -256,7 +269,7 @@ class Line:
         came = found.raw.hex(" ").upper() or "nothing"
         log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self.port, at, came, meaning)
 
-    def _failure(self, result: int, error: int) -> LineError:
+    def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
             return LineError(
                 self.port, f"the port does not take the {refused_names(error)} that the drive needs"
@@ -264,6 +277,9 @@ class Line:
         if self._core is None:
             return self._closed()
         why = os.strerror(error) if error else "hung up"
+        if error == errno.EPROTO:
+            shown = received[:16].hex(" ").upper() or "a damaged header"
+            why = f"what came is no Modbus TCP: {shown}{mixed_up(self.port, received)}"
         self._log_loss(why)
         return PortLost(self.port, f"the port was lost ({why})")
 

@@ -6,10 +6,11 @@ import errno
 import os
 import socket
 from typing import cast
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 import serial
 
+from multidrop.drive.network import MODBUS_PORT
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
 from multidrop.transport.rfc2217 import RFC2217Port
@@ -36,15 +37,31 @@ def reason_of(failure: BaseException) -> str:
     return str(failure)
 
 
+_URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
+
+
+def _needs_place(url: SplitResult) -> bool:
+    if url.scheme == "tcp":
+        return not url.hostname or url.port == 0
+    return url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
+
+
+def _socket_url(url: SplitResult) -> str:
+    host = f"[{url.hostname}]" if ":" in str(url.hostname) else url.hostname
+    return f"socket://{host}:{url.port or MODBUS_PORT}"
+
+
 def unopened(port: str) -> serial.Serial:
     """Return the port, not opened yet. Raises TypeError, and NoSuchPort for a URL that no port can have."""
     if not isinstance(port, str):
         raise TypeError(f"a port is a device such as '/dev/ttyUSB0' or a pyserial URL, not {port!r}")
     try:
         url = urlsplit(port)
-        needs_place = url.scheme in ("socket", "rfc2217") and not (url.hostname and url.port)
+        needs_place = _needs_place(url)
     except ValueError as mistake:
         raise NoSuchPort(port, str(mistake)) from mistake
+    if needs_place and url.scheme == "tcp":
+        raise NoSuchPort(port, f"it needs a host, such as tcp://10.0.0.7 or tcp://10.0.0.7:{MODBUS_PORT}")
     if needs_place:
         raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
     try:
@@ -52,10 +69,10 @@ def unopened(port: str) -> serial.Serial:
             found = RFC2217Port()
             found.port = port
             return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
-        return serial.serial_for_url(port, do_not_open=True)
+        name = _socket_url(url) if url.scheme == "tcp" else port
+        return serial.serial_for_url(name, do_not_open=True)
     except ValueError as mistake:
-        right = "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
-        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {right}") from mistake
+        raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {_URLS}") from mistake
 
 
 def connection_of(port: serial.SerialBase | None) -> socket.socket | None:

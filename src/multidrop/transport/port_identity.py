@@ -8,6 +8,8 @@ import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from multidrop.drive.network import MODBUS_PORT, speaks_tcp
+
 BY_ID = Path("/dev/serial/by-id")  # links that udev makes, with each adapter's serial number
 _PEER = re.compile(r"(\[[^\]]+\]|[\w.-]+):\d+")
 
@@ -38,7 +40,7 @@ def of_name(name: str) -> str:
     if "://" in name:
         try:
             url = urlsplit(name)
-            host, port = url.hostname, url.port
+            host, port = url.hostname, url.port or (MODBUS_PORT if speaks_tcp(name) else None)
         except ValueError:
             return name
         return of_address((host, port)) if host and port else name

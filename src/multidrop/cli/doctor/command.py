@@ -22,17 +22,31 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
-from multidrop.cli.support.arguments import add_json_argument, add_port_argument
+from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
+from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
 from multidrop.cli.support.values import wrapped
-from multidrop.core import Completion, Exchange, Framing, Message, Peer, build_request, is_pseudo_terminal
+from multidrop.core import (
+    Completion,
+    Exchange,
+    Framing,
+    Message,
+    Peer,
+    build_request,
+    characters_on_wire,
+    is_pseudo_terminal,
+)
 from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
 from multidrop.drives.registry import find_model
 from multidrop.errors import LineError
-from multidrop.planning.blocks import blocks
+from multidrop.planning.blocks import Block, blocks
+from multidrop.plant.model import Plant
 from multidrop.transport.exchange import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
+from multidrop.transport.mixed_up import other_port
 
 MOST_S = 5.0  # that the rounds take, where the drive is slow or silent
 LOOK_S = 0.05  # between attempts to send a request that was held back
@@ -44,7 +58,7 @@ SETTING_UP = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_port_argument(parser)
+    add_line_arguments(parser, "NAME")
     parser.add_argument("--model", help="of a drive that answers there: the round trip is measured with it")
     parser.add_argument("--address", type=int, metavar="N", help="its address")
     parser.add_argument(
@@ -56,8 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    drive = _drive(arguments)
-    settings = drive.settings if drive else _line_settings(arguments)
+    plant = plant_at(arguments)
+    drive, settings = _of_plant(plant, arguments) if plant else _by_hand(arguments)
     findings = list(_findings(arguments.port, drive, settings))
     if arguments.json:
         records = [asdict(finding) for finding in findings]
@@ -65,6 +79,29 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text("\n".join(_text(findings)))
     return 1 if any(finding.is_failure for finding in findings) else 0
+
+
+def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
+    """Return the drive to measure with, where one is named, and its or its line's settings.
+
+    `port` is the line's port afterwards. Raises ValueError for what only a port by hand takes.
+    """
+    for name in ("model", "address", "baudrate", "format", "framing"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is a matter of the plant file: write it into {plant.path}")
+    lines = {line.name for line in plant.lines}
+    if arguments.name is None or arguments.name in lines:
+        line = line_of(plant, arguments.name)
+        arguments.port = line.port
+        return None, usual_settings(line)
+    line, drive = plant.find_drive(arguments.name)
+    arguments.port = line.port
+    return drive, drive.settings
+
+
+def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
+    drive = _drive(arguments)
+    return drive, drive.settings if drive else _line_settings(arguments)
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -92,8 +129,16 @@ def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Fi
         yield from _remote(port)
     else:
         yield from _local(port)
-    yield _echo(port, settings)
-    yield _round_trip(port, drive)
+    nobody = Message(NOBODY, 0x03, 0, 1)
+    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, settings)
+    measured = _round_trip(port, drive)
+    yield measured
+    if not other_port(port) or (drive and not measured.is_failure):
+        return
+    if drive:
+        yield other_way_finding(port, _first_reading(drive).request, settings)
+    elif not speaks_tcp(port):  # a line without drives says nothing in the other way
+        yield other_way_finding(port, nobody, settings)
 
 
 # ---- the port ----
@@ -101,14 +146,17 @@ def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Fi
 
 def _remote(port: str) -> Iterator[Finding]:
     kind = port.partition("://")[0]
-    if kind == "socket":
+    if speaks_tcp(port):
+        what = "a Modbus TCP connection; small packets are sent at once (TCP_NODELAY)"
+        yield Finding("port", f"{port} is {what}")
+    elif kind == "socket":
         yield Finding("port", f"{port} is a TCP connection; small packets are sent at once (TCP_NODELAY)")
     else:
         yield Finding("port", f"{port} is a pyserial {kind} port, which is copied to by two threads")
     yield Finding(
         "adapter",
         "it is at the far end: its driver, latency timer and RS-485 mode cannot be seen from here",
-        "set baud rate, format and the shortest packing delay in the serial server itself",
+        "set baud rate, format and the shortest packing delay in the serial server or gateway itself",
     )
 
 
@@ -174,20 +222,26 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
         return Finding(
             "round trip",
             "not measured: a drive must answer",
-            "name one with --model and --address; `multidrop scan` finds those that are there",
+            "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
+            "that are there",
         )
-    register = next(iter(drive.readings()))
-    (block,) = blocks(drive, [register])
     with Bus(port) as bus:
         bus.attach(drive)
+        block = _first_reading(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
     # Time of the request and the reply's first character: unknown on a network and on a pseudo-terminal.
-    wire = (len(build_request(drive.framing, poll.request)) + 1) * drive.settings.character
+    sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
+    wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
     seen = [(done.first_ns - done.sent_ns) / 1e9 for done in completions if done.result > 0]
     delays = sorted(max(0.0, delay - wire) if shows_bits else delay for delay in seen)
     return round_trip_finding(drive, delays, len(completions), 0.0 if shows_bits else wire)
+
+
+def _first_reading(drive: Drive) -> Block:
+    (block,) = blocks(drive, [next(iter(drive.readings()))])
+    return block
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:

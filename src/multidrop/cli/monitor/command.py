@@ -17,14 +17,13 @@ from typing import Any
 
 from multidrop.cli.monitor.keys import DOWN, ENTER, ESCAPE, PAGE_DOWN, PAGE_UP, UP, keys
 from multidrop.cli.monitor.side_reads import SideReader
-from multidrop.cli.support.arguments import add_plant_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.live_plant import LiveDrive, LivePlant
 from multidrop.cli.support.output import logging_to, warn
+from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import PollingSession, polling_session
 from multidrop.control.outcome import Seen
-from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 
 DRAW_S = 0.25
@@ -34,6 +33,7 @@ PAGE = 10  # lines
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
+    add_port_option(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help="record what is polled as well")
 
 
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError("`multidrop monitor` needs a terminal; `multidrop poll` works without one")
     if arguments.out:
         refuse_overwriting(arguments.out)
-    summary = watch(load_plant(arguments.plant), out=arguments.out)
+    summary = watch(plant_of(arguments.plant, arguments), out=arguments.out)
     return 0 if summary["samples"] else 1
 
 

@@ -14,13 +14,13 @@ from typing import Any
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
 from multidrop.cli.poll.comparison import compare, comparison_text
 from multidrop.cli.poll.live_table import LiveTable
-from multidrop.cli.support.arguments import add_json_argument, add_plant_argument, duration
+from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import check_capture, refuse_overwriting
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.polling import polling_session
 from multidrop.cli.support.signals import Interruption
 from multidrop.cli.support.values import aligned
-from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 
@@ -29,6 +29,7 @@ _TAKE_S = 0.1  # between looks for new rows
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
+    add_port_option(parser)
     add_polling_arguments(parser, out=None, seconds=None)
 
 
@@ -59,7 +60,7 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
 def run(arguments: argparse.Namespace) -> int:
     if arguments.out:
         refuse_overwriting(arguments.out)
-    return follow(load_plant(arguments.plant), arguments)
+    return follow(plant_of(arguments.plant, arguments), arguments)
 
 
 def follow(plant: Plant, arguments: argparse.Namespace) -> int:

@@ -10,11 +10,12 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from multidrop.capture import Capture, CaptureWriter
-from multidrop.capture.lookup import line_of
+from multidrop.capture.lookup import line_of as captured_line
 from multidrop.cli.sniff.listener import Listener
-from multidrop.cli.support.arguments import add_json_argument, add_port_argument, duration
+from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import check_capture
 from multidrop.cli.support.output import print_text
+from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
 from multidrop.cli.support.signals import noting_signals
 from multidrop.cli.support.traffic import TrafficPrinter, replay, summary
 from multidrop.drive.timing import Settings
@@ -26,7 +27,7 @@ _GIVEN_UP_S = 1.5  # longer than any master waits for a reply
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_port_argument(parser, nargs="?")
+    add_line_arguments(parser)
     parser.add_argument("--replay", metavar="FILE", type=Path, help="a capture, instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
     parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
             out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
             counts = dict(replay(source, plant, as_json=arguments.json, out=out))
         else:
-            line = _line_at(plant, arguments.port)
+            line = _line(arguments, plant)
             listener = stack.enter_context(closing(Listener(arguments.port, _settings(arguments, line))))
             out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
             name = line.name if line else _name(arguments.port)
@@ -59,10 +60,21 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _line_at(plant: Plant | None, port: str) -> PlantLine | None:
-    """Find the plant's line at this port; a plant's only line is it at any port."""
-    lines = plant.lines if plant else ()
-    return next((line for line in lines if line.port == port), line_of(plant, port))
+def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
+    """Return the line to listen to, where it is known; `port` is its port afterwards.
+
+    Of --plant it is the line at this port; a plant's only line is it at any port.
+    """
+    named = plant_at(arguments)
+    if named is None:
+        port = arguments.port
+        lines = plant.lines if plant else ()
+        return next((line for line in lines if line.port == port), captured_line(plant, port))
+    if plant:
+        raise ValueError(f"--plant is for a PORT: {arguments.port} is a plant file already")
+    line = line_of(named, arguments.name)
+    arguments.port = line.port
+    return line
 
 
 def _name(port: str) -> str:
@@ -71,8 +83,7 @@ def _name(port: str) -> str:
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
     """Return the arguments' settings, else those of most of the line's drives."""
-    found = [polled.drive.settings for polled in line.drives] if line else []
-    usual = max(found, key=found.count) if found else Settings(9600, "8N1")
+    usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)
 

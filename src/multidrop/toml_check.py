@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from multidrop.printable import printable
 
 T = TypeVar("T")
 
+MOST_PARTS = 100  # of a dotted key
+
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
     """Return a TOML file's tables; ValueError, without the path, where it cannot be read.
@@ -20,18 +23,36 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
     A byte order mark before the text is skipped: some editors write one.
     """
     try:
-        document = tomllib.loads(path.read_text("utf-8-sig"))
+        data = path.read_bytes()
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
+    return parse_document(data)
+
+
+def parse_document(data: bytes) -> dict[str, Any]:
+    """Return the tables of a TOML file's bytes; ValueError where they are none."""
+    try:
+        text = data.decode("utf-8-sig")
+        _check_keys(text)
+        document = tomllib.loads(text)
+        fits = _fits(document)
     except UnicodeDecodeError as failure:
         raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
     except RecursionError as failure:
         raise ValueError("is not TOML of ours: it is nested too deeply") from failure
     except ValueError as failure:
         raise ValueError(f"is not TOML: {failure}") from failure
-    if not _fits(document):
+    if not fits:
         raise ValueError("is not TOML: a number does not fit into 64 bits")
     return document
+
+
+def _check_keys(text: str) -> None:
+    """Refuse keys of very many parts, for which tomllib takes memory and time with their square."""
+    if text.count(".") > MOST_PARTS:
+        pieces = re.split(r"[=,{}\[\]\n]+", text)
+        if any(piece.count(".") > MOST_PARTS for piece in pieces):
+            raise ValueError(f"a key or a text has more than {MOST_PARTS} points")
 
 
 def _fits(value: Any) -> bool:
@@ -51,6 +72,12 @@ class Key:
     example: str
     needed: bool = False
 
+    def takes(self, value: Any) -> bool:
+        """Return True for a value of its type that says something; true and false are no numbers."""
+        if isinstance(value, bool):
+            return self.kind is bool
+        return isinstance(value, self.kind) and value not in ("", [])
+
 
 @dataclass(frozen=True)
 class TomlPlace:
@@ -67,6 +94,14 @@ class TomlPlace:
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
             yield table, TomlPlace(self.path, (*self.labels, label), self.config_errors, self.seen)
+
+    def within(self, *labels: str) -> TomlPlace:
+        """Return a place inside this one."""
+        return TomlPlace(self.path, (*self.labels, *labels), self.config_errors, self.seen)
+
+    def of_file(self, path: Path, *labels: str) -> TomlPlace:
+        """Return a place in another file that belongs to this one."""
+        return TomlPlace(path, labels, self.config_errors, self.seen)
 
     def wrong(self, sentence: object) -> None:
         """Add an error. What a terminal would not print as it stands is spelt out."""
@@ -92,14 +127,14 @@ class TomlPlace:
         if not isinstance(table, dict):
             self.wrong(f"{table!r} is not a table with {', '.join(keys)}")
             return {}
-        meant = self._unknown(table, keys)
+        meant = self.unknown(table, keys)
         good = {}
         for name, key in keys.items():
             value = table.get(name)
             if value is None:
                 if key.needed and name not in meant:
                     self.wrong(f"{name!r} is missing; add {key.example}")
-            elif isinstance(value, bool) or not isinstance(value, key.kind) or value in ("", []):
+            elif not key.takes(value):
                 self.wrong(f"{name} = {value!r} is not right; write {key.example}")
             elif isinstance(value, str) and not value.isprintable():
                 self.wrong(f"{name} = {value!r} has characters that do not print; leave them out")
@@ -107,7 +142,7 @@ class TomlPlace:
                 good[name] = value
         return good
 
-    def _unknown(self, table: Mapping[str, Any], keys: Mapping[str, Key]) -> set[str]:
+    def unknown(self, table: Mapping[str, Any], keys: Mapping[str, object]) -> set[str]:
         """Add an error for each unknown key; return the known ones that they probably mean."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:
@@ -116,3 +151,35 @@ class TomlPlace:
             hint = f"did you mean {near[0]!r}?" if near else f"the keys here are {', '.join(keys)}"
             self.wrong(f"unknown key {name!r}; {hint}")
         return meant
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds in a duration such as "50 ms"; ValueError if it is none."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", text.strip(), re.ASCII)
+    units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+    seconds = float(match[1]) * units[match[2]] if match else 0
+    if not _SHORTEST <= seconds <= _LONGEST:
+        raise ValueError(f'{text!r} is not a duration from 100 us to 24 h, such as "50 ms", "2 s" or "1 min"')
+    return seconds
+
+
+def check_period(seconds: float) -> None:
+    """Raise ValueError unless a period in s is one that a plant file may have."""
+    is_number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
+    if not is_number or not _SHORTEST <= seconds <= _LONGEST:
+        raise ValueError(f"every = {seconds!r} is not a number of seconds from 0.0001 to 86400, or None")
+
+
+def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
+    """Return the duration under this key in s; None where it is not given, or wrong."""
+    return place.attempt(_duration_under, key, given[key]) if key in given else None
+
+
+def _duration_under(key: str, text: str) -> float:
+    try:
+        return parse_duration(text)
+    except ValueError as mistake:
+        raise ValueError(f"{key} = {mistake}") from mistake
+
+
+_SHORTEST, _LONGEST = 100e-6, 86400.0  # s

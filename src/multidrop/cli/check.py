@@ -1,0 +1,164 @@
+"""`multidrop check`: says what a family's file declares, what it leaves open, and what will be refused."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from multidrop.cli.models import INDENT, facts, sheet
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.values import wrapped
+from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
+from multidrop.control.rules import wears
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Access, Kept, Register
+from multidrop.drive.verbs import MOVING
+from multidrop.drives.registry import SHIPPED, shipped_family
+from multidrop.family_file.loader import FamilyError, load_family
+from multidrop.family_file.step_words import declared_in_words
+
+Remark = tuple[str, str]  # a register or a key, and the sentence about it
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "file", metavar="FILE.toml", type=Path, help="a family's file, or a shipped family's name"
+    )
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    try:
+        name = str(arguments.file)
+        family = shipped_family(name) if name in SHIPPED else load_family(arguments.file)
+    except FamilyError as wrong:
+        if arguments.json:
+            print_text(json.dumps({"mistakes": wrong.mistakes}, indent=2))
+        else:
+            warn(str(wrong))
+        return 1
+    unknown, refused = list(_unknown(family)), list(_refused(family))
+    if arguments.json:
+        more = {
+            "mistakes": [],
+            "steps": list(_verbs(family)),
+            "not_known": unknown,
+            "will_be_refused": refused,
+        }
+        print_text(json.dumps(facts(family) | more, indent=2))
+        return 0
+    verbs = list(_verbs(family))
+    lines = [sheet(family)]
+    if verbs:
+        lines += ["", "verbs", *_lines(verbs)]
+    for heading, remarks in (("not known", unknown), ("will be refused", refused)):
+        lines += ["", heading, *_lines(remarks)]
+    print_text("\n".join([*lines, "", _verdict(family, arguments.file)]))
+    return 0
+
+
+def _lines(remarks: list[Remark]) -> Iterator[str]:
+    if not remarks:
+        yield "  nothing"
+    for name, sentence in remarks:
+        yield from wrapped(sentence, f"  {name:<{INDENT}}", " " * (INDENT + 2))
+
+
+def _verdict(family: type[Drive], file: Path) -> str:
+    if "confirmed" not in family.options:
+        return f"No mistake found in {file}. Compare the addresses, as they are sent, with the manual."
+    return (
+        f"No mistake found in {file}. It can move a motor, and nobody has tested it: compare every line with "
+        "the\nmanual, and only then give its drives confirmed = 1 in the plant file, or --option confirmed=1."
+    )
+
+
+def _verbs(family: type[Drive]) -> Iterator[Remark]:
+    declared = getattr(family, "declared_verbs", None)
+    if declared is not None:
+        yield from declared_in_words(declared, family.registers)
+
+
+# ---- what the file leaves open ----
+
+
+def _unknown(family: type[Drive]) -> Iterator[Remark]:
+    drive = family(family.addresses[0])
+    registers = family.registers.values()
+    for register in registers:
+        if wears(drive, register) is Kept.UNKNOWN and register.writable:
+            where = 'each write is counted as wear; kept = "ram" or "eeprom"'
+            yield register.name, f"whether it is kept in EEPROM: {where}"
+        if register.step is None:
+            yield register.name, "the value of one count: its counts are shown as they are"
+        if register.access is Access.SETTING and register.values is None and register.span is None:
+            yield register.name, "its span: all that fits is written; span = [0, 50]"
+        if register.access is not Access.READING and not register.place:
+            yield register.name, 'its place in the manual, to be compared; place = "table 3"'
+    placeless = [one.name for one in registers if one.access is Access.READING and not one.place]
+    if placeless:
+        yield "place", f"the manual's place of {_some(placeless)}"
+    if family.identify is Drive.identify:
+        yield "identify", "how to tell this device from another; look at its name plate"
+    if not family.most_registers:
+        yield "together", "how many neighbours one request may read; together = { holding = 20 }"
+    if "confirmed" in family.options:
+        for key in ("remote", "watchdog"):
+            if getattr(family, key) == getattr(Drive, key):
+                yield key, _OF_A_MOTOR[key]
+
+
+_OF_A_MOTOR = {
+    "remote": "what to set on the keypad so that the line commands it",
+    "watchdog": "whether the motor stops when nobody asks any more; it is taken to run on",
+}
+
+
+def _some(names: list[str]) -> str:
+    return (
+        ", ".join(names) if len(names) <= 4 else f"{', '.join(names[:3])} and {len(names) - 3} more readings"
+    )
+
+
+# ---- what will not be sent ----
+
+
+def _refused(family: type[Drive]) -> Iterator[Remark]:
+    drive = family(family.addresses[0])
+    for register in family.registers.values():
+        if register.access is not Access.READING:
+            yield from ((register.name, sentence) for sentence in _of_writes(drive, register))
+    moving = [name for name in MOVING if getattr(family, name) is not getattr(Drive, name)]
+    if "confirmed" in family.options:
+        writes = "every write that is not called harmless" if moving else "every write"
+        yield "confirmed", f"{', '.join([*moving, writes])}, until the drive has confirmed = 1"
+    if not moving:
+        yield "verbs", "start, stop and the like: it has none"
+    if not family.broadcasts:
+        yield "broadcast", "all: no register has counts that are documented for it"
+
+
+def _of_writes(drive: Drive, register: Register[Any]) -> Iterator[str]:
+    if register.never:
+        yield f"every write: {register.never}"
+        return
+    if not register.writable:
+        yield f"every write: a {register.table.name} cannot be written"
+    elif register.commands:
+        harmless = ", ".join(f"{raw:04X}H" for raw in register.harmless or ())
+        yield f"every write but by verbs, and of {harmless}" if harmless else "every write but by verbs"
+    if register.while_running is False:
+        stands = "while the motor does not stand"
+        unsure = type(drive).state is Drive.state
+        yield (
+            "every write: nothing says whether the motor stands ([state])" if unsure else f"a write {stands}"
+        )
+    kept = wears(drive, register)
+    if register.writable and kept is Kept.EEPROM:
+        yield f"more than one write in {LEAST_INTERVAL:.0f} s, and than {BUDGET} a year: it is in EEPROM"
+    elif register.writable and kept is Kept.UNKNOWN:
+        yield f"more than {BUDGET} writes a year: it may be in EEPROM"

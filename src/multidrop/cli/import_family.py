@@ -1,0 +1,52 @@
+"""`multidrop import`: makes a family file of another program's register table."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from multidrop.cli.support.files import refuse_overwriting
+from multidrop.cli.support.output import print_text, warn
+from multidrop.importers import ImportedDevice, family_text, plant_text, read_devices
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "file", metavar="FILE", type=Path, help="CSV, TSV, YAML (Home Assistant), TOML (Telegraf) or JSON"
+    )
+    parser.add_argument("--address", metavar="N", type=int, help="the device, where the file has several")
+    parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; printed without it")
+    parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    for target in filter(None, (arguments.out, arguments.plant)):
+        refuse_overwriting(target)
+    if arguments.plant and not arguments.out:
+        raise ValueError("a plant file names its family's file: add --out FAMILY.toml")
+    try:
+        devices = read_devices(arguments.file)
+    except ImportError as failure:
+        raise ValueError(str(failure)) from failure
+    device = _chosen(devices, arguments.address)
+    text = family_text(device, arguments.file.name)
+    plant = plant_text(device, arguments.out.name) if arguments.plant else ""
+    if arguments.out:
+        arguments.out.write_text(text, "utf-8")
+        print_text(f"{arguments.out} is ready: mend its gaps, then multidrop check {arguments.out}")
+    else:
+        print_text(text)
+    if plant:
+        arguments.plant.write_text(plant, "utf-8")
+        print_text(f"{arguments.plant} is ready: say its port")
+    for sentence in device.lost:
+        warn(f"not carried over: {sentence}")
+    return 0
+
+
+def _chosen(devices: list[ImportedDevice], address: int | None) -> ImportedDevice:
+    found = [device for device in devices if address is None or device.address == address]
+    if len(found) == 1:
+        return found[0]
+    known = ", ".join(str(device.address) for device in devices)
+    raise ValueError(f"the file has devices at {known}: say which, such as --address {devices[0].address}")

@@ -1,0 +1,69 @@
+"""Check what a declaration says of a register's number: order, part, invalid counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from multidrop.core import NumberFormat
+from multidrop.drive.number_format import FLOATS, WORDS, width
+from multidrop.drive.register import Access, Carrier, Register
+
+_PARTED = frozenset(
+    {
+        *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
+        *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
+    }
+)
+
+
+def number_errors(register: Register[Any]) -> Iterator[str]:
+    """Yield a sentence for each error; number format and table fit each other already."""
+    if register.table.carrier is not Carrier.WORD:
+        yield from _only_words(register)
+        return
+    yield from _order(register)
+    yield from _part(register)
+    yield from _invalid(register)
+    if register.number_format is NumberFormat.I8 and register.access is not Access.READING:
+        yield "number_format = I8 is one byte of a word, whose other byte is not known: it is never written"
+
+
+def _only_words(register: Register[Any]) -> Iterator[str]:
+    for name, common in (("part", None), ("invalid", ()), ("order", "ABCD"), ("scale_register", "")):
+        if getattr(register, name) != common:
+            yield f"{name} is for numbers in words, and a {register.table.name} holds none"
+
+
+def _order(register: Register[Any]) -> Iterator[str]:
+    if register.order == "BA" and WORDS[register.number_format] > 1:
+        words = WORDS[register.number_format]
+        yield f"order = 'BA' is for one word, and this has {words}: CDAB, BADC or DCBA"
+    if register.order != "ABCD" and register.number_format is NumberFormat.U32_EITHER:
+        yield "number_format = U32_EITHER leaves the order of its words open: it has no order"
+
+
+def _part(register: Register[Any]) -> Iterator[str]:
+    if register.part is None:
+        return
+    if register.number_format not in _PARTED:
+        yield f"part is for whole numbers, not for number_format = {register.number_format.name}"
+    elif register.part[1] >= width(register.number_format):
+        bits = width(register.number_format)
+        yield f"part = ({register.part[0]}, {register.part[1]}) is beyond the {bits} bits of its number"
+    if register.access is not Access.READING:
+        yield "a part is never written, as the other bits of its word would be too: declare a reading"
+
+
+def _invalid(register: Register[Any]) -> Iterator[str]:
+    if register.invalid and register.number_format is NumberFormat.U32_EITHER:
+        yield "number_format = U32_EITHER leaves its words open: no count of it can be told to be invalid"
+        return
+    if register.number_format in FLOATS:
+        return
+    bits = width(register.number_format)
+    for count in register.invalid:
+        if count != count:
+            yield "invalid = nan is for floats, and this is a whole number"
+        elif not -(1 << bits - 1) <= count < 1 << bits or count != int(count):
+            yield f"invalid = {count:g} is no count of {bits} bits"

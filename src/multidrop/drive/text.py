@@ -1,0 +1,96 @@
+"""Texts: characters in neighbouring registers, read on demand and for identification, never polled."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+from multidrop.drive.register import HOLDING, Table
+
+_LAST_ADDRESS = 0xFFFF
+MOST_WORDS = 125  # of one request
+_ORDERS = ("AB", "BA", "B")  # B: one character a register, in its low byte
+
+
+@dataclass(frozen=True, eq=False)
+class Text:
+    """A text of a drive: its address, its length in registers, and the order of characters in them.
+
+    Raises ValueError for what no request could read.
+    """
+
+    address: int
+    length: int
+    table: Table = HOLDING
+    order: str = "AB"
+    place: str = ""
+    name: str = field(default="", init=False)
+
+    def __post_init__(self) -> None:
+        if not _is_whole(self.length) or not 1 <= self.length <= MOST_WORDS:
+            raise ValueError(f"a text of {self.length!r} registers: one request reads 1 to {MOST_WORDS}")
+        if not _is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
+            raise ValueError(f"a text at {self.address!r}: its registers are not within 0 to FFFFH")
+        if self.order not in _ORDERS:
+            raise ValueError(f"order = {self.order!r} of a text is none of 'AB', 'BA' and 'B'")
+        if not isinstance(self.table, Table) or self.table.read not in (0x03, 0x04):
+            raise ValueError(f"a text is in HOLDING or INPUT registers, not in {self.table!r}")
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", name)
+
+    def __str__(self) -> str:
+        return self.name
+
+    def decode(self, data: bytes) -> str:
+        """Return the text of a reply's data: up to the first NUL, without spaces at its end.
+
+        Bytes above 7FH are Latin-1; what cannot be printed is shown as a question mark, for it comes from a
+        line.
+        """
+        if self.order == "BA":
+            data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
+        elif self.order == "B":
+            data = data[1::2]
+        found = data.partition(b"\0")[0].decode("latin-1").rstrip()
+        return "".join(character if character.isprintable() else "?" for character in found)
+
+    def encode(self, value: str) -> bytes:
+        """Return the bytes of the registers that hold a text. Raises ValueError for one that does not fit."""
+        data = value.encode("latin-1")
+        most = self.length * (1 if self.order == "B" else 2)
+        if len(data) > most:
+            raise ValueError(f"{self.name} holds {most} characters, not {len(data)}")
+        if self.order == "B":
+            return b"".join(bytes((0, character)) for character in data.ljust(most, b"\0"))
+        data = data.ljust(2 * self.length, b"\0")
+        if self.order == "BA":
+            data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
+        return data
+
+
+def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB", place: str = "") -> Text:
+    """Declare a text of so many registers, two characters in each; order "BA": the second one comes first.
+
+    Order "B" is one character in each, in its low byte.
+    """
+    return Text(address, length, table, order, place)
+
+
+def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
+    """Return a sentence for each error in a class's texts; `taken` are names that drives have already."""
+    found = [
+        f"{name}: this is a name that every drive has for something else; call it otherwise"
+        for name in texts
+        if name in taken
+    ]
+    return found + [
+        f"{name}: this is the text {text.name} already; declare one of its own"
+        for name, text in texts.items()
+        if text.name != name
+    ]
+
+
+def _is_whole(number: object) -> bool:
+    return isinstance(number, int) and not isinstance(number, bool)

@@ -1,0 +1,139 @@
+"""WideRows: a column for each register of each drive, a row for each time at which any was asked."""
+
+from __future__ import annotations
+
+import difflib
+from array import array
+from collections.abc import Collection, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from multidrop.polling.table import ArrowTable
+
+if TYPE_CHECKING:
+    from multidrop.polling.batch import Row
+
+TIMES = ("time", "monotonic_ns")
+
+
+class _WideColumn:
+    """Samples of one register, each with the number of its row."""
+
+    def __init__(self) -> None:
+        self.rows = array("q")
+        self.values = array("d")
+
+    def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
+        """Return a bit for each row, 1 where there is a value, and the values; rows go to these places."""
+        valid = bytearray((len(places) + 7) // 8)
+        values = array("d", bytes(8 * len(places)))
+        for row, value in zip(self.rows, self.values, strict=True):
+            at = places[row]
+            valid[at >> 3] |= 1 << (at & 7)
+            values[at] = value
+        return valid, values
+
+
+class WideRows(ArrowTable):
+    """Rows by time: columns `time`, `monotonic_ns`, and `drive.register` for each register of each drive.
+
+    Rows of the long form that have the same time to the nanosecond are one row: those of one request are,
+    as its registers share the time at which it was sent. Nothing else is joined, filled or interpolated, so
+    a row has values for the registers of one request, and null for all others. A miss is null too; why is
+    in the long form alone. Rows are in the order of `monotonic_ns`.
+    """
+
+    def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
+        """Take the rows of these columns, or of all.
+
+        `known` are columns that may have no row. Raises ValueError for a column that is not known, and where
+        two registers would have the same column.
+        """
+        self._columns = {name: _WideColumn() for name in chosen}
+        self._times: dict[tuple[int, int], int] = {}  # and monotonic_ns: the number of the row
+        found: dict[tuple[str, str], _WideColumn | None] = {}
+        owners: dict[str, tuple[str, str]] = {}
+        for time, monotonic_ns, _, drive, register, value, _ in rows:
+            owner = drive, register
+            if owner not in found:
+                found[owner] = self._column(owner, owners, bool(chosen))
+            column = found[owner]
+            if column is None:
+                continue
+            row = self._times.setdefault((time, monotonic_ns), len(self._times))
+            if value is not None:
+                column.rows.append(row)
+                column.values.append(value)
+        _check_chosen(chosen, {*owners, *known})
+
+    def _column(
+        self, owner: tuple[str, str], owners: dict[str, tuple[str, str]], are_chosen: bool
+    ) -> _WideColumn | None:
+        """Return the column of a drive's register; None where it is not chosen."""
+        name = ".".join(owner)
+        if owners.setdefault(name, owner) != owner:
+            drives = " and ".join(repr(drive) for drive, _ in (owners[name], owner))
+            raise ValueError(
+                f"drives {drives} both have a register that is called {name!r}: rename one of them"
+            )
+        if are_chosen:
+            return self._columns.get(name)
+        return self._columns.setdefault(name, _WideColumn())
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of all columns."""
+        return [*TIMES, *self._columns]
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} rows of {len(self._columns)} registers>"
+
+    def __arrow_c_schema__(self) -> Any:
+        return self._schema().__arrow_c_schema__()
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        import nanoarrow
+
+        return nanoarrow.c_array_stream(self._arrow()).__arrow_c_stream__()
+
+    def _schema(self) -> Any:
+        import nanoarrow as arrow
+
+        times = {
+            "time": arrow.timestamp("ns", "UTC", nullable=False),
+            "monotonic_ns": arrow.int64(nullable=False),
+        }
+        values = {name: arrow.float64() for name in self._columns}
+        return arrow.c_schema(arrow.struct({**times, **values}, nullable=False))
+
+    def _arrow(self) -> Any:
+        from nanoarrow import c_array_from_buffers
+
+        ordered = sorted(self._times, key=lambda times: (times[1], times[0]))
+        places = array("q", bytes(8 * len(ordered)))
+        for place, times in enumerate(ordered):
+            places[self._times[times]] = place
+        buffers: list[tuple[Any, Any]] = [(None, array("q", column)) for column in _transposed(ordered)]
+        buffers += [column.dense(places) for column in self._columns.values()]
+        schema = self._schema()
+        children = [
+            c_array_from_buffers(kind, len(self), pair)
+            for kind, pair in zip(schema.children, buffers, strict=True)
+        ]
+        return c_array_from_buffers(schema, len(self), [None], children=children, move=True)
+
+
+def _transposed(times: Sequence[tuple[int, int]]) -> Iterable[Iterable[int]]:
+    return zip(*times, strict=True) if times else ((), ())
+
+
+def _check_chosen(chosen: Sequence[str], known: set[str]) -> None:
+    for name in chosen:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=2)
+            hint = f"did you mean {' or '.join(near)}?" if near else "a column is DRIVE.REGISTER"
+            raise ValueError(f"there is no column {name!r}; {hint}")
+        if chosen.count(name) > 1:
+            raise ValueError(f"column {name!r} is chosen twice")

@@ -1,0 +1,63 @@
+"""Tell Modbus TCP (tcp://) from RTU over TCP (socket://), which are easily taken for each other.
+
+A gateway is set to the one or to the other, and is silent, or says what makes no sense, when asked in the
+other.
+"""
+
+from __future__ import annotations
+
+from urllib.parse import urlsplit
+
+from multidrop.core import crc16
+from multidrop.drive.network import MODBUS_PORT
+
+_HEAD = 6  # bytes of Modbus TCP's header before the unit id
+_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU frame: an exception is the shortest reply
+_OTHER = {"socket": "tcp", "tcp": "socket"}
+_SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
+
+
+def other_port(port: str) -> str:
+    """Return the same place in the other way; "" for a port that is neither."""
+    url = urlsplit(port)
+    if url.scheme not in _OTHER:
+        return ""
+    place = url.netloc if url.port else f"{url.netloc}:{MODBUS_PORT}"
+    return f"{_OTHER[url.scheme]}://{place}"
+
+
+def spoken_on(port: str) -> str:
+    """Return the name of what such a port carries."""
+    return _SPOKEN[urlsplit(port).scheme]
+
+
+def mixed_up(port: str, received: bytes) -> str:
+    """Return advice where these bytes, received on this port, have the shape of the other way; else ""."""
+    other = other_port(port)
+    is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
+    if not is_shaped:
+        return ""
+    return f"; this has the shape of {spoken_on(other)}: name the port {other} in place of {port}"
+
+
+def silence_hint(port: str) -> str:
+    """Return advice for a drive that is silent behind such a port; "" for any other."""
+    other = other_port(port)
+    if not other:
+        return ""
+    return (
+        f", and whether the far end speaks {spoken_on(port)}: else name the port {other} "
+        "(`multidrop doctor` tries)"
+    )
+
+
+def _is_tcp(received: bytes) -> bool:
+    """Tell whether one frame of Modbus TCP is all that came."""
+    announced = int.from_bytes(received[4:6])
+    return len(received) > _HEAD + 2 and received[2:4] == b"\0\0" and announced == len(received) - _HEAD
+
+
+def _is_rtu(received: bytes) -> bool:
+    """Tell whether an RTU frame stands at the beginning of what came."""
+    ends = range(_LEAST, min(len(received), _MOST_RTU) + 1)
+    return any(crc16(received[:end], end) == 0 for end in ends)

@@ -1,0 +1,85 @@
+"""Captures of a tcp:// line: Wireshark decodes them as Modbus/TCP, and so do we."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from lines import until
+from peers import require_program
+
+from multidrop.capture import Capture, CaptureWriter, Decoding, Tapped
+from multidrop.drives import InnovertIBD
+from multidrop.plant.loader import load_plant
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import EncodedDrive, Simulator, Wire, proof
+
+FIELDS = ("mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code", "modbus.reference_num")
+POLLED = ("output_current", "motor_speed")
+
+
+@pytest.fixture
+def captured(tmp_path: Path) -> tuple[Path, Path, list[Row]]:
+    """A plant file, the capture of its poll with a silent drive, and the poll's rows."""
+    plant, path = tmp_path / "plant.toml", tmp_path / "a.pcapng"
+    wire = Wire([EncodedDrive(InnovertIBD(3))], port="tcp://127.0.0.1:0", unpaced=True)
+    with Simulator([wire]):
+        plant.write_text(
+            f'[[line]]\nname = "net"\nport = "{wire.path}"\n'
+            + "".join(
+                f'[[line.drive]]\nname = "{name}"\nmodel = "innovert-ibd"\naddress = {address}\n'
+                f"poll = {list(POLLED)}\n"
+                for name, address in (("pump", 3), ("gone", 4))
+            )
+        )
+        poller, rows = Poller(load_plant(plant)), []
+
+        def is_enough() -> bool:
+            tapped.collect()
+            while batch := poller.take():
+                rows.extend(batch)
+            return len(rows) > 200 and "gone" in {row.drive for row in rows}
+
+        with CaptureWriter(path, list(poller.buses)) as capture:
+            with Tapped(poller.buses, capture) as tapped, poller:
+                until(is_enough)
+            while batch := poller.take():
+                rows.extend(batch)
+        assert tapped.lost == 0
+    return plant, path, rows
+
+
+def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> None:
+    _, path, rows = captured
+    fields = [word for field in FIELDS for word in ("-e", field)]
+    command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
+    said = subprocess.run([*command, *fields], capture_output=True, text=True, check=True).stdout
+    lines = [line.split("\t") for line in said.splitlines()]
+    packets = [it for it in lines if it[1]]  # a late reply is part of no exchange
+    assert len(packets) > 0.9 * len(lines)
+    answered = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Response")]
+    asked = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Query")]
+    assert len(answered) == len({row.monotonic_ns for row in rows if row.value is not None})
+    assert {it[1] for it in answered} <= {it[1] for it in asked}
+    assert {(it[2], it[3]) for it in packets} == {("3", "3"), ("4", "3")}
+    assert "Malformed" not in said
+
+
+def test_our_own_reader_has_the_poll_s_values(captured: tuple[Path, Path, list[Row]]) -> None:
+    plant, path, polled = captured
+    known = load_plant(plant)
+    with Capture(path) as capture:
+        decoding = Decoding(capture, known)
+        found = [row for batch in decoding for row in batch]
+        assert decoding.counts()["unknown_bytes"] == 0
+    drive = known.lines[0].drives[0].drive
+    assert {row.value for row in found if row.drive == "pump" and row.register == "output_current"} == {
+        proof(drive, drive.register("output_current"))
+    }
+    told = [(row.drive, row.register, row.value, row.status) for row in polled if row.status != NOT_ASKED]
+    assert [(row.drive, row.register, row.value, row.status) for row in found][: len(told) - 8] == told[:-8]
+
+
+NOT_ASKED = "not asked: drive is silent"

@@ -1,0 +1,157 @@
+"""`multidrop check`, and the other commands on a family's file."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from commands import Run
+from families import write_meter
+
+DATA = Path(__file__).parents[1] / "data" / "families"
+FAN = """\
+[family]
+title = "Fan FC-2"
+manual = "FC-2, section 4"
+counts_from = 1
+[reading]
+speed = { at = 0x0010, unit = "rpm" }
+scale = { at = 0x0011, step = "unknown", place = "P0" }
+[setting]
+frequency = { at = 0x0020, unit = "Hz", step = 0.1 }
+ramp = { at = 0x0021, unit = "s", kept = "eeprom", while_running = false, span = [0, 10], place = "P1" }
+locked = { at = 0x0022, never = "it changes the motor", place = "P2", span = [0, 1], kept = "ram" }
+[command]
+run = { at = 0x0030, values = { off = 0, on = 1 }, harmless = [0], place = "P3" }
+"""
+
+
+def words(text: str) -> str:
+    return re.sub(r"\s+", " ", text)
+
+
+@pytest.fixture
+def fan(tmp_path: Path) -> Path:
+    path = tmp_path / "fan.toml"
+    path.write_text(FAN)
+    return path
+
+
+def test_check_tells_what_it_understood_and_what_it_does_not_know(run: Run, fan: Path) -> None:
+    status, out, err = run("check", fan)
+    shown = words(out)
+    assert (status, err) == (0, "")
+    assert "000FH speed reading 1 rpm" in shown  # as it is sent: the manual counts from 1
+    assert "declared by its file, not tested by us" in shown
+    unknown, refused = shown.partition(" not known ")[2].split(" will be refused ")
+    for told in (
+        "frequency whether it is kept in EEPROM: each write is counted as wear",
+        "frequency its span: all that fits is written; span = [0, 50]",
+        "frequency its place in the manual",
+        "scale the value of one count: its counts are shown as they are",
+        "place the manual's place of speed",
+        "identify how to tell this device from another",
+        "watchdog whether the motor stops when nobody asks any more",
+    ):
+        assert told in unknown
+    for told in (
+        "ramp every write: nothing says whether the motor stands",
+        "ramp more than one write in 60 s, and than 1000 a year: it is in EEPROM",
+        "locked every write: it changes the motor",
+        "run every write but by verbs, and of 0000H",
+        "confirmed every write, until the drive has confirmed = 1",
+        "It can move a motor, and nobody has tested it",
+    ):
+        assert told in refused
+
+
+def test_check_tells_verbs_in_words(run: Run) -> None:
+    status, out, _ = run("check", DATA / "abb.toml")
+    assert status == 0
+    for told in (
+        "identify it is one when status has remote",
+        "state fault when tripped (status has tripped)",
+        "start 7 write 0477H to 0000H (control: off1 + off2 + off3 + ramp_out_zero",
+        "start 6 wait 0.1 s",
+        "stop 2 wait until stands (status lacks rdy_ref and output_frequency is below 0.2 Hz); after 60 s:",
+        "reset-fault 1 refuse when runs (status has rdy_on + rdy_run + rdy_ref): it runs: it has no fault",
+    ):
+        assert told in words(out)
+
+
+@pytest.mark.parametrize("name", ["abb", "fc", "enum", "coil"])
+def test_every_step_has_its_words(run: Run, name: str) -> None:
+    status, out, _ = run("check", DATA / f"{name}.toml")
+    assert status == 0
+    assert "no words for" not in out
+
+
+def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
+    status, out, _ = run("check", "abb-acs355")
+    assert status == 0
+    assert "No mistake found in abb-acs355" in words(out)
+
+
+def test_check_prints_json(run: Run, fan: Path) -> None:
+    status, out, _ = run("check", fan, "--json")
+    found = json.loads(out)
+    assert (status, found["model"], found["declared_in"], found["mistakes"]) == (
+        0,
+        "fan.toml",
+        "fan.toml",
+        [],
+    )
+    assert ["identify", "how to tell this device from another; look at its name plate"] in found["not_known"]
+
+
+def test_all_mistakes_are_told_with_status_1(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "fan.toml"
+    path.write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
+    status, out, err = run("check", path)
+    assert (status, out) == (1, "")
+    assert [line.partition(": [")[2] for line in err.splitlines()] == [
+        'reading] speed: at: "8192" may be decimal or hex; write 8192, or "8192H"',
+        "setting] frequency: at: -1 is outside 1 to 10000H",
+    ]
+    status, out, _ = run("check", path, "--json")
+    assert (status, len(json.loads(out)["mistakes"])) == (1, 2)
+
+
+def test_models_says_that_a_file_is_not_tested(run: Run, tmp_path: Path) -> None:
+    path = write_meter(tmp_path)
+    status, out, _ = run("models", path)
+    assert status == 0
+    assert "declared by its file, not tested by us" in words(out)
+    assert json.loads(run("models", path, "--json")[1])["declared_in"] == "meter.toml"
+
+
+def test_a_model_s_file_with_mistakes_is_a_mistaken_call(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "fan.toml"
+    path.write_text("[family]\n")
+    status, _, err = run("models", path)
+    assert status == 2
+    assert "'title' is missing" in err
+    assert "'manual' is missing" in err
+
+
+def test_a_plant_file_tells_its_family_s_mistakes_once(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "fan.toml").write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
+    drives = "".join(f'[[line.drive]]\nname = "f{at}"\nmodel = "fan.toml"\naddress = {at}\n' for at in (1, 2))
+    (tmp_path / "plant.toml").write_text(f'[[line]]\nname = "L"\nport = "/dev/null"\n{drives}')
+    status, _, err = run("plan", tmp_path / "plant.toml")
+    assert status == 2
+    told = [line for line in err.splitlines() if "fan.toml" in line]
+    assert len(told) == 2
+    assert all('plant.toml: line "L", drive "f1": ' in line for line in told)
+
+
+def test_two_files_of_one_name_are_not_scanned_for_at_once(run: Run, tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write_meter(tmp_path / folder)
+    found = [tmp_path / folder / "meter.toml" for folder in ("a", "b")]
+    status, _, err = run("scan", "/dev/null", "--model", found[0], "--model", found[1])
+    assert status == 2
+    assert "two files are called meter.toml: scan for one of them at a time" in err

@@ -1,0 +1,335 @@
+"""Commands that take a plant file and a name in it in place of PORT MODEL ADDRESS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from commands import TOY, Run
+from own_fan import Fan
+from toy import Status, Toy
+
+from multidrop.bus import Bus
+from multidrop.cli.monitor import command as monitor
+from multidrop.drive import Drive
+from multidrop.drives import InvtCHE
+from multidrop.drives.registry import find_model
+from multidrop.plant.model import Plant
+from multidrop.sim import simulated
+from multidrop.sim.drive import SimulatedDrive
+from multidrop.sim.simulator import Simulator
+from multidrop.sim.wire import Wire
+
+FAN = f"{Path(__file__).parents[1]}/support/own_fan.py:Fan"
+find_model(FAN)  # says that the file is run, once in a process: not in the midst of a test
+LINE = '[[line]]\nname = "{}"\nport = "{}"\n'
+DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
+READINGS = ("output_current", "output_frequency")
+
+
+@pytest.fixture
+def toy() -> SimulatedDrive:
+    return simulated(Toy(1))
+
+
+@pytest.fixture
+def port(toy: SimulatedDrive) -> Iterator[str]:
+    toy["output_frequency"] = 49.9
+    toy["output_current"] = 3.25
+    with Simulator([Wire([toy, simulated(Fan(3)), simulated(Toy(4))], unpaced=True)]) as simulator:
+        yield simulator.wires[0].path
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    """A plant of two lines, with ports that are not there."""
+    path = tmp_path / "plant.toml"
+    drives = (("pump-1", TOY, 1), ("fan-1", FAN, 3), ("che-1", "invt-che", 4))
+    hall = LINE.format("hall-1", "/dev/none-1") + "".join(DRIVE.format(*drive) for drive in drives)
+    path.write_text(hall + LINE.format("roof", "/dev/none-2") + DRIVE.format("pump-2", TOY, 2))
+    return path
+
+
+@pytest.fixture
+def at(port: str) -> str:
+    return f"--port=hall-1={port}"
+
+
+def one_line(directory: Path, port: str, name: str = "one.toml") -> Path:
+    path = directory / name
+    path.write_text(LINE.format("hall-1", port) + DRIVE.format("pump-1", TOY, 1))
+    return path
+
+
+# ---- reading and writing ----
+
+
+def test_read_takes_a_plant_file_and_a_drive_of_it(run: Run, port: str, tmp_path: Path) -> None:
+    plant = one_line(tmp_path, port)
+    shown = "output_current    3.25  A\noutput_frequency  49.9  Hz\n"
+    assert run("read", plant, "pump-1", *READINGS) == (0, shown, "")
+    assert run("read", plant, "pump-1")[1] == run("read", port, TOY, 1)[1]
+    record = json.loads(run("read", plant, "pump-1", "output_current", "--json")[1])
+    assert (record["drive"], record["values"]["output_current"]["value"]) == ("pump-1", 3.25)
+
+
+def test_a_line_s_port_is_replaced(run: Run, plant: Path, at: str) -> None:
+    assert run("read", plant, "pump-1", "output_current")[0] == 1
+    assert run("read", plant, "pump-1", "output_current", at) == (0, "output_current  3.25  A\n", "")
+    both = (at, "--port", "roof=/dev/none-3")
+    assert run("read", *both, plant, "pump-1", "output_current")[0] == 0
+    assert "/dev/none-3" in run("read", *both, plant, "pump-2", "output_current")[2]
+
+
+def test_what_a_plant_says_of_a_drive_holds_for_a_command(run: Run, plant: Path, at: str) -> None:
+    text = plant.read_text().replace("address = 1\n", 'address = 1\nframing = "ascii"\nbaudrate = 19200\n')
+    plant.write_text(text)
+    status, _, err = run("read", plant, "pump-1", "output_current", at)
+    assert (status, err.startswith("multidrop: pump-1 does not answer")) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["pmp-1"], "PLANT has no drive 'pmp-1'; did you mean pump-1 or pump-2?"),
+        (["zz"], "PLANT has no drive 'zz'; there are pump-1, fan-1, che-1, pump-2"),
+        (
+            [],
+            "name a drive of PLANT: pump-1, fan-1, che-1, pump-2; see `multidrop read --help`",
+        ),
+        (["pump-1", "output_curent"], "TOY T1 has no register 'output_curent'; did you mean output_current"),
+        (["pump-1", "control"], "control can only be written; see `multidrop models PLANT pump-1`"),
+        (["pump-1", "--baudrate", "9600"], "--baudrate is a matter of the plant file: write it into PLANT"),
+        (["pump-1", "--option", "rated_frequency=50"], "--option is a matter of the plant file"),
+        (["pump-1", "--ram", "sealed"], "--ram is a matter of the plant file"),
+        (["pump-1", "--port", "hal-1=x"], "PLANT has no line 'hal-1'; did you mean hall-1?"),
+        (["pump-1", "--port", "hall-1"], "argument --port: 'hall-1' is not LINE=PORT, such as"),
+        (["pump-1", "--port", "hall-1="], "argument --port: 'hall-1=' is not LINE=PORT, such as"),
+        (["pump-1", "--port", "roof=/dev/none-1"], "lines hall-1 and roof would both be at /dev/none-1"),
+        (
+            ["pump-1", "--port", "roof=a", "--port", "roof=b"],
+            "--port names line 'roof' twice; a line has one port",
+        ),
+    ],
+)
+def test_a_mistake_is_a_sentence(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+    status, out, err = run("read", plant, *words)
+    assert (status, out) == (2, "")
+    assert err.startswith(f"multidrop: {sentence.replace('PLANT', str(plant))}")
+    assert err.count("\n") == 1
+
+
+def test_what_belongs_to_a_plant_file_is_refused_without_one(run: Run) -> None:
+    sentence = "multidrop: --port is for the lines of a plant file; write the port in place of PORT\n"
+    for words in (("read", "/dev/none", TOY, 1), ("scan", "/dev/none"), ("doctor", "/dev/none")):
+        assert run(*words, "--port=a=b") == (2, "", sentence)
+
+
+def test_a_plant_file_with_mistakes_is_told_as_plan_tells_them(run: Run, plant: Path) -> None:
+    plant.write_text(
+        plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
+    )
+    told = run("plan", plant)
+    assert (told[0], told[2].count("\n")) == (2, 2)
+    assert run("read", plant, "fan-1") == told
+    assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
+
+
+def test_write_takes_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+    words = ("write", plant, "pump-1", at, "frequency")
+    assert run(*words, "25", "--yes") == (0, "pump-1: frequency = 25.00 Hz: done (cannot be read back)\n", "")
+    assert toy["frequency"] == 25
+    assert "the following arguments are required: VALUE" in run(*words)[2]
+    assert "unrecognized arguments: 26" in run(*words, 25, 26)[2]
+    status, out, err = run(*words, "26")
+    assert (status, out) == (1, "")
+    assert "There is no terminal to ask on: add --yes if it is meant" in err
+    assert toy["frequency"] == 25
+
+
+# ---- commands to motors ----
+
+
+def test_verbs_take_a_plant_file(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+    drive = (plant, "pump-1", at)
+    assert run("state", *drive)[1].startswith("stopped\n")
+    assert run("set-frequency", *drive, "33.5", "--yes")[0] == 0
+    assert toy["frequency"] == 33.5
+    assert run("set-frequency", *drive, "--yes")[2].startswith(
+        "multidrop: the following arguments are required: HZ"
+    )
+    assert "argument HZ: 'fast' is not a number" in run("set-frequency", *drive, "fast", "--yes")[2]
+    assert run("start", *drive, "--direction", "reverse", "--yes")[0] == 0
+    assert toy["control"] == Status.RUNNING | Status.REVERSE
+    assert run("stop", *drive)[0] == 0  # is never asked for
+    assert toy["control"] == 0
+
+
+def test_a_start_by_plant_asks_first(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+    status, _, err = run("start", plant, "pump-1", at)
+    assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
+    assert not toy.counters.writes
+
+
+def test_a_drive_that_cannot_identify_itself_is_commanded_only_when_the_plant_says_confirmed(
+    run: Run, plant: Path, at: str
+) -> None:
+    start = ("start", plant, "fan-1", at, "--yes")
+    status, _, err = run(*start)
+    assert (status, "declare confirmed = 1" in err or "confirmed" in err) == (1, True)
+    assert run("read", plant, "fan-1", "run", at)[1].split()[:2] == ["run", "OFF"]
+    plant.write_text(plant.read_text().replace("address = 3\n", "address = 3\nconfirmed = 1\n"))
+    run(*start)  # it runs on the simulator only as far as its speed is played
+    assert run("read", plant, "fan-1", "run", at)[1].split()[:2] == ["run", "ON"]
+
+
+@pytest.mark.parametrize(("there", "is_started"), [(Toy(4), False), (InvtCHE(4, maximum_frequency=50), True)])
+def test_a_drive_of_another_family_than_the_plant_says_is_sent_nothing(
+    run: Run, plant: Path, there: Drive, is_started: bool
+) -> None:
+    plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
+    played = simulated(there)
+    with Simulator([Wire([played], unpaced=True)]) as simulator:
+        at = f"--port=hall-1={simulator.wires[0].path}"
+        status, _, err = run("start", plant, "che-1", at, "--yes", "--frequency", 20)
+    assert (status == 0, bool(played.counters.writes)) == (is_started, is_started), err
+
+
+def test_an_interruption_says_how_to_stop_it_by_plant(
+    run: Run, plant: Path, at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*words: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bus, "watchdog", interrupt)
+    status, _, err = run("start", plant, "pump-1", at, "--yes")
+    assert status == 130
+    assert err.splitlines()[-1] == f"multidrop: to stop it, type: multidrop stop {plant} pump-1 {at}"
+    assert run(*err.splitlines()[-1].split()[6:])[0] == 0
+
+
+# ---- commands to lines ----
+
+
+def test_models_shows_a_drive_s_family(run: Run, plant: Path) -> None:
+    assert run("models", plant, "che-1") == run("models", "invt-che")
+    status, _, err = run("models", plant, "che-2")
+    assert (status, err.startswith(f"multidrop: {plant} has no drive 'che-2'; did you mean che-1")) == (
+        2,
+        True,
+    )
+
+
+def test_poll_takes_other_ports(run: Run, port: str, tmp_path: Path) -> None:
+    plant = one_line(tmp_path, "/dev/none-1")
+    assert run("poll", plant, "--seconds", "0.2")[0] == 1
+    status, out, _ = run("poll", plant, "--seconds", "0.2", "--json", f"--port=hall-1={port}")
+    assert (status, json.loads(out)["samples"] > 0) == (0, True)
+
+
+def test_monitor_takes_other_ports(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+
+    def watch(watched: Plant, out: object) -> dict[str, int]:
+        shown.extend(line.port for line in watched.lines)
+        return {"samples": 1}
+
+    monkeypatch.setattr(monitor, "is_possible", lambda: True)
+    monkeypatch.setattr(monitor, "watch", watch)
+    assert run("monitor", plant, "--port=roof=/dev/other")[0] == 0
+    assert shown == ["/dev/none-1", "/dev/other"]
+
+
+def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
+    few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--quick", "--json")
+    status, out, _ = run("scan", plant, "hall-1", at, *few)
+    assert status == 0
+    record = json.loads(out)
+    assert (record["port"], [drive["address"] for drive in record["drives"]]) == (port, [1])
+    sentence = f"multidrop: {plant} has several lines: name one of hall-1, roof\n"
+    assert run("scan", plant, *few) == (2, "", sentence)
+    assert "has no line 'hall-2'; did you mean hall-1?" in run("scan", plant, "hall-2", *few)[2]
+    assert "unrecognized arguments: hall-1" in run("scan", "/dev/none", "hall-1")[2]
+    assert "the following arguments are required: PORT" in run("scan")[2]
+
+
+def test_doctor_measures_with_a_drive_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
+    def findings(*words: object) -> dict[str, str]:
+        record = json.loads(run("doctor", plant, *words, at, "--json")[1])
+        assert record["port"] == port
+        return {finding["topic"]: finding["what"] for finding in record["findings"]}
+
+    assert "not measured" in findings("hall-1")["round trip"]
+    assert "not measured" not in findings("pump-1")["round trip"]
+    assert "has no drive 'pump-7'; did you mean" in run("doctor", plant, "pump-7")[2]
+    assert "--model is a matter of the plant file" in run("doctor", plant, "pump-1", "--model", TOY)[2]
+
+
+def test_sniff_listens_to_a_line_of_a_plant(run: Run, plant: Path, at: str) -> None:
+    status, out, err = run("sniff", plant, "hall-1", at, "--seconds", "0.2")
+    assert (status, out) == (0, "0 exchanges, 0 unknown bytes\n")
+    assert err.startswith("listening on /dev/pts/")
+    assert "has several lines: name one of hall-1, roof" in run("sniff", plant, "--seconds", "0.2")[2]
+    assert "is a plant file already" in run("sniff", plant, "roof", "--plant", plant, "--seconds", "0.2")[2]
+
+
+def test_a_simulated_plant_of_another_family_resolves_models_from_the_plant_file(
+    run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the working directory is, and with a module beside the model."""
+    room = tmp_path / "room"
+    room.mkdir()
+    (room / "steps.py").write_text("CURRENT = 0.01\n")
+    (room / "own.py").write_text(
+        "from steps import CURRENT\nfrom multidrop import Drive, reading\n\n\n"
+        "class Own(Drive):\n    output_current = reading(2, 'A', step=CURRENT)\n"
+    )
+    (room / "plant.toml").write_text(LINE.format("hall-1", port) + DRIVE.format("own-1", "own.py:Own", 1))
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = run("read", "room/plant.toml", "own-1")
+    assert (status, out) == (0, "output_current  3.25  A\n")
+
+
+def test_every_guard_is_the_one_of_port_model_address(run: Run, plant: Path, at: str, port: str) -> None:
+    """The two ways to name a drive differ in nothing but its name."""
+    for command, further in (
+        ("write", ("control", "RUNNING", "--yes")),
+        ("write", ("sealed", "1", "--yes")),
+        ("write", ("frequency", "51", "--yes")),
+        ("coast", ()),
+        ("reset-fault", ("--yes",)),
+        ("set-frequency", ("51", "--yes")),
+    ):
+        by_plant = run(command, plant, "pump-1", at, *further)
+        by_hand = run(command, port, TOY, 1, *further)
+        assert by_plant[0] == by_hand[0] != 0
+        assert by_plant[2].replace("pump-1", "toy@1") == by_hand[2]
+
+
+METER = """\
+[family]
+title = "Meter M1"
+manual = "Meter M1, register table"
+counts_from = 0
+
+[reading]
+current = { at = 2, unit = "A", step = 0.01 }
+"""
+
+
+def test_a_family_s_file_beside_the_plant_file_is_a_model(run: Run, port: str, tmp_path: Path) -> None:
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "meter.toml").write_text(METER)
+    plant = tmp_path / "room" / "plant.toml"
+    plant.write_text(LINE.format("hall-1", port) + DRIVE.format("meter-1", "meter.toml", 1))
+    assert run("read", plant, "meter-1", "current")[:2] == (0, "current  3.25  A\n")
+    assert run("models", plant, "meter-1")[1] == run("models", tmp_path / "room" / "meter.toml")[1]
+
+
+def test_a_family_s_file_in_place_of_a_plant_file_is_told(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "meter.toml").write_text(METER)
+    status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
+    assert (status, out) == (2, "")
+    assert "'line' is missing; add [[line]]" in err

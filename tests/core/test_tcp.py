@@ -1,0 +1,417 @@
+"""Modbus TCP: frames as others print and build them, and exchanges on a clock that the test sets."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from random import Random
+
+import pytest
+from damage import frames
+from frames import words
+from hypothesis import given
+from hypothesis import strategies as st
+from judges import Pymodbus
+from line_driver import MS, LineDriver
+from line_exchanges import CHARACTER, LEAST, MOST, READ, WRITE
+from line_exchanges import exchange as over_rtu
+
+from multidrop.core import (
+    Exchange,
+    Failure,
+    FrameFault,
+    Framing,
+    Message,
+    Peer,
+    Port,
+    Transactions,
+    build_reply,
+    build_request,
+    parse_reply,
+    parse_request,
+    reply_length,
+)
+
+TCP = Framing.TCP
+NUMBER = 400  # random frames
+
+# As printed: in the messaging guide for TCP/IP V1.0b, 4.4.2 (read one register of unit FF), and in a panel
+# meter's manual (write one register, and its reply).
+GUIDE = "15 01 00 00 00 06 FF 03 00 04 00 01"
+METER = "01 00 00 00 00 09 01 10 05 15 00 01 02 00 08", "01 00 00 00 00 06 01 10 05 15 00 01"
+
+
+def tcp(transaction: int, body: bytes) -> bytes:
+    """A frame, made by hand."""
+    return transaction.to_bytes(2) + b"\0\0" + len(body).to_bytes(2) + body
+
+
+# ---- frames ----
+
+
+def test_printed_frames_are_built_and_understood() -> None:
+    read = Message(0xFF, 3, 4, 1, transaction=0x1501)
+    assert build_request(TCP, read) == bytes.fromhex(GUIDE)
+    assert parse_request(TCP, bytes.fromhex(GUIDE)) == (12, read)
+    asked, said = map(bytes.fromhex, METER)
+    write = Message(1, 0x10, 0x0515, 1, words(8), transaction=0x0100)
+    assert build_request(TCP, write) == asked
+    assert parse_request(TCP, asked) == (len(asked), write)
+    assert parse_reply(TCP, said, write) == (12, replace(write, data=b""))
+
+
+@pytest.mark.parametrize("replies", [False, True])
+def test_bodies_mean_what_they_mean_over_rtu(replies: bool) -> None:
+    """Whole ones and damaged ones; only a wrong length shows sooner, because the header has it."""
+    seen = set()
+    for number, said in enumerate(frames(11, Framing.RTU, NUMBER, replies=replies)):
+        if said.damage in ("flipped on the line", "cut off", "followed") or len(said.frame) < 4:
+            continue
+        frame = tcp(number, said.frame[:-2])
+        if replies:
+            (network, found), (serial, meant) = (
+                parse_reply(TCP, frame, said.request),
+                parse_reply(Framing.RTU, said.frame, said.request),
+            )
+        else:
+            network, found = parse_request(TCP, frame)
+            serial, meant = parse_request(Framing.RTU, said.frame)
+        seen.add(serial > 0)
+        if meant and serial == len(said.frame):
+            assert found == replace(meant, transaction=number)
+            assert network == len(frame)
+        elif serial in (FrameFault.INCOMPLETE, FrameFault.BAD_CHECKSUM) or serial > 0:
+            assert network == FrameFault.BAD_LENGTH
+        else:
+            assert network == serial
+    assert seen == {True, False}
+
+
+@pytest.mark.parametrize("replies", [False, True])
+def test_frames_are_pymodbus_s_byte_by_byte(replies: bool) -> None:
+    pymodbus, chance, count = Pymodbus(TCP), Random(12), 0
+    for said in frames(13, Framing.RTU, NUMBER, replies=replies):
+        request = replace(said.request, transaction=chance.randrange(1 << 16))
+        if not replies and request.address:
+            assert build_request(TCP, request) == pymodbus.build_request(request)
+            count += 1
+        if replies and not said.damage:
+            reply = parse_reply(Framing.RTU, said.frame, said.request)[1]
+            assert reply
+            reply = replace(reply, transaction=request.transaction)
+            assert build_reply(TCP, reply) == pymodbus.build_reply(reply)
+            count += 1
+    assert count > NUMBER / 5
+
+
+@pytest.mark.parametrize("unit", [0, 1, 247, 248, 255])
+def test_every_unit_id_is_asked_and_answers(unit: int) -> None:
+    for request in (Message(unit, 3, 0, 2), Message(unit, 6, 1, data=words(2))):
+        assert parse_request(TCP, build_request(TCP, request)) == (12, request)
+        reply = replace(request, data=request.data or words(3, 4))
+        assert parse_reply(TCP, build_reply(TCP, reply), request)[1] == reply
+        assert reply_length(TCP, request) == len(build_reply(TCP, reply))
+
+
+def test_the_longest_frame_has_its_place() -> None:
+    request = Message(1, 3, 0, 125)
+    reply = build_reply(TCP, replace(request, data=bytes(250)))
+    assert len(reply) == 259
+    assert parse_reply(TCP, reply, request)[0] == 259
+
+
+@pytest.mark.parametrize(
+    ("damaged", "fault"),
+    [
+        ("00 00 00 01 00 05 01 03 02 00 07", FrameFault.NO_START),  # protocol 1
+        ("00 00 00 00 00 01 01", FrameFault.NO_START),
+        ("00 00 00 00 00 FF 01", FrameFault.NO_START),
+        ("00 00 00 00 00 06 01 03 02 00 07 00", FrameFault.BAD_LENGTH),
+        ("00 00 00 00 00 04 01 03 02 00", FrameFault.BAD_LENGTH),
+        ("00 00 00 00 00 05 02 03 02 00 07", FrameFault.BAD_ADDRESS),
+        ("00 00 00 00 00 05 01 04 02 00 07", FrameFault.BAD_FUNCTION),
+        ("00 00 00 00 00 05 01 03 02 00", FrameFault.INCOMPLETE),
+        ("00 00 00", FrameFault.INCOMPLETE),
+    ],
+)
+def test_a_damaged_reply_is_none(damaged: str, fault: FrameFault) -> None:
+    assert parse_reply(TCP, bytes.fromhex(damaged), READ) == (fault, None)
+
+
+# ---- exchanges ----
+
+
+@pytest.fixture
+def line() -> LineDriver:
+    return LineDriver(Transactions.MATCHED)
+
+
+@pytest.fixture
+def drive() -> Peer:
+    return Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+
+
+def exchange(request: Message, drive: Peer) -> Exchange:
+    return Exchange(TCP, request, drive, baudrate=9600, format="8N1", character=CHARACTER / 1e9, silence=0.0)
+
+
+def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
+    """Send a request; its transaction id."""
+    line.begin(exchange(request, drive))
+    sent = line.wait_until_write()
+    assert parse_request(TCP, sent)[1] == replace(request, transaction=int.from_bytes(sent[:2]))
+    return int.from_bytes(sent[:2])
+
+
+def value(transaction: int, raw: int) -> bytes:
+    return tcp(transaction, bytes([1, 3, 2]) + words(raw))
+
+
+def miss(line: LineDriver, drive: Peer) -> int:
+    transaction = ask(line, drive)
+    line.wait_until_done()
+    assert line.completion.result == Failure.NO_REPLY
+    return transaction
+
+
+def test_each_request_has_a_transaction_of_its_own(line: LineDriver, drive: Peer) -> None:
+    seen = set()
+    for raw in range(300):
+        transaction = ask(line, drive)
+        seen.add(transaction)
+        line.receive(value(transaction, raw))
+        assert line.want == "done"
+        assert line.completion.reply.data == words(raw)
+    assert len(seen) == 300
+
+
+def test_no_silence_is_kept_and_no_wire_time_waited_for(line: LineDriver, drive: Peer) -> None:
+    for _ in range(3):
+        began = line.now
+        line.receive(value(ask(line, drive), 7))
+        assert line.want == "done"
+        assert line.now == began
+
+
+@pytest.mark.parametrize("piece", [1, 2, 5, 7, 4096])
+def test_a_reply_may_come_in_pieces(line: LineDriver, drive: Peer, piece: int) -> None:
+    line.receive(value(ask(line, drive), 7), piece)
+    assert line.want == "done"
+    assert line.completion.reply.data == words(7)
+
+
+@pytest.mark.parametrize("cut", range(1, 11))
+def test_a_late_reply_that_is_cut_by_its_time_out_disturbs_nothing(
+    line: LineDriver, drive: Peer, cut: int
+) -> None:
+    late = value(ask(line, drive), 1)
+    line.receive(late[:cut])
+    line.wait_until_done()
+    assert line.completion.result == (Failure.CUT_SHORT if cut > 1 else Failure.NO_REPLY)
+    own = ask(line, drive)
+    line.receive(late[cut:] + value(own, 2))
+    assert line.completion.reply.data == words(2)
+
+
+def test_late_doubled_and_foreign_replies_are_never_the_present_one(line: LineDriver, drive: Peer) -> None:
+    late = miss(line, drive)
+    own = ask(line, drive)
+    line.receive(value(late, 1) + value(late, 1) + value((own + 1) & 0xFFFF, 2))
+    assert line.want == "read"
+    line.receive(value(own, 3) + value(own, 4))
+    assert line.want == "done"
+    assert line.completion.reply.data == words(3)
+    assert drive.late == 1
+    own = ask(line, drive)
+    assert line.completion.stale == 0
+    line.receive(value(own, 5))
+    assert line.completion.reply.data == words(5)
+
+
+def test_replies_in_any_order_are_their_requests_own(drive: Peer) -> None:
+    for seed in range(200):
+        chance, line = Random(seed), LineDriver(Transactions.MATCHED)
+        missed = [miss(line, drive) for _ in range(chance.randrange(5))]
+        own = ask(line, drive)
+        came = [value(each, 1000 + at) for at, each in enumerate(missed)] * 2 + [value(own, 7)] * 2
+        chance.shuffle(came)
+        line.receive(b"".join(came), chance.choice([1, 3, 17, 4096]))
+        assert line.want == "done"
+        assert line.completion.reply.data == words(7)
+
+
+def test_a_request_leaves_at_once_though_an_answer_may_be_late(line: LineDriver, drive: Peer) -> None:
+    for request in (READ, WRITE, WRITE):
+        ask(line, drive, request)
+        line.wait_until_done()
+        assert line.completion.sent_ns
+        assert line.completion.result == Failure.NO_REPLY
+    assert drive.late_until_ns == 0
+
+
+def test_how_late_a_reply_is_is_learnt_to_the_nanosecond(line: LineDriver, drive: Peer) -> None:
+    late = miss(line, drive)
+    sent = line.completion.sent_ns + 8 * CHARACTER  # as long as on a wire behind the gateway
+    for _ in range(30):
+        miss(line, drive)
+    line.now = sent + 2000 * MS
+    assert drive.failures == 31
+    line.receive(value(late, 1))
+    assert drive.failures == 0
+    assert drive.timeout == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("code", [0x0A, 0x0B])
+def test_a_gateway_s_exception_is_no_reply(line: LineDriver, drive: Peer, code: int) -> None:
+    for number in (1, 2):
+        line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
+        assert line.want == "done"
+        assert line.completion.result == Failure.NO_REPLY
+        assert line.completion.raw[-1] == code
+        assert drive.failures == number
+    assert not drive.has_answered
+    line.receive(tcp(ask(line, drive), bytes([1, 0x83, 2])))
+    assert line.completion.reply.exception == 2
+    assert drive.failures == 0
+
+
+def test_a_late_exception_of_a_gateway_is_no_sign_of_life(line: LineDriver, drive: Peer) -> None:
+    late = miss(line, drive)
+    line.receive(tcp(late, bytes([1, 0x83, 0x0B])))
+    assert drive.failures == 1
+    assert drive.late == 0
+
+
+@pytest.mark.parametrize(
+    ("body", "result"),
+    [
+        (bytes([2, 3, 2, 0, 7]), FrameFault.BAD_ADDRESS),
+        (bytes([1, 4, 2, 0, 7]), FrameFault.BAD_FUNCTION),
+        (bytes([1, 3, 4, 0, 7, 0, 7]), FrameFault.BAD_LENGTH),
+        (bytes([1, 3, 2, 0, 7, 0]), FrameFault.BAD_LENGTH),
+    ],
+)
+def test_a_wrong_reply_with_the_right_id_is_told_at_the_time_out(
+    line: LineDriver, drive: Peer, body: bytes, result: FrameFault
+) -> None:
+    transaction = ask(line, drive)
+    line.receive(tcp(transaction, body))
+    assert line.want == "read"
+    line.wait_until_done()
+    assert line.completion.result == result
+    assert line.completion.raw == tcp(transaction, body)
+
+
+def test_a_write_is_confirmed_by_its_copy(line: LineDriver, drive: Peer) -> None:
+    transaction = ask(line, drive, WRITE)
+    line.receive(tcp(transaction, build_request(TCP, WRITE)[6:]))
+    assert line.want == "done"
+    assert line.completion.reply == replace(WRITE, transaction=transaction)
+
+
+@pytest.mark.parametrize(
+    "header", ["00 01 00 01", "01 03 02 00 07 F9 86", "00 00 00 00 00 01", "3A 30 31 30"]
+)
+def test_what_is_no_header_ends_the_connection(line: LineDriver, drive: Peer, header: str) -> None:
+    ask(line, drive)
+    assert not line.is_out_of_step
+    line.receive(bytes.fromhex(header))
+    assert line.is_out_of_step
+    line.lose(errno.EPROTO)
+    assert (line.completion.result, line.completion.error) == (Failure.LINE_LOST, errno.EPROTO)
+    assert line.completion.raw
+
+
+def test_frames_of_another_framing_never_leave(line: LineDriver, drive: Peer) -> None:
+    line.begin(over_rtu(READ, drive))
+    assert (line.want, line.completion.result) == ("done", FrameFault.BAD_REQUEST)
+    serial = LineDriver()
+    serial.begin(exchange(READ, drive))
+    assert (serial.want, serial.completion.result) == ("done", FrameFault.BAD_REQUEST)
+
+
+def test_foreign_frames_without_end_fill_no_memory(line: LineDriver, drive: Peer) -> None:
+    transaction = ask(line, drive)
+    for foreign in (transaction ^ 1, transaction):
+        line.receive(tcp(foreign, bytes([9]) + bytes(250)) * 50)
+    line.receive(value(transaction, 7))
+    assert line.completion.reply.data == words(7)
+
+
+@given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(list(Transactions)[1:]))
+def test_anything_may_come_at_any_time(pieces: list[bytes], transactions: Transactions) -> None:
+    line, drive = LineDriver(transactions), Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
+    for piece in pieces:
+        line.begin(exchange(READ, drive))
+        line.receive(piece[::2])
+        if line.is_out_of_step:
+            return
+        if line.want != "done":
+            line.wait_until_write()
+        line.receive(piece)
+        if line.is_out_of_step:
+            return
+        line.wait_until_done()
+
+
+# ---- gateways with ids of their own ----
+
+
+@pytest.fixture
+def gateway() -> LineDriver:
+    return LineDriver(Transactions.IGNORED)
+
+
+def test_a_gateway_may_have_ids_of_its_own(gateway: LineDriver, drive: Peer) -> None:
+    for raw in range(10):
+        line = gateway
+        line.receive(value((ask(line, drive) + 1) & 0xFFFF, raw))
+        assert line.want == "done"
+        assert line.completion.reply.data == words(raw)
+
+
+def test_then_a_late_reply_holds_the_next_request_back(gateway: LineDriver, drive: Peer) -> None:
+    miss(gateway, drive)
+    gateway.begin(exchange(READ, drive))
+    assert gateway.completion.result == Failure.LATE_ANSWER_DUE
+    assert drive.late_until_ns > gateway.now
+    gateway.receive(value(1, 1))
+    assert drive.late == 1
+    assert drive.late_until_ns == 0
+    gateway.receive(value(ask(gateway, drive), 2))
+    assert gateway.completion.reply.data == words(2)
+
+
+def test_then_an_exception_of_the_gateway_leaves_its_answer_due(gateway: LineDriver, drive: Peer) -> None:
+    gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
+    assert gateway.completion.result == Failure.NO_REPLY
+    assert drive.late_until_ns > gateway.now
+
+
+# ---- a connection ----
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    ours, theirs = socket.socketpair()
+    ours.setblocking(False)
+    theirs.settimeout(60)
+    with ours, theirs:
+        yield ours, theirs
+
+
+def test_a_connection_out_of_step_is_lost(ends: tuple[socket.socket, socket.socket], drive: Peer) -> None:
+    ours, theirs = ends
+    port = Port(ours.fileno(), -1, transactions=Transactions.MATCHED)
+    try:
+        theirs.send(bytes.fromhex("01 03 02 00 07 F9 86"))
+        found = port.carry_out(exchange(READ, drive))
+        while found.result != Failure.LINE_LOST:  # it may be sent before the bytes are seen
+            found = port.carry_out(exchange(READ, drive))
+        assert found.error == errno.EPROTO, os.strerror(found.error)
+        assert port.lost
+    finally:
+        port.close()

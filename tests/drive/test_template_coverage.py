@@ -1,0 +1,210 @@
+"""The script that says which share of a reader's templates the register model holds."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from multidrop.drive.text import Text, text
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = [sys.executable, "-m", "bench.questions.coverage"]
+
+HELD = [  # as they are
+    {"name": "voltage", "reg_type": "input", "address": "0x10", "format": "s16", "scale": 0.1},
+    {"name": "relay", "reg_type": "coil", "address": 0},
+    {"name": "door", "reg_type": "discrete", "address": 3},
+    {"name": "setpoint", "reg_type": "holding", "address": 4, "write_address": 104},
+    {"name": "energy", "reg_type": "input", "address": 20, "format": "u64", "word_order": "little_endian"},
+    {"name": "power", "reg_type": "input", "address": 24, "format": "double"},
+    {"name": "limit", "reg_type": "holding", "address": 30, "format": "float", "byte_order": "little_endian"},
+    {"name": "cold", "reg_type": "input", "address": 40, "format": "s16", "error_value": "0x7FFF"},
+    {"name": "mode", "reg_type": "input", "address": "50:4:2"},
+    {"name": "flag", "reg_type": "holding", "address": "50:0", "readonly": True},
+    {"name": "small", "reg_type": "input", "address": 51, "format": "u8", "sporadic": True},
+    {"name": "frost", "reg_type": "input", "address": 52, "format": "s8", "offset": -40},
+    {"name": "count", "reg_type": "input", "address": 53, "format": "bcd32", "scale": -1},
+    {"name": "alone", "reg_type": "holding_multi", "address": 60},
+    {"name": "serial", "reg_type": "input", "address": 70, "format": "string8", "string_data_size": 5},
+    {"name": "only", "reg_type": "holding", "write_address": 91},
+    {"name": "version", "reg_type": "input", "address": 80, "format": "string", "string_data_size": 16},
+]
+READ_ONLY = [{"name": "bit", "reg_type": "holding", "address": "55:1:1"}]
+LACKING = [
+    {"name": "presses", "reg_type": "press_counter", "address": 0},
+    {"name": "odd", "reg_type": "input", "address": 90, "format": "s24"},
+    {"name": "far", "reg_type": "input", "address": 70000},
+]
+
+
+def wb(channels: list[dict[str, Any]], **device: Any) -> str:
+    return json.dumps({"device_type": "x", "device": {"name": "x", "channels": channels, **device}})
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(ROOT))
+    return importlib.import_module("bench.questions.coverage")
+
+
+def shares(bench: Any, folder: Path) -> dict[str, tuple[int, int]]:
+    templates, unread = bench.load(folder)
+    assert unread == []
+    coverage = bench.Coverage(templates)
+    entries = coverage.entries
+    return {
+        "templates": (len(templates), coverage.whole),
+        "entries": (len(entries), sum(entry.is_held and entry.is_written for entry in entries)),
+        "read": (len(entries), sum(entry.is_held for entry in entries)),
+    }
+
+
+def test_what_a_template_needs_is_held(bench: Any, tmp_path: Path) -> None:
+    (tmp_path / "all.json").write_text(wb(HELD))
+    assert shares(bench, tmp_path) == {
+        "templates": (1, 1),
+        "entries": (len(HELD), len(HELD)),
+        "read": (len(HELD), len(HELD)),
+    }
+    templates, _ = bench.load(tmp_path)
+    needed = {words: (count, held) for words, count, held in bench.Coverage(templates).needed()}
+    assert needed == {
+        "offset": (1, 1),
+        "invalid counts": (1, 1),
+        "bits of a word": (3, 3),
+        "numbers of 64 bit": (2, 2),
+        "order of bytes or words": (2, 2),
+        "BCD": (1, 1),
+        "signed 8 bit": (1, 1),
+        "negative step": (1, 1),
+        "text": (2, 2),
+        "text of one character a register": (1, 1),
+        "written by 16 alone": (1, 1),
+        "float that is written": (1, 1),
+        "written at another address": (1, 1),
+    }
+
+
+def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> None:
+    (tmp_path / "some.json").write_text(wb([*HELD, *READ_ONLY, *LACKING, *LACKING]))
+    (tmp_path / "more.json").write_text(wb(LACKING[:1]))
+    whole = len(HELD) + 1 + 2 * len(LACKING) + 1
+    assert shares(bench, tmp_path) == {
+        "templates": (2, 0),
+        "entries": (whole, len(HELD)),
+        "read": (whole, len(HELD) + 1),
+    }
+    templates, _ = bench.load(tmp_path)
+    lacking = {reason: (count, found) for reason, count, found in bench.Coverage(templates).lacking()}
+    assert lacking.pop("register type press_counter") == (3, 2)
+    assert lacking.pop("signed 24 bit") == (2, 1)
+    (part,) = [reason for reason in lacking if reason.startswith("is read, and not written: a part is")]
+    assert lacking.pop(part) == (1, 1)
+    assert list(lacking.values()) == [(2, 1)]
+    assert "is outside 0 to FFFFH" in next(iter(lacking))
+
+
+def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
+    parameters = {"p": {"title": "p", "address": 5, "condition": "q==1"}}
+    within = [{"device_type": "y", "device": {"channels": [HELD[0]], "parameters": [{"address": 6}]}}]
+    text = wb(HELD[:1], parameters=parameters, subdevices=within, setup=[{"address": 1, "value": 2}])
+    (tmp_path / "a.json").write_text(
+        "// http://x\n" + text.replace("}", "} /* so */ // too\n", 1).replace("]", ",\n]", 1)
+    )
+    templates, unread = bench.load(tmp_path)
+    coverage = bench.Coverage(templates)
+    assert unread == []
+    assert (len(coverage.entries), coverage.whole) == (4, 1)
+    assert dict(coverage.besides()) == {"condition": 1, "setup (devices)": 1, "subdevices (devices)": 1}
+
+
+def test_entries_that_are_held_apart_and_not_together_are_told(bench: Any, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
+    templates, _ = bench.load(tmp_path)
+    coverage = bench.Coverage(templates)
+    assert (coverage.whole, coverage.refused.total()) == (0, 1)
+    assert "is written at the same address" in next(iter(coverage.refused))
+
+
+def test_other_protocols_and_files_that_are_none_are_left_out(bench: Any, tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "modbus.json").write_text(wb(HELD[:1]))
+    (tmp_path / "other.json").write_text(wb(HELD[:1], protocol="uniel"))
+    (tmp_path / "broken.json").write_text("{")
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "table.csv").write_text("name,address\nvoltage,1\n")
+    (tmp_path / "notes.txt").write_text("no template")
+    templates, unread = bench.load(tmp_path)
+    assert [Path(template.path).name for template in templates] == ["modbus.json"]
+    names = [Path(sentence.partition(": ")[0]).name for sentence in unread]
+    assert names == ["broken.json", "list.json", "table.csv"]
+
+
+MODPOLL = """\
+# a meter
+device,meter,1,,
+poll,holding_register,0,40,BE_LE
+ref,voltage,0,uint16,r,V,0.1
+ref,energy,2,int64,r
+ref,power,8,float32,rw,W
+ref,alarm,19:15,bool,r
+ref,serial,20,string16,r
+ref,half,36,float16,r
+ref,reset,37,uint16,w
+poll,coil,0,16,BE_BE
+ref,coils,0,bool8,rw
+
+device,other,2
+poll,input_register,0x10,2,LE_LE
+ref,current,0x10,uint32,r
+"""
+
+
+def test_modpoll_s_tables_are_read(bench: Any, tmp_path: Path) -> None:
+    (tmp_path / "meter.csv").write_text(MODPOLL)
+    assert shares(bench, tmp_path) == {"templates": (2, 1), "entries": (9, 8), "read": (9, 8)}
+    templates, _ = bench.load(tmp_path)
+    coverage = bench.Coverage(templates)
+    assert list(coverage.lacking()) == [("format float16", 1, 1)]
+    needed = {words: count for words, count, _ in coverage.needed()}
+    assert (needed["order of bytes or words"], needed["bits of a word"], needed["text"]) == (3, 1, 1)
+
+
+def test_the_script_prints_its_tables(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(wb([*HELD, *LACKING]))
+    (tmp_path / "b.json").write_text("{")
+    done = subprocess.run([*SCRIPT, str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=True)
+    whole = len(HELD) + len(LACKING)
+    lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
+    assert "templates, whole 1 0 0.0%" in lines
+    assert f"entries, as they are {whole} {len(HELD)} {len(HELD) / whole:.1%}" in lines
+    assert "register type press_counter 1 1" in lines
+    assert lines[-1].startswith(f"not read: {tmp_path}/b.json: ")
+
+
+@pytest.mark.parametrize(("folder", "sentence"), [("none", "is no folder"), (".", "has no template")])
+def test_a_folder_without_templates_is_told(tmp_path: Path, folder: str, sentence: str) -> None:
+    command = [*SCRIPT, str(tmp_path / folder)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert sentence in done.stderr
+
+
+# ---- texts of one character a register ----
+
+
+def test_a_text_of_one_character_a_register_is_its_low_bytes() -> None:
+    version = text(250, 5, order="B")
+    assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
+    assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"
+    assert version.encode("4.1") == bytes.fromhex("0034 002E 0031 0000 0000")
+    with pytest.raises(ValueError, match="holds 5 characters, not 6"):
+        version.encode("4.18.1")
+    with pytest.raises(ValueError, match="order = 'A' of a text is none of 'AB', 'BA' and 'B'"):
+        Text(1, 1, order="A")

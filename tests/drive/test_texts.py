@@ -1,0 +1,174 @@
+"""Texts: characters in registers, read on demand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import Run
+from hypothesis import given
+from hypothesis import strategies as st
+from simulated_bus import SimulatedBus
+
+from multidrop.core import Message
+from multidrop.drive import Drive, Refused, Script, read, verb
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import COIL, INPUT, Kept, reading, setting
+from multidrop.drive.text import Text, text
+from multidrop.scan.identify import _read
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+
+METER = """\
+from multidrop import INPUT, Drive, reading, text
+
+class Meter(Drive):
+    model = "meter"
+    most_registers = {INPUT: 10}
+    level = reading(3, "m", table=INPUT, invalid=0x7FFF)
+    speed = reading(4, "rpm", table=INPUT)
+    serial = text(20, 4, table=INPUT, place="section 2")
+"""
+
+
+class Meter(Drive):
+    """A text of more registers than one request may read."""
+
+    most_registers = {INPUT: 5}
+    level = reading(0, table=INPUT)
+    serial = text(20, 12, table=INPUT)
+    maker = text(40, 3, order="BA")
+
+
+def test_a_text_is_read_as_the_document_prints_it() -> None:
+    assert Meter.serial.decode(b"EM3-0042\0\0\0\0 rubbish") == "EM3-0042"
+    assert Meter.maker.decode(b"BAB ") == "AB B"
+    assert Meter.maker.decode(bytes.fromhex("42 41 00 42 00 00")) == "ABB"
+    assert Meter.serial.decode(b"  v1.2   ") == "  v1.2"
+
+
+@given(st.binary(max_size=24))
+def test_bytes_of_a_line_are_never_control_characters(data: bytes) -> None:
+    found = Meter.serial.decode(data)
+    assert found.isprintable()
+    assert Meter.serial.decode(b"\x1b[2J\x07") == "?[2J?"
+
+
+@given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=6))
+@pytest.mark.parametrize("declared", [Meter.serial, Meter.maker], ids=str)
+def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sim = SimulatedDrive(Meter(1))
+        hall = SimulatedBus(monkeypatch, sim)
+        drive = hall.attach(Meter(1))
+        sim[declared.name] = value
+        assert hall.bus.read_text(drive, declared) == value == sim[declared.name]
+        counts = [request.count for request, _ in hall.frames]
+        assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
+
+
+class Known(Meter):
+    """Its maker says who it is."""
+
+    limit = setting(1, "m", span=(0, 10), kept=Kept.RAM)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Ask for its maker."""
+        if (found := (yield from read(self.maker))) != "ABB":
+            raise Refused(f"{self.name} is of {found}")
+
+
+@pytest.mark.parametrize("maker", ["ABB", "ABC"])
+def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = maker
+    hall = SimulatedBus(monkeypatch, sim)
+    drive = hall.attach(Known(1, name="em-1"))
+    if maker == "ABB":
+        assert hall.bus.write(drive, drive.limit, 3) == 3
+    else:
+        with pytest.raises(Refused, match="em-1 is of ABC"):
+            hall.bus.write(drive, drive.limit, 3)
+    assert (hall.written != []) == (maker == "ABB")
+
+
+def test_a_text_of_another_family_is_asked_for_by_a_scan() -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = "ABB"
+
+    def ask(drive: Drive, request: Message) -> Message:
+        reply = sim.answer(request, 0.0)
+        assert reply is not None
+        return reply
+
+    assert _read(Known(1), Known.maker, ask) == "ABB"
+
+
+def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other(Drive):
+        """With a text of its own."""
+
+        serial = text(20, 12)
+
+    hall = SimulatedBus(monkeypatch, SimulatedDrive(Meter(1)))
+    drive = hall.attach(Meter(1, name="em-1"))
+    assert [register.name for register in Meter.readings()] == ["level"]
+    assert list(Meter.texts) == ["serial", "maker"]
+    with pytest.raises(ValueError, match=r"^this serial is no text of em-1"):
+        hall.bus.read_text(drive, Other.serial)
+    with pytest.raises(TypeError, match="is no text of em-1"):
+        hall.bus.read_text(drive, Meter.level)
+    with pytest.raises(AttributeError, match=r"serial is a text, which bus.read_text"):
+        drive.serial = "x"
+    with pytest.raises(ValueError, match="maker holds 6 characters, not 7"):
+        hall.sims[0]["maker"] = "1234567"
+
+
+@pytest.mark.parametrize(
+    ("details", "sentence"),
+    [
+        ((1, 0), "a text of 0 registers"),
+        ((1, 126), "a text of 126 registers: one request reads 1 to 125"),
+        ((0xFFFF, 2), "its registers are not within 0 to FFFFH"),
+        ((-1, 2), "its registers are not within 0 to FFFFH"),
+    ],
+)
+def test_a_text_that_no_request_reads_is_refused(details: tuple[int, int], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        text(*details)
+
+
+def test_a_text_s_other_mistakes() -> None:
+    with pytest.raises(ValueError, match="order = 'CDAB' of a text is none of 'AB', 'BA' and 'B'"):
+        text(1, 2, order="CDAB")
+    with pytest.raises(ValueError, match="a text is in HOLDING or INPUT registers"):
+        text(1, 2, table=COIL)
+    with pytest.raises(DeclarationError, match="bus: this is a name that every drive has"):
+        type("Wrong", (Drive,), {"bus": text(1, 2)})
+    with pytest.raises(DeclarationError, match="second: this is the text serial already"):
+        type("Wrong", (Drive,), {"second": Meter.serial})
+
+
+def test_the_command_line_prints_texts_and_what_has_no_value(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "meter.py"
+    path.write_text(METER)
+    model = f"{path}:Meter"
+    namespace: dict[str, type[Drive]] = {}
+    exec(METER, namespace)
+    sim = SimulatedDrive(namespace["Meter"](1))
+    sim["level"], sim["speed"], sim["serial"] = None, 1440, "EM3-0042"
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        port = simulator.wires[0].path
+        status, out, _ = run("read", port, model, 1)
+        assert (status, out) == (0, "level        no valid value\nspeed  1440  rpm\nserial  EM3-0042\n")
+        assert run("read", port, model, 1, "serial")[1] == "serial  EM3-0042\n"
+        shown = json.loads(run("read", port, model, 1, "--json")[1])["values"]
+    assert shown == {
+        "level": {"value": None, "reason": "no valid value"},
+        "speed": {"value": 1440.0, "unit": "rpm"},
+        "serial": {"value": "EM3-0042"},
+    }
+    told = run("models", model)[1]
+    assert "0014H  serial  8 characters  section 2" in told
+    assert "no value: 7FFFH" in told

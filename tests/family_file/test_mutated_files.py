@@ -1,0 +1,83 @@
+"""Family files that somebody damaged: each is a family, or refused with sentences; nothing else happens."""
+
+from __future__ import annotations
+
+import random
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import seeds
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from readers import read
+
+SEEDS = list(seeds.family())
+WORDS = (
+    *(b"-1", b"0", b"65535", b"65536", b"1e400", b"-inf", b"nan", b"true", b'""', b"[]", b"{}", b"[[]]"),
+    *(b"9223372036854775807", b"1979-05-27", b"'NaN'", b'"40001"', b'"1E10"', b"0x7FFF", b"[1, 2]", b'["a"]'),
+    *(
+        b"{ a = 1 }",
+        b'{ a = "b" }',
+        b"[family]",
+        b"[reading]",
+        b"[option]",
+        b"[[line]]",
+        b"= 1",
+        b"\xff",
+        b"\0",
+    ),
+    *(b"at = ", b"values = ", b"bits = ", b"table = ", b"unit = ", b"span = ", b"steps = ", b"await = "),
+)
+
+
+def mutated(data: bytes, chosen: random.Random) -> bytes:
+    """Return a file in which up to four pieces were replaced, doubled, moved or taken out."""
+    for _ in range(chosen.randint(1, 4)):
+        begin = chosen.randrange(len(data) + 1)
+        end = min(len(data), begin + chosen.choice((0, 1, 3, 10, 40)))
+        other = chosen.randrange(len(data) + 1)
+        piece = chosen.choice(
+            (chosen.choice(WORDS), b"", data[other : other + 30], data[begin:end] * 2, chosen.randbytes(2))
+        )
+        if chosen.random() < 0.4:  # a whole value, which leaves the file TOML
+            begin = data.find(b"= ", begin) + 2
+            ends = [at for at in (data.find(mark, begin) for mark in (b",", b" }", b"\n")) if at > 0]
+            end = min(ends, default=begin)
+        data = data[:begin] + piece + data[end:]
+    return data
+
+
+@settings(max_examples=300)
+@given(st.sampled_from(SEEDS), st.integers(0, 2**32))
+def test_a_damaged_file_is_taken_or_refused(seed: bytes, number: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        read("family", mutated(seed, random.Random(number)), Path(folder))
+
+
+def wide(count: int) -> bytes:
+    head = b'[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\n[setting]\n'
+    return head + b"".join(b"a%d = { at = %d }\n" % (at, at) for at in range(count))
+
+
+@pytest.mark.parametrize(
+    ("make", "seconds"),
+    [
+        (lambda: wide(1990), 20.0),
+        (lambda: wide(20_000), 20.0),
+        (lambda: b"a = " + b"[" * 100_000, 20.0),
+        (lambda: b"a." * 100_000 + b"b = 1", 20.0),
+        (lambda: b'[family]\nregisters = ["fuzzed.csv"]\n\n\0\nname,at\n' + b"a,1\n" * 100_000, 20.0),
+        (lambda: b"#" * 5_000_000, 20.0),
+    ],
+    ids=["many", "too many", "deep", "dotted", "long csv", "large"],
+)
+def test_a_large_file_takes_no_more_than_its_time(
+    tmp_path: Path, make: Callable[[], bytes], seconds: float
+) -> None:
+    """The bound is generous: a loader that compares all with all would take minutes."""
+    begun = time.process_time()
+    read("family", make(), tmp_path)
+    assert time.process_time() - begun < seconds

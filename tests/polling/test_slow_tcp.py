@@ -1,0 +1,207 @@
+"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a world's clock.
+
+A reply with its request's id needs no proof; a gateway with ids of its own is dealt with as RTU is.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+from lines import proof
+from motors import MAKE, Heard
+from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
+
+from multidrop import bus
+from multidrop.bus import Bus
+from multidrop.control.outcome import Effect
+from multidrop.core import Framing, Message, Status, TransactionIds
+from multidrop.drive import Drive
+from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.errors import BusError
+from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
+from multidrop.transport import clock
+
+pytestmark = pytest.mark.story
+
+TCP = "tcp://world:502"
+FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
+FEW = [
+    pytest.param(name, marks=() if name in ("innovert-ibd", "invt-che") else pytest.mark.long)
+    for name in FAMILIES
+]
+PATHS = [
+    pytest.param(path, seconds, marks=() if seconds in (0.0, 0.6) else pytest.mark.long)
+    for path, delays in ((constant, (0.0, 0.3, 0.6, 1.5, 10.0)), (jittering, (0.6, 10.0)))
+    for seconds in delays
+]
+KINDS = ("delay", "twice", "merge")  # what a gateway may do without damage to the stream
+
+
+class TrueIds(PathWire):
+    """A path behind a gateway that replies with the requests' ids, late as it likes."""
+
+    most_late = 2.0
+
+
+class OwnIds(PathWire):
+    """A path behind a gateway that counts its replies, whatever their requests' ids were."""
+
+    ids = TransactionIds.IGNORE
+    most_late = 0.25  # s out of order: beyond the window of three time-outs no rule holds without ids
+    count = 0
+
+    def distort(self, reply: bytes) -> bytes:
+        self.count += 1
+        return (self.count & 0xFFFF).to_bytes(2) + reply[2:]
+
+
+class TrueIdsPath(Path):
+    wires = TrueIds
+
+
+class OwnIdsPath(Path):
+    wires = OwnIds
+
+
+STORIES = pytest.mark.parametrize("story_of", [TrueIdsPath, OwnIdsPath])
+
+
+def two_of(name: str) -> list[Drive]:
+    return [FAMILIES[name](address, name=f"drive-{address}") for address in (1, 2)]
+
+
+@STORIES
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
+@pytest.mark.parametrize("name", FEW)
+def test_a_slow_path_costs_time_and_no_truth(
+    name: str, seconds: float, path: Callable[[float], Delay], story_of: type[Path]
+) -> None:
+    story = story_of(two_of(name), port=TCP)
+    assert {drive.framing for drive in story.drives} == {Framing.TCP}
+    answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
+    assert answering == {drive.name for drive in story.drives}
+
+
+@STORIES
+@pytest.mark.parametrize("kind", KINDS)
+def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
+    story = story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP)
+    story.wire.faults = Faults(**{kind: 0.2, "late": story.wire.most_late})
+    story.tell_of(stalling(1.0))
+    assert story.wire.struck[kind] > 50
+
+
+@STORIES
+def test_a_stall_costs_no_truth(story_of: type[Path]) -> None:
+    story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).tell_of(stalling(15.0))
+
+
+def test_what_is_provably_late_holds_nothing_up() -> None:
+    """No request waits for a late reply, and none is sent to prove anything."""
+    story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
+    story.tell_of(stalling(3.0))
+    told = story.world.poller.summary()["lines"]["line"]
+    assert told["late_replies"] > 0
+    assert str(Status.LATE_ANSWER_DUE) not in told["misses"]
+    assert {drive for drive, peer in story.world.poller.bus("line").peers.items() if peer.proofs} == set()
+
+
+# ---- by hand ----
+
+
+@pytest.fixture(params=[TrueIds, OwnIds])
+def path_of(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[Bus, PathLine]]:
+    def made(sims: Sequence[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
+        wire: Any = request.param(sims, Faults(), port=TCP)
+        wire.delay = delay
+        wire.open()
+        line = PathLine(wire)
+        monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
+        monkeypatch.setattr(clock, "now_ns", lambda: line.now)
+        monkeypatch.setattr(clock, "sleep", line.sleep)
+        opened = Bus(TCP)
+        for sim in sims:
+            opened.attach(sim.drive)
+        return opened, line
+
+    return made
+
+
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
+@pytest.mark.parametrize("name", FEW)
+def test_what_a_bus_reads_over_a_slow_path_is_true(
+    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drives = two_of(name)
+    opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
+    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
+    read: Counter[str] = Counter()
+    with opened:
+        for _ in range(24):
+            for drive, register in asked:
+                try:
+                    value = opened.read(drive, register)
+                except BusError:
+                    line.sleep(0.05)
+                else:
+                    assert value == proof(drive, register)
+                    read[drive.name] += 1
+    assert set(read) == {drive.name for drive in drives}
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.6, 4.0])
+def test_what_became_of_a_write_over_a_slow_path_is_true(
+    seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = InnovertIBD(1, ram=["acceleration_time"])
+    sim = simulated(drive)
+    opened, line = path_of([sim], constant(seconds))
+    done = 0
+    with opened:
+        for turn in range(30):
+            asked = float(10 + turn % 3)
+            try:
+                outcome = opened.try_write(drive, drive.acceleration_time, asked)
+            except BusError:
+                line.sleep(0.05)
+                continue
+            if outcome.effect is Effect.UNCONFIRMED:
+                continue
+            assert outcome.effect is Effect.DONE
+            assert (outcome.held, sim["acceleration_time"]) == (asked, asked)
+            done += 1
+    assert done > 10
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.6])
+@pytest.mark.parametrize("model", FAMILIES)
+def test_a_stop_over_a_slow_path_is_seen_to_be_done(
+    model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    drive = DelixiModbus(1) if model == "delixi-modbus" else MAKE[model](1)
+    sim = simulated(drive)
+    assert isinstance(sim, MotorDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    opened, line = path_of([sim], constant(seconds))
+    heard = Heard(sim)
+    sent_after: list[float] = []
+    begun = line.now
+
+    def note(request: Message) -> bool:
+        if request.function > 4:
+            sent_after.append((line.now - begun) / S)
+        return False
+
+    heard.loses = note
+    with opened:
+        line.wire.advance(line.now / S)  # its clock begins
+        sim.motor.run(1)
+        opened.drives[0].stop()
+    assert not sim.motor.energised
+    assert sent_after[0] < 1
+    assert (line.now - begun) / S < 8 * seconds + 3

@@ -1,0 +1,201 @@
+"""Batches as tables of pandas and polars, and in the wide form."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import subprocess
+import sys
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from batches import EXAMPLE, SECOND, UTC_0, block, completion, example
+from completions import add_miss, add_rows
+from recordings import row
+
+from multidrop.core import Columns, Names, Status
+from multidrop.polling.batch import Batch, Row
+from multidrop.recording.rows import from_rows
+
+PUMP = "pump-1.output_frequency"
+SPEED = "pump-1.motor_speed"
+
+
+def test_pandas_gets_times_with_their_type() -> None:
+    pytest.importorskip("pandas", reason="needs pandas")
+    frame = example().to_pandas()
+    assert list(frame.columns) == list(Row._fields)
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert [time.value for time in frame["time"]] == [row.time for row in EXAMPLE]
+    assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
+    assert list(frame["value"].dropna()) == [49.99, 0.3]
+    assert list(frame["status"]) == [row.status for row in EXAMPLE]
+
+
+def test_polars_gets_times_with_their_type() -> None:
+    polars = pytest.importorskip("polars", reason="needs polars")
+    frame = example().to_polars()
+    assert frame.schema["time"] == polars.Datetime("ns", "UTC")
+    assert [
+        Row(*each) for each in frame.with_columns(time=frame["time"].to_physical()).iter_rows()
+    ] == EXAMPLE
+
+
+@pytest.mark.parametrize(
+    ("method", "missing", "sentence"),
+    [
+        (
+            "to_pandas",
+            "pandas",
+            r"to_pandas\(\) needs pandas, which is not installed: .*'multidrop\[pandas\]'",
+        ),
+        ("to_pandas", "pyarrow", r"to_pandas\(\) needs pyarrow, which is not .*'multidrop\[pandas\]'"),
+        (
+            "to_polars",
+            "polars",
+            r"to_polars\(\) needs polars, which is not installed: .*'multidrop\[polars\]'",
+        ),
+    ],
+)
+def test_a_library_that_is_missing_is_told_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, method: str, missing: str, sentence: str
+) -> None:
+    pytest.importorskip("pandas", reason="needs pandas")
+
+    def without(name: str) -> Any:
+        if name == missing:
+            raise ImportError(name)
+        return builtins.__import__(name)
+
+    monkeypatch.setattr(importlib, "import_module", without)
+    for table in (example(), example().wide()):
+        with pytest.raises(ImportError, match=sentence):
+            getattr(table, method)()
+
+
+def test_no_library_is_imported_before_it_is_needed() -> None:
+    code = (
+        "import sys, multidrop; multidrop.Poller, multidrop.read, multidrop.WideRows; "
+        "sys.exit(not {'pandas', 'polars', 'pyarrow', 'numpy', 'nanoarrow'}.isdisjoint(sys.modules))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# ---- the wide form ----
+
+
+def test_registers_of_one_request_share_a_row() -> None:
+    wide = example().wide()
+    assert wide.columns == [
+        *("time", "monotonic_ns", PUMP, SPEED),
+        *('fan, the "old" one.output_frequency', "насос.motor_speed", 'fan, the "old" one.motor_speed'),
+    ]
+    table = pa.table(wide)
+    table.validate(full=True)
+    assert table.schema.field("time").type == pa.timestamp("ns", "UTC")
+    assert table.schema.field(PUMP).type == pa.float64()
+    assert len(wide) == table.num_rows == 4
+    assert table.column(PUMP).to_pylist() == [49.99, None, None, None]
+    assert table.column(SPEED).to_pylist() == [0.3, None, None, None]
+    times = table.column("time").cast(pa.int64()).to_pylist()
+    assert times == [UTC_0 + second * SECOND for second in (1, 2, 3, 4)]
+    assert table.column("monotonic_ns").to_pylist() == [second * SECOND for second in (1, 2, 3, 4)]
+
+
+def test_pandas_and_polars_take_the_wide_form() -> None:
+    pytest.importorskip("pandas", reason="needs pandas")
+    polars = pytest.importorskip("polars", reason="needs polars")
+    frame = example().wide(PUMP, SPEED).to_pandas()
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert list(frame.columns) == ["time", "monotonic_ns", PUMP, SPEED]
+    assert frame[SPEED].tolist() == [0.3]
+    frame = example().wide(SPEED).to_polars()
+    assert frame.schema == {
+        "time": polars.Datetime("ns", "UTC"),
+        "monotonic_ns": polars.Int64,
+        SPEED: polars.Float64,
+    }
+    assert frame[SPEED].to_list() == [0.3]
+
+
+def test_chosen_columns_come_in_their_order_and_are_always_there() -> None:
+    """Also those of which a batch has no row: each batch has the same columns."""
+    never = "насос.output_frequency"
+    wide = example().wide(never, SPEED, PUMP)
+    assert wide.columns == ["time", "monotonic_ns", never, SPEED, PUMP]
+    table = pa.table(wide)
+    assert table.column(never).to_pylist() == [None]
+    assert table.column(PUMP).to_pylist() == [49.99]
+
+
+def test_what_is_no_column_is_told() -> None:
+    with pytest.raises(ValueError, match=r"no column 'pump-1\.motor_sped'; did you mean pump-1\.motor_"):
+        example().wide("pump-1.motor_sped")
+    with pytest.raises(ValueError, match=r"there is no column 'x'; a column is DRIVE\.REGISTER"):
+        example().wide("x")
+    with pytest.raises(ValueError, match=f"column '{PUMP}' is chosen twice"):
+        example().wide(PUMP, PUMP)
+
+
+def test_rows_are_in_the_order_of_their_times_whatever_order_they_came_in() -> None:
+    """Two lines' requests overlap; a row of each is found at its time."""
+    rows = [row(second, "pump", name, second) for name in ("b", "a") for second in (3.0, 1.0, 2.0)]
+    table = pa.table(from_rows(rows).wide())
+    assert table.column("pump.a").to_pylist() == table.column("pump.b").to_pylist() == [1.0, 2.0, 3.0]
+    assert table.column("monotonic_ns").to_pylist() == [SECOND, 2 * SECOND, 3 * SECOND]
+
+
+def test_times_are_joined_only_where_they_are_the_same() -> None:
+    early = row(1.0, "pump", "a", 1.0)
+    rows = [early, early._replace(register="b", time=early.time + 1, monotonic_ns=early.monotonic_ns + 1)]
+    rows.append(rows[1]._replace(drive="fan"))  # of another line, at the same nanosecond
+    table = pa.table(from_rows(rows).wide())
+    assert table.column("pump.a").to_pylist() == [1.0, None]
+    assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
+
+
+def test_a_clock_that_is_set_back_joins_nothing() -> None:
+    """UTC comes twice, and the monotonic clock tells the two apart."""
+    first = row(1.0, "pump", "a", 1.0)
+    table = pa.table(from_rows([first._replace(monotonic_ns=2 * SECOND, value=2.0), first]).wide())
+    assert table.column("pump.a").to_pylist() == [1.0, 2.0]
+
+
+def test_a_miss_is_null_and_hides_no_sample() -> None:
+    columns = Columns(4)
+    assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
+    assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)
+    assert add_miss(columns, block(0, 0), Status.NO_REPLY, 2 * SECOND, UTC_0)
+    table = pa.table(Batch(columns, Names(["p"]), Names(["r"])).wide())
+    assert table.column("p.r").to_pylist() == [1.0, None]
+
+
+def test_an_empty_batch_has_an_empty_wide_form() -> None:
+    wide = Batch(Columns(4), Names(["p"]), Names(["r"])).wide()
+    assert (len(wide), wide.columns) == (0, ["time", "monotonic_ns"])
+    assert pa.table(wide).num_rows == 0
+    assert pa.table(Batch(Columns(4), Names(["p"]), Names(["r"])).wide("p.r")).num_rows == 0
+
+
+def test_drives_whose_columns_would_be_one_are_told() -> None:
+    rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
+    with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a register that is called 'a\.b\.c'"):
+        rows.wide()
+
+
+def test_many_rows_against_pandas_own_pivot() -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    rows = [
+        row(second / 7, f"pump-{second % 3}", name, float(second), "ok")
+        for second in range(2000)
+        for name in ("a", "b")
+        if second % 5 or name == "a"
+    ]
+    frame = from_rows(rows).to_pandas()
+    frame["column"] = frame["drive"] + "." + frame["register"]
+    theirs = frame.pivot(index="time", columns="column", values="value")
+    ours = from_rows(rows).wide().to_pandas().set_index("time").drop(columns="monotonic_ns")
+    pandas.testing.assert_frame_equal(
+        ours[sorted(ours.columns)], theirs, check_names=False, check_index_type=False
+    )

@@ -1,0 +1,332 @@
+"""The frames that each profile's verbs send, against the words of the manuals, typed from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import checksums
+import pytest
+from profile_families import MAKE
+from scripts import Wire
+
+from multidrop.drive import (
+    Condition,
+    Direction,
+    Drive,
+    NotDone,
+    Refused,
+    State,
+    Unconfirmed,
+    Unsupported,
+)
+
+# Each without its checksum: address 1, function 06, where the manual has the word.
+ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
+FC = "01 06 C3 4F "  # 50000, counted from 1 (FC 202 design guide p. 175)
+DELTA = "01 06 20 00 "
+RESET = "01 06 20 02 "
+E3 = "01 06 00 00 "
+ATV = "01 06 21 35 "  # 8501
+
+ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # ACS355 manual p. 319
+ABB_FAULT = 0x0238
+FC_READY, FC_RUNS, FC_TRIP, FC_LOCK = 0x0607, 0x0E07, 0x0604 | 8, 0x0604 | 0x48
+DELTA_STOP, DELTA_RUNS, DELTA_REVERSE = 0x0500, 0x0503, 0x051B
+GD_STANDBY, GD_RUNS, GD_FAULT = 3, 1, 4
+E3_READY, E3_RUNS, E3_TRIP = 0x0040, 0x0041, 0x0302
+ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS, ATV_FAULT = 0x0250, 0x0231, 0x0233, 0x0237, 0x0218
+
+FREE = {"reference": 40.0, "output_frequency": 0.0, "fault": 0, "reference_in_force": 40.0}
+
+
+def wire(model: str, status: Any, **says: Any) -> Wire:
+    """Return the drive on a wire, on which its status is the same after each of its own words."""
+    drive: Any = MAKE[model](1)
+    drive.commanded = 40.0
+    kind = drive.status.values
+    said = [kind(one) for one in status] if isinstance(status, list) else kind(status)
+    return Wire(drive, {**FREE, "status": said, **says})
+
+
+def sent(found: Wire) -> list[str]:
+    """Return the frames without their checksums, which are checked here."""
+    assert all(checksums.rtu(frame[:-6]).hex(" ").upper() == frame for frame in found.sent)
+    return [frame[:-6] for frame in found.sent]
+
+
+STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
+    # ACS550-02/U2 manual p. 246: ...0110, 100 ms, ...0111, then operation enabled with all of the ramp's bits
+    "abb-acs355": (
+        [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS],
+        (ABB + "04 76", ABB + "04 77", ABB + "04 7F"),
+    ),
+    "siemens-v20": (
+        [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS],
+        tuple(f"01 06 00 63 04 {word}" for word in ("76", "77", "7F")),
+    ),
+    "schneider-atv320": (
+        [ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS],
+        (ATV + "00 06", ATV + "00 07", ATV + "00 0F"),
+    ),
+    "danfoss-fc51": ([FC_READY, FC_RUNS], (FC + "04 7C",)),
+    "delta-vfd-el": ([DELTA_STOP, DELTA_RUNS], (DELTA + "00 12",)),  # CP2000 p. 12.1-09-8: run and forward
+    "invt-goodrive": ([GD_STANDBY, GD_RUNS], (DELTA + "00 01",)),  # Goodrive100 p. 167
+    "optidrive-e3": ([E3_READY, E3_RUNS], (E3 + "00 01",)),  # ODE-3 user guide p. 33
+}
+
+
+@pytest.mark.parametrize("model", STARTS)
+def test_a_start(model: str) -> None:
+    status, words = STARTS[model]
+    found = wire(model, status)
+    found.drive.start()
+    assert sent(found) == list(words)
+
+
+def test_the_abb_waits_between_its_words() -> None:
+    found = wire("abb-acs355", [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS])
+    found.drive.start()
+    assert found.seconds >= 0.1
+
+
+@pytest.mark.parametrize("model", ["abb-acs355", "siemens-v20"])
+def test_a_running_profidrive_is_not_switched_off_by_a_start(model: str) -> None:
+    found = wire(model, ABB_RUNS)
+    found.drive.start()
+    assert [frame[-5:] for frame in sent(found)] == ["04 7F"]
+
+
+STOPS = {
+    "abb-acs355": (ABB_READY, ABB + "04 7E", ABB + "04 7C"),
+    "siemens-v20": (ABB_READY, "01 06 00 63 04 7E", "01 06 00 63 04 7C"),
+    "schneider-atv320": (ATV_ON, ATV + "00 07", ATV + "00 00"),
+    "danfoss-fc51": (FC_READY, FC + "04 3C", FC + "04 34"),
+    "delta-vfd-el": (DELTA_STOP, DELTA + "00 01", None),
+    "invt-goodrive": (GD_STANDBY, DELTA + "00 05", DELTA + "00 06"),
+    "optidrive-e3": (E3_READY, E3 + "00 00", E3 + "00 08"),
+}
+
+
+@pytest.mark.parametrize("model", STOPS)
+def test_a_stop_and_a_coast(model: str) -> None:
+    status, stop, coast = STOPS[model]
+    found = wire(model, status, output_frequency=[12.0, 0.0])
+    found.drive.stop()
+    assert sent(found) == [stop]
+    assert found.reads.count("output_frequency") == 2  # it is watched
+    found.sent.clear()
+    if coast is None:
+        with pytest.raises(Unsupported, match="no coast"):
+            found.drive.coast()
+        return
+    found.drive.coast()
+    assert sent(found) == [coast]
+
+
+RESETS: Mapping[str, tuple[list[int], dict[str, Any], tuple[str, ...]]] = {
+    "abb-acs355": ([ABB_FAULT, ABB_OFF], {}, (ABB + "04 7E", ABB + "04 FE", ABB + "04 7E")),
+    "siemens-v20": (
+        [ABB_FAULT, ABB_OFF],
+        {},
+        ("01 06 00 63 04 7E", "01 06 00 63 04 FE", "01 06 00 63 04 7E"),
+    ),
+    "schneider-atv320": ([ATV_FAULT, ATV_OFF], {}, (ATV + "00 07", ATV + "00 87", ATV + "00 07")),
+    "danfoss-fc51": ([FC_TRIP, FC_READY], {}, (FC + "04 3C", FC + "04 BC", FC + "04 3C")),
+    "delta-vfd-el": (
+        [DELTA_STOP],
+        {"fault": [1, 0]},
+        (DELTA + "00 01", RESET + "00 02", RESET + "00 00"),
+    ),
+    "invt-goodrive": ([GD_FAULT, GD_STANDBY], {}, (DELTA + "00 05", DELTA + "00 07")),
+    "optidrive-e3": ([E3_TRIP, E3_READY], {}, (E3 + "00 00", E3 + "00 04", E3 + "00 00")),
+}
+
+
+@pytest.mark.parametrize("model", RESETS)
+def test_a_reset(model: str) -> None:
+    status, says, words = RESETS[model]
+    found = wire(model, status, **says)
+    found.drive.reset_fault()
+    assert sent(found) == list(words)
+
+
+def test_a_locked_trip_is_not_reset() -> None:
+    found = wire("danfoss-fc51", FC_LOCK)
+    with pytest.raises(Refused, match="take its mains away"):
+        found.drive.reset_fault()
+    assert found.sent == []
+
+
+REVERSES = {
+    "danfoss-fc51": ([FC_READY, FC_RUNS], FC + "84 7C"),
+    "delta-vfd-el": ([DELTA_STOP, DELTA_REVERSE], DELTA + "00 22"),
+    "invt-goodrive": ([GD_STANDBY, 2], DELTA + "00 02"),
+    "schneider-atv320": ([ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS], ATV + "08 0F"),
+}
+
+
+@pytest.mark.parametrize("model", REVERSES)
+def test_reverse(model: str) -> None:
+    status, word = REVERSES[model]
+    found = wire(model, status)
+    found.drive.start(Direction.REVERSE)
+    assert sent(found)[-1] == word
+
+
+def test_a_jog_has_its_direction() -> None:
+    found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
+    found.drive.jog()
+    assert sent(found) == [DELTA + "00 13"]
+    found = wire("delta-vfd-el", [DELTA_REVERSE])
+    found.drive.jog()
+    assert sent(found) == [DELTA + "00 23"]
+    found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
+    found.drive.jog(Direction.REVERSE)
+    assert sent(found) == [DELTA + "00 04"]
+
+
+# A setpoint of 25 Hz: half of 50 Hz where it is a percentage.
+SETPOINTS = {
+    "abb-acs355": "01 06 00 01 27 10",  # 10000 of 20000 (ACS355 manual p. 308)
+    "siemens-v20": "01 06 00 64 20 00",  # 2000H of 4000H
+    "schneider-atv320": "01 06 21 36 00 FA",
+    "danfoss-fc51": "01 06 C3 59 20 00",  # 50010, 2000H of 4000H
+    "delta-vfd-el": "01 06 20 01 09 C4",
+    "invt-goodrive": "01 06 20 01 09 C4",
+    "optidrive-e3": "01 06 00 01 00 FA",  # "100 = 10.0 Hz" (ODE-3 user guide p. 33)
+}
+
+
+@pytest.mark.parametrize("model", SETPOINTS)
+def test_a_setpoint(model: str) -> None:
+    drive: Drive = MAKE[model](1)
+    found = Wire(drive)
+    drive.set_frequency(25)
+    assert sent(found) == [SETPOINTS[model]]
+
+
+HINDRANCES = [
+    ("abb-acs355", 0x0060 | 0x0200, "OFF2, which coasts, is active from elsewhere"),
+    ("abb-acs355", 0x0050 | 0x0200, "OFF3, the quick stop, is active from elsewhere"),
+    ("abb-acs355", 0x0070 | 0x0200, "switching on is inhibited"),
+    ("abb-acs355", 0x0030 | 0x0200, "not ready to be switched on"),
+    ("danfoss-fc51", 0x0600, "is not ready"),
+    ("danfoss-fc51", 0x0403, "hand mode"),
+    ("optidrive-e3", 0x0000, "is not ready to run"),
+    ("optidrive-e3", 0x0100, "is not ready to run"),  # "running", as the first guide prints it
+    ("invt-goodrive", 5, "has no mains"),
+]
+
+
+@pytest.mark.parametrize(("model", "status", "sentence"), HINDRANCES)
+def test_a_hindrance_is_named_and_nothing_starts(model: str, status: int, sentence: str) -> None:
+    found = wire(model, status)
+    with pytest.raises(Refused, match=sentence):
+        found.drive.start()
+    assert all(frame[-5:] == "04 76" for frame in sent(found))
+
+
+def test_an_optidrive_of_the_first_guide_is_never_taken_for_stopped() -> None:
+    found = wire("optidrive-e3", 0x0100, output_frequency=20.0)  # "high byte 1: running"
+    assert found.drive.state().condition is Condition.DECELERATING
+    found = wire("optidrive-e3", 0x0000)
+    assert found.drive.state() == State(Condition.STOPPED, note="is not ready to run")
+
+
+STATES = [
+    ("abb-acs355", ABB_RUNS, {}, Condition.RUNNING),
+    ("abb-acs355", 0x0235, {}, Condition.DECELERATING),  # OFF1 is active
+    ("abb-acs355", ABB_READY, {"output_frequency": 3.0}, Condition.DECELERATING),
+    ("abb-acs355", ABB_READY, {}, Condition.STOPPED),
+    ("abb-acs355", ABB_FAULT, {"fault": 7}, Condition.FAULT),
+    ("danfoss-fc51", FC_LOCK, {}, Condition.FAULT),
+    ("delta-vfd-el", 0x0501, {}, Condition.DECELERATING),
+    ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # standby: a run at 0 Hz
+    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),  # a warning, in the high byte
+    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0031}, Condition.FAULT),
+    ("invt-goodrive", 2, {}, Condition.RUNNING),
+    ("invt-goodrive", 5, {}, Condition.STOPPED),
+    ("optidrive-e3", E3_TRIP, {}, Condition.FAULT),
+    ("schneider-atv320", 0x0217, {}, Condition.DECELERATING),  # quick stop
+    ("schneider-atv320", ATV_ON, {}, Condition.STOPPED),
+]
+
+
+@pytest.mark.parametrize(("model", "status", "says", "condition"), STATES)
+def test_a_state(model: str, status: int, says: dict[str, Any], condition: Condition) -> None:
+    assert wire(model, status, **says).drive.state().condition is condition
+
+
+# ---- what only one profile has ----
+
+
+@pytest.mark.parametrize(
+    ("model", "running"),
+    [
+        ("abb-acs355", ABB_RUNS),
+        ("danfoss-fc51", FC_RUNS),
+        ("delta-vfd-el", 0x0502),
+        ("optidrive-e3", E3_RUNS),
+    ],
+)
+def test_a_drive_that_runs_at_0_hz_does_not_stand(model: str, running: int) -> None:
+    found = wire(model, running, output_frequency=0.0)
+    found.drive.option["stop_time"] = 5.0
+    with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):
+        found.drive.stop()
+
+
+@pytest.mark.parametrize(
+    ("shown", "sentence"),
+    [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, which is not what it was told")],
+)
+def test_a_delta_that_follows_another_setpoint_is_not_started(shown: float, sentence: str) -> None:
+    found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
+    with pytest.raises(Refused, match=sentence):
+        found.drive.start()
+    assert found.sent == []
+
+
+def test_an_invt_that_goes_on_jogging_is_stopped_as_one() -> None:
+    found = wire("invt-goodrive", GD_RUNS)
+    found.drive.option["stop_time"] = 5.0
+    with pytest.raises(Unconfirmed, match="5 s"):
+        found.drive.stop()
+    assert sent(found) == [DELTA + "00 05", DELTA + "00 08"]
+
+
+def test_an_invt_that_was_jogged_is_stopped_before_a_start() -> None:
+    found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
+    found.drive.jog()
+    found.sent.clear()
+    with pytest.raises(Refused, match=r"may still jog.*stop\(\)"):
+        found.drive.start()
+    assert found.sent == []
+    found.say({"status": found.drive.status.values(GD_STANDBY)})
+    with pytest.raises(Unconfirmed):  # it stands and so may be started, and is not seen to run
+        found.drive.start()
+    assert sent(found) == [DELTA + "00 01"]
+
+
+@pytest.mark.parametrize(
+    ("status", "words", "sentence"),
+    [
+        ([ATV_OFF], ("00 06",), "not ready to be switched on"),
+        ([ATV_OFF, ATV_READY], ("00 06", "00 07"), "not switched on"),
+    ],
+)
+def test_a_cia402_drive_goes_up_step_by_step(
+    status: list[int], words: tuple[str, ...], sentence: str
+) -> None:
+    found = wire("schneider-atv320", status)
+    with pytest.raises(NotDone, match=sentence):
+        found.drive.start()
+    assert sent(found) == [ATV + word for word in words]
+
+
+def test_a_profidrive_that_does_not_get_ready_to_operate_is_switched_off() -> None:
+    found = wire("abb-acs355", [ABB_OFF, ABB_READY])
+    with pytest.raises(NotDone, match="not ready to operate"):
+        found.drive.start()
+    assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]

@@ -1,0 +1,114 @@
+"""`multidrop.read`: a recording of any format as a table, whole or damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from batches import EXAMPLE, METADATA, counting, example
+from recordings import ABOUT, SCHEMA, record, recorded, row, rows_of
+from toy import Toy
+
+import multidrop
+from multidrop.polling.batch import Row
+from multidrop.recording import FORMATS, open_writer
+
+SUFFIXES = list(FORMATS)
+PUMP = "pump.output_frequency"
+
+
+@pytest.fixture(params=SUFFIXES)
+def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / f"run{request.param}"
+    with open_writer(path, METADATA) as writer:
+        writer.write(example())
+        writer.write(counting(3000))
+    return path
+
+
+def test_every_format_is_read_as_the_same_table(path: Path) -> None:
+    found = multidrop.read(path)
+    assert found.metadata == METADATA
+    table = pa.table(found)
+    assert table.schema.equals(SCHEMA)
+    assert rows_of(table) == [*EXAMPLE, *counting(3000)]
+    assert [each for rows in multidrop.read(str(path)) for each in rows] == rows_of(table)
+
+
+def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
+    pytest.importorskip("pandas", reason="needs pandas")
+    polars = pytest.importorskip("polars", reason="needs polars")
+    found = multidrop.read(path)
+    frame = found.to_pandas()
+    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
+    assert [time.value for time in frame["time"]] == [each.time for each in recorded(path)]
+    other = found.to_polars()
+    assert other.schema["time"] == polars.Datetime("ns", "UTC")
+    assert [Row(*each) for each in other.with_columns(other["time"].to_physical()).iter_rows()] == recorded(
+        path
+    )
+
+
+def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
+    wide = multidrop.read(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
+    table = pa.table(wide).to_pydict()
+    expected = {(each.time, each.register): each.value for each in recorded(path) if each.drive == "pump-1"}
+    times = pa.table(wide).column("time").cast(pa.int64()).to_pylist()
+    assert len(times) == len({time for time, _ in expected})
+    for number, time in enumerate(times):
+        for register in ("output_frequency", "motor_speed"):
+            assert table[f"pump-1.{register}"][number] == expected.get((time, register))
+
+
+def test_columns_that_are_in_the_metadata_may_have_no_row(tmp_path: Path) -> None:
+    path = record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)], ABOUT)
+    wide = multidrop.read(path).wide("fan.output_current", PUMP)
+    assert pa.table(wide).column("fan.output_current").to_pylist() == [None]
+    with pytest.raises(ValueError, match=r"no column 'fan\.output_curent'; did you mean fan\.output_cu"):
+        multidrop.read(path).wide("fan.output_curent")
+
+
+@pytest.mark.parametrize(
+    "about", [{}, {"drives": 3}, {"drives": {"a": 3}}, {"drives": {"a": {"registers": 1}}}]
+)
+def test_metadata_of_any_kind_harms_nothing(tmp_path: Path, about: dict[str, object]) -> None:
+    path = record(tmp_path / "run.csv", [row(1, "pump", "output_frequency", 50.0)], about)
+    assert pa.table(multidrop.read(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
+
+
+@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+def test_a_truncated_end_is_left_out_and_counted(tmp_path: Path, suffix: str) -> None:
+    path = record(tmp_path / f"run{suffix}", [row(at, "pump", "output_frequency", 50.0) for at in range(40)])
+    whole = recorded(path)
+    path.write_bytes(path.read_bytes()[:-5])
+    found = multidrop.read(path)
+    assert found.truncated > 0
+    kept = rows_of(pa.table(found))
+    assert kept == whole[: len(kept)]
+    assert 0 < len(kept) < 40
+    assert len(found.wide()) == len(kept)
+
+
+def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
+    path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
+    path.write_text(path.read_text().replace("pump,", "pump;", 1))
+    for take in ("to_pandas", "to_polars", "wide"):
+        with pytest.raises(ValueError, match=r"run\.csv, line 2: not a row of a recording"):
+            getattr(multidrop.read(path), take)()
+
+
+def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
+    (tmp_path / "run.txt").write_text("")
+    with pytest.raises(ValueError, match=r"a recording's name ends in \.arrows, \.csv, \.parquet"):
+        multidrop.read(tmp_path / "run.txt")
+    with pytest.raises(FileNotFoundError):
+        multidrop.read(tmp_path / "none.arrows")
+    with pytest.raises(TypeError, match=r"read takes a recording such as 'run\.arrows', or in a script"):
+        multidrop.read(3)  # type: ignore[call-overload]
+
+
+def test_a_script_s_read_is_still_the_step() -> None:
+    register = Toy.registers["output_current"]
+    step = next(multidrop.read(register))
+    assert step == next(multidrop.drive.read(register))

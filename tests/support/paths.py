@@ -1,0 +1,125 @@
+"""A path that holds everything up and keeps the order: a modem, a gateway, a stalled network."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from random import Random
+from typing import Any, cast
+
+from stories import Story
+from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire, transactions_of
+
+from multidrop.core import Completion, Exchange
+from multidrop.drive.network import speaks_tcp
+
+Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
+
+S = 1_000_000_000
+SECONDS = 150.0  # of a story: what is outstanding is remembered for 120 s
+TAIL = 20.0  # s at its end, and TURNS times the delay, in which every drive must have answered
+TURNS = 20
+
+
+class PathWire(WorldWire):
+    """A hostile wire at the far end of a path that delays what the drives say."""
+
+    delay: Delay
+
+    def __init__(self, *arguments: Any, **details: Any) -> None:
+        super().__init__(*arguments, **details)
+        self._path: deque[tuple[float, bytes]] = deque()
+
+    def advance(self, now: float) -> bytes:
+        said = super().advance(now)
+        if said:
+            before = self._path[-1][0] if self._path else 0.0
+            self._path.append((max(before, now + self.delay(now)), said))
+        heard = b""
+        while self._path and self._path[0][0] <= now:
+            heard += self._path.popleft()[1]
+        return heard
+
+    @property
+    def wake(self) -> float | None:
+        arrival = self._path[0][0] if self._path else None
+        return min((time for time in (super().wake, arrival) if time is not None), default=None)
+
+
+def constant(seconds: float) -> Delay:
+    return lambda now: seconds
+
+
+def jittering(seconds: float) -> Delay:
+    random = Random(1)
+    return lambda now: seconds * random.uniform(0.8, 1.2)
+
+
+def stalling(longest: float) -> Delay:
+    """Twelve stalls of up to so many seconds, in which everything waits for the end."""
+    random = Random(2)
+    begins = [random.uniform(2.0, SECONDS) for _ in range(12)]
+    stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
+
+    def delay(now: float) -> float:
+        now -= 1000.0  # when a world begins
+        return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
+
+    return delay
+
+
+class Path(Story):
+    """A line behind such a path."""
+
+    wires = PathWire
+
+    def tell_of(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
+        """Judge every row; the drives of which values came in the end."""
+        self.wire.delay = delay
+        with self.world:
+            self.run(SECONDS)
+            tail = self.run(tail_s)
+        self.judge_values()
+        return {row.drive for row in tail if row.value is not None}
+
+
+class PathLine:
+    """A bus's view of a line behind such a path; time passes only while it waits."""
+
+    def __init__(self, wire: PathWire) -> None:
+        self.port = self.identity = wire.where if speaks_tcp(wire.where) else "world"
+        self.now = BEGIN_NS
+        self.wire = wire
+        self.has_echo = self.is_lost = False
+        self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
+        self.queue = WorldPort(cast(World, self), transactions_of(self))
+
+    def require(self, settings: tuple[int, str]) -> None:
+        pass
+
+    def overruns(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def send(self, request: bytes, baudrate: int) -> None:
+        self.wire.receive(request, self.now / S, baudrate)
+
+    def sleep(self, seconds: float) -> None:
+        self._pass_until(self.now + round(seconds * S))
+
+    def carry_out(self, exchange: Exchange, *, expires_ns: int = 0) -> Completion:
+        self.queue.begin_urgent(exchange)
+        self._pass_until(self.now + 1000 * S)
+        assert self.queue.granted
+        return self.queue.granted
+
+    def _pass_until(self, end_ns: int) -> None:
+        is_awaited = self.queue.granted is None
+        while self.now < end_ns and not (is_awaited and self.queue.granted):
+            wake = self.queue.advance(self.wire.advance(self.now / S))
+            at = self.wire.wake
+            arrival = NEVER if at is None else -int(-at * S // 1)
+            if not (is_awaited and self.queue.granted):
+                self.now = min(max(min(wake, arrival), self.now + 1), end_ns)

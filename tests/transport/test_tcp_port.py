@@ -1,0 +1,254 @@
+"""Ports of Modbus TCP: their names, which drives they take, and far ends that speak something else."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from lines import until
+
+from multidrop.bus import Bus
+from multidrop.core import Framing, Message, build_reply, build_request, parse_request
+from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, reading
+from multidrop.drives import YD1000, DelixiNative, InnovertIBD
+from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Refused
+from multidrop.plant.loader import PlantError, load_plant
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.transport.mixed_up import mixed_up
+from multidrop.transport.opening import unopened
+from multidrop.transport.port_identity import of_name
+
+
+class Meter(Drive):
+    """A device with a connection of its own, whose unit id may be any."""
+
+    title = "Meter"
+    framings = (Framing.TCP,)
+    addresses = range(256)
+    voltage = reading(1, "V", table=HOLDING)
+
+
+@contextmanager
+def far_end(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
+    """A server that says these bytes to whatever comes first; its place, and what came."""
+    came: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            while True:
+                try:
+                    connection, _ = listener.accept()
+                except OSError:
+                    return
+                with connection:
+                    came.append(connection.recv(1024))
+                    if answer is not None:
+                        connection.sendall(answer)
+                    while connection.recv(1024):
+                        pass
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"127.0.0.1:{listener.getsockname()[1]}", came
+        listener.shutdown(socket.SHUT_RDWR)
+    thread.join()
+
+
+# ---- names ----
+
+
+@pytest.mark.parametrize(
+    ("name", "opened", "identity"),
+    [
+        ("tcp://10.0.0.7", "socket://10.0.0.7:502", "10.0.0.7:502"),
+        ("tcp://10.0.0.7:1502", "socket://10.0.0.7:1502", "10.0.0.7:1502"),
+        ("tcp://[fe80::1]", "socket://[fe80::1]:502", "[fe80::1]:502"),
+    ],
+)
+def test_a_port_without_a_number_is_502(name: str, opened: str, identity: str) -> None:
+    assert unopened(name).port == opened
+    assert of_name(name) == identity
+
+
+@pytest.mark.parametrize("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
+def test_a_name_without_a_place_is_a_sentence(name: str) -> None:
+    with pytest.raises(NoSuchPort, match=r"it needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
+        Bus(name)
+
+
+def test_nothing_that_listens_is_told() -> None:
+    with pytest.raises(LineError, match="nothing listens there"):
+        Bus("tcp://127.0.0.1:1")
+
+
+# ---- drives ----
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    with Simulator([Wire([simulated(InnovertIBD(1))], port="tcp://127.0.0.1:0", unpaced=True)]) as line:
+        yield line.wires[0].path
+
+
+def test_every_drive_takes_the_port_s_framing_and_gives_it_back(port: str) -> None:
+    drive = InnovertIBD(1)
+    with Bus(port) as bus:
+        bus.attach(drive)
+        assert drive.framing is Framing.TCP
+        assert bus.read(drive, drive.output_current) == 0
+    with Simulator([Wire([simulated(InnovertIBD(1))])]) as line, Bus(line.wires[0].path) as bus:
+        bus.attach(drive)
+        assert drive.framing is Framing.RTU
+        assert bus.read(drive, drive.output_current) == 0
+
+
+@pytest.mark.parametrize(
+    ("drive", "sentence"),
+    [
+        (InnovertIBD(1, framing="rtu"), "framing rtu is a serial line's, and tcp://.* speaks Modbus TCP"),
+        (InnovertIBD(1, framing="ascii"), "framing ascii is a serial line's"),
+        (DelixiNative(1), "does not speak Modbus, and tcp://.* carries nothing else"),
+    ],
+)
+def test_another_framing_on_tcp_is_a_sentence(port: str, drive: Drive, sentence: str) -> None:
+    with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
+        bus.attach(drive)
+
+
+@pytest.mark.parametrize(
+    ("drive", "sentence"),
+    [
+        (InnovertIBD(1, framing="tcp"), "framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502"),
+        (Meter(0), "framing tcp is that of tcp:// ports"),
+    ],
+)
+def test_tcp_on_a_serial_port_is_a_sentence(drive: Drive, sentence: str) -> None:
+    wire = Wire([simulated(InnovertIBD(9))])
+    with Simulator([wire]), Bus(wire.path) as bus, pytest.raises(ValueError, match=sentence):
+        bus.attach(drive)
+
+
+def test_a_unit_id_beyond_a_serial_line_s_addresses_stays_on_tcp() -> None:
+    class Both(Drive):
+        title = "Both"
+        addresses = range(256)
+        voltage = reading(1, "V", table=HOLDING)
+
+    with Simulator([Wire([simulated(InnovertIBD(9))])]) as line, Bus(line.wires[0].path) as bus:
+        for address in (0, 248, 255):
+            with pytest.raises(ValueError, match=f"address {address} is a unit id of Modbus TCP"):
+                bus.attach(Both, address)
+
+
+@pytest.mark.parametrize("unit", [0, 1, 255])
+def test_every_unit_id_is_read(unit: int) -> None:
+    sim = simulated(Meter(unit))
+    sim["voltage"] = 230
+    wire = Wire([sim], port="tcp://127.0.0.1:0", unpaced=True)
+    with Simulator([wire]), Bus(wire.path) as bus:
+        assert bus.read(bus.attach(Meter, unit), Meter.voltage) == 230
+
+
+def test_nothing_is_broadcast() -> None:
+    drives = [YD1000(1), YD1000(2)]
+    sims = [simulated(drive) for drive in drives]
+    wire = Wire(sims, port="tcp://127.0.0.1:0", unpaced=True)
+    with Simulator([wire]), Bus(wire.path) as bus:
+        for drive in (YD1000(1), YD1000(2)):
+            bus.attach(drive)
+            bus.check_identity(drive)
+        register = bus.drives[0].register("control")
+        with pytest.raises(Refused, match="cannot be broadcast over Modbus TCP"):
+            bus.broadcast(register, 0xC000)
+        bus.stop_all(seconds=5)
+    assert [sim.counters.broadcasts for sim in sims] == [0, 0]
+
+
+def test_a_plant_file_tells_each_mistake(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        '[[line]]\nname = "a"\nport = "tcp://10.0.0.7"\ntransaction = "skip"\n'
+        '[[line.drive]]\nname = "p"\nmodel = "innovert-ibd"\naddress = 1\nframing = "rtu"\n'
+        '[[line]]\nname = "b"\nport = "/dev/ttyUSB0"\ntransaction = "ignore"\n'
+        '[[line.drive]]\nname = "q"\nmodel = "innovert-ibd"\naddress = 1\nframing = "tcp"\n'
+    )
+    with pytest.raises(PlantError) as mistakes:
+        load_plant(path)
+    said = "\n".join(mistakes.value.mistakes)
+    assert """transaction 'skip' is none of "match" and "ignore\"""" in said
+    assert "framing rtu is a serial line's, and tcp://10.0.0.7 speaks Modbus TCP" in said
+    assert "transaction is a fact of tcp:// ports, and /dev/ttyUSB0 is none" in said
+    assert "framing tcp is that of tcp:// ports" in said
+
+
+# ---- far ends of another kind ----
+
+READ = Message(1, 3, 3, 1)
+
+
+def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
+    answer = build_reply(Framing.RTU, Message(1, 3, data=b"\0\7"))
+    with far_end(answer) as (place, came), Bus(f"tcp://{place}") as bus:
+        drive = bus.attach(InnovertIBD, 1)
+        with pytest.raises(PortLost, match=f"has the shape of RTU over TCP: name the port socket://{place}"):
+            bus.read(drive, drive.output_current)
+        assert parse_request(Framing.TCP, came[0])[0] == len(came[0])
+        bus.line.regain()
+        with pytest.raises(PortLost):
+            bus.read(drive, drive.output_current)
+        until(lambda: len(came) == 2)  # on a connection of its own
+
+
+def test_modbus_tcp_behind_socket_is_told() -> None:
+    answer = build_reply(Framing.TCP, Message(1, 3, data=b"\0\7", transaction=3))
+    with far_end(answer) as (place, _), Bus(f"socket://{place}") as bus:
+        drive = bus.attach(InnovertIBD, 1)
+        with pytest.raises((BadReply, NoReply)) as failure:
+            bus._exchanges.values(drive, [drive.output_current], 1)
+        assert f"name the port tcp://{place}" in str(failure.value)
+
+
+def test_silence_names_the_other_way() -> None:
+    with far_end(None) as (place, _):
+        for kind, other in (("tcp", "socket"), ("socket", "tcp")):
+            with Bus(f"{kind}://{place}") as bus:
+                drive = bus.attach(InnovertIBD, 1)
+                with pytest.raises(NoReply, match=f"{other}://{place}"):
+                    bus.read(drive, drive.output_current)
+
+
+def test_what_a_gateway_cannot_reach_is_no_reply() -> None:
+    """Its connection answers each request with 0BH, under the request's own id."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            connection, _ = listener.accept()
+            with connection:
+                while request := connection.recv(260):
+                    connection.sendall(
+                        request[:4] + b"\0\3" + request[6:7] + bytes([request[7] | 0x80, 0x0B])
+                    )
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        with Bus(f"tcp://127.0.0.1:{listener.getsockname()[1]}") as bus:
+            drive = bus.attach(InnovertIBD, 1)
+            with pytest.raises(NoReply, match=r"behind the gateway, which says so \(exception 0BH\)"):
+                bus.read(drive, drive.output_current)
+            assert bus.peer(drive).failures == 3
+    thread.join()
+
+
+@pytest.mark.parametrize("kind", ["socket", "tcp"])
+def test_only_the_other_way_s_shape_is_taken_for_it(kind: str) -> None:
+    port = f"{kind}://10.0.0.7:502"
+    rtu, tcp = build_request(Framing.RTU, READ), build_request(Framing.TCP, READ)
+    own, other = (rtu, tcp) if kind == "socket" else (tcp, rtu)
+    assert mixed_up(port, other)
+    assert not any(mixed_up(port, came) for came in (own, b"", b"\0" * 4, b"HTTP/1.1 400 Bad Request"))
+    assert not any(mixed_up("/dev/ttyUSB0", came) for came in (rtu, tcp))
