@@ -84,8 +84,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for every drive however busy the machine is; not for tests in which one is silent."""
 
-    def peer(**timeouts: float) -> Peer:
-        return Peer(**{name: max(seconds, PATIENCE) for name, seconds in timeouts.items()})
+    def peer(*, interval: float, **timeouts: float) -> Peer:
+        return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
 
     monkeypatch.setattr(exchanges, "Peer", peer)
 

@@ -8,16 +8,21 @@ import pytest
 from lines import polled
 from picky import Picky, family
 from simulated_bus import SimulatedBus
+from toy import Toy
 from worlds import S, World, WorldWire
 
 from multidrop.control.call import Call
+from multidrop.control.stop_all import stop_together
+from multidrop.control.stop_attempt import StopAttempt
 from multidrop.core import Latch, Message
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING
+from multidrop.drive.script import Insist, Script
 from multidrop.planning.blocks import planned
 from multidrop.planning.prediction import predict
 from multidrop.planning.schedule import Job, Schedule
 from multidrop.sim import Faults
+from multidrop.transport import clock
 from multidrop.transport.exchange import NO_ROWS, make_exchange
 
 INTERVAL = 0.1
@@ -170,3 +175,24 @@ def test_jobs_of_one_drive_take_turns_beside_many_others() -> None:
     assert max(counts[:5]) - min(counts[:5]) <= 1
     assert max(counts[5:]) - min(counts[5:]) <= 1
     assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
+
+
+def test_a_stop_that_must_wait_for_its_drive_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(clock, "now_ns", lambda: round(now[0] * 1e9))
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
+    first, second = slow()[0], family(1)(2, name="other")
+    sent: list[str] = []
+
+    def script() -> Script[None]:
+        yield Insist(Toy.control, 0)
+
+    def do(stop: StopAttempt, step: object) -> None:
+        sent.append(stop.drive.name)
+
+    stops = [
+        StopAttempt(first, script, now[0], None, lambda: now[0] + INTERVAL),
+        StopAttempt(second, script, now[0], None),
+    ]
+    stop_together(stops, do, lambda stop: None)
+    assert sent == ["other", "slow"]

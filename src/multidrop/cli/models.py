@@ -14,11 +14,13 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.read_limits import read_limit, stated_limit
+from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives import MODELS
-from multidrop.drives.registry import SHIPPED, find_model, shipped_family
+from multidrop.drives.registry import SHIPPED, find_model, is_users_own, shipped_family
+from multidrop.planning.reading_gain import ReadingGain, reading_gain
 from multidrop.plant.loader import load_plant
 
 INDENT = 16  # of a family's facts
@@ -105,12 +107,26 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
     yield "response", f"{_response_delay(family)} until measured; none after {_ms(family.response_timeout)}"
     pause = f"yes; then {_ms(family.turnaround_delay)} of pause"
     yield "broadcast", pause if family.broadcasts else family.no_broadcasts
+    if family.least_interval:
+        yield "interval", f"{_ms(family.least_interval)} from the end of an exchange to the next request"
+    for group in family.read_together:
+        yield "read together", ", ".join(group)
+    if gain := _gain(family):
+        yield "reading", f"all readings in {gain} (at {gain.drive.settings})"
     yield "verbs", ", ".join(_verbs(family)) or "none"
     if family.line_parameters:
         yield "line", family.line_parameters
     if family.remote != Drive.remote:
         yield "remote", family.remote
     yield "watchdog", family.watchdog
+
+
+def _gain(family: type[Drive]) -> ReadingGain | None:
+    """Return what stated gaps would save a class of a user's own, at its default settings."""
+    drive = family(family.addresses[0])
+    if not is_users_own(family):
+        return None
+    return reading_gain(drive, [(register, None) for register in drive.readings()])
 
 
 def _ms(seconds: float) -> str:
@@ -154,7 +170,9 @@ def _option(option: Option) -> str:
 def _table_heading(table: Table, family: type[Drive]) -> str:
     codes = []
     if table.read is not None:
-        codes.append(f"read {table.read:02X}H, {family.most_registers.get(table, 1)} at most")
+        is_stated = stated_limit(family, table) or table.carrier not in (Carrier.BIT, Carrier.WORD)
+        stated = "" if is_stated else ", as the standard has it: the class states no limit"
+        codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most{stated}")
     if table.write is not None:
         codes.append(f"write {table.write:02X}H")
     return f"{table.name}s ({'; '.join(codes)})"
@@ -268,6 +286,14 @@ def facts(family: type[Drive]) -> dict[str, Any]:
         "broadcasts": family.broadcasts,
         "no_broadcasts": None if family.broadcasts else family.no_broadcasts,
         "most_registers": {table.name: most for table, most in family.most_registers.items()},
+        "read_limits": {
+            table.name: read_limit(family, table)
+            for table in dict.fromkeys(register.table for register in family.registers.values())
+            if table.read is not None
+        },
+        "read_together": family.read_together,
+        "least_interval_s": family.least_interval,
+        "reading_gain": str(gain) if (gain := _gain(family)) else None,
         "exceptions": family.exceptions,
         "options": {
             name: {"unit": option.unit, "span": option.span, "meaning": option.meaning}

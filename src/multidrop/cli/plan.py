@@ -15,7 +15,9 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_plant_argument
 from multidrop.cli.support.values import Row, aligned, shortened, wrapped
+from multidrop.drives.registry import is_users_own
 from multidrop.planning.prediction import Prediction, Rate, predict
+from multidrop.planning.reading_gain import reading_gain
 from multidrop.planning.suggestions import Suggestions, duration_text, suggest
 from multidrop.plant.loader import load_plant
 from multidrop.plant.metadata import planned_on
@@ -68,6 +70,20 @@ def _misfit(rate: Rate, every: float) -> str:
 
 
 def _warnings(plan: _PredictedLine) -> list[str]:
+    return [*_long_cycle(plan), *_gains(plan)]
+
+
+def _gains(plan: _PredictedLine) -> list[str]:
+    """Say what classes of a user's own would save if they stated the gaps that their document allows."""
+    gains = {
+        polled.drive.name: reading_gain(polled.drive, polled.wanted)
+        for polled in plan.line.drives
+        if is_users_own(type(polled.drive))
+    }
+    return [f"{name}: {gain}" for name, gain in gains.items() if gain]
+
+
+def _long_cycle(plan: _PredictedLine) -> list[str]:
     """Warn where all readings are polled, which is the default, and a cycle takes long."""
     whole = [
         polled.drive

@@ -50,6 +50,11 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     return _drive(_load((relative_to or Path()) / path), path, name if colon else "")
 
 
+def is_users_own(family: type[Drive]) -> bool:
+    """Return True for a family that is not of this package, and derives from none that is."""
+    return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
+
+
 def _drive(module: ModuleType, path: str, name: str) -> type[Drive]:
     found = getattr(module, name, None)
     if isinstance(found, type) and issubclass(found, Drive) and found.registers:
