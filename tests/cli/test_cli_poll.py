@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from batches import METADATA, counting
 from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
+from examples import usually
 from lines import Faulty, line, polled
 from recordings import recorded
 from terminals import on_terminal
@@ -108,7 +109,7 @@ def test_a_recording_says_what_its_registers_are(plant: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
 def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Path, number: int) -> None:
     out = tmp_path / "out.csv"
     with running("poll", plant, "--out", out, "--json") as (process, printed):
@@ -212,7 +213,7 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".arrows", ".csv"])
+@pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:

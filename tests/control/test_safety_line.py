@@ -137,9 +137,11 @@ def test_a_power_cycle_in_mid_ramp() -> None:
         until(lambda: drive.perform(read(drive.output_frequency)) > 0)
         assert 0 < sim.motor.frequency < 40
         sim._restart()  # all but the EEPROM is gone, and it is deaf for a while
+        sim.deaf_until = float("inf")
         sent = len(heard.writes)
         with pytest.raises(NoReply):
             drive.state()
+        sim.deaf_until = 0.0
         until(lambda: _condition(drive) is Condition.STOPPED)
         with pytest.raises(Refused, match="set_frequency"):
             drive.start()

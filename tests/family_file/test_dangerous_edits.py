@@ -11,11 +11,12 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from itertools import islice
 from typing import Any
 
 import pytest
 from declared_families import NAMES, class_of, document_of, mistakes_of
-from examples import in_turn
+from examples import PART, in_turn
 from nasty_drives import RESETS, NastyDrive
 from simulated_bus import SimulatedBus
 from verb_edits import KINDS, Document
@@ -463,7 +464,7 @@ def test_the_unchanged_files_do_no_harm(name: str) -> None:
 def test_no_dangerous_edit_survives(kind: Any, name: str) -> None:
     document = document_of(name)
     total, survivors, dangerous = 0, [], {}
-    for edit in kind(document):
+    for edit in islice(kind(document), 0, None, PART**2):
         total += 1
         if repr(edit.document) == repr(document):
             continue

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from declared_families import NAMES, class_of, document_of, registers_of
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,7 +85,7 @@ def damaged(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     return name, document
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(damaged())
 def test_damaged_documents_are_told_about(case: tuple[str, dict[str, Any]]) -> None:
     told(*case)

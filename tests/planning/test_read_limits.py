@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from examples import examples
+from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from meter import ADDRESSES, Meter, StatedMeter
@@ -47,7 +47,9 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 # ---- nothing stated ----
 
 
-@pytest.mark.parametrize(("table", "most"), [(HOLDING, 125), (INPUT, 125), (COIL, 2000), (DISCRETE, 2000)])
+@pytest.mark.parametrize(
+    ("table", "most"), usually((HOLDING, 125), (INPUT, 125), (COIL, 2000), (DISCRETE, 2000))
+)
 def test_side_by_side_the_standard_s_limits_hold(table: Table, most: int) -> None:
     drive = family(**{f"r{at}": reading(at, table=table) for at in range(most + 1)})(1)
     counts = sorted(count for _, count in spans(drive))

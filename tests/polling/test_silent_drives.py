@@ -61,6 +61,7 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead"), usually((16, 5), (16, 1), (31, 10)))
 @pytest.mark.parametrize("every", usually(None, 0.5), ids=["in turn", "at a rate"])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
+from examples import usually
 from lines import proof
 from motors import MAKE, Heard
 from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
@@ -28,12 +29,9 @@ pytestmark = pytest.mark.story
 
 TCP = "tcp://world:502"
 FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
-FEW = [
-    pytest.param(name, marks=() if name in ("innovert-ibd", "invt-che") else pytest.mark.long)
-    for name in FAMILIES
-]
+FEW = [pytest.param(name, marks=() if name == "innovert-ibd" else pytest.mark.long) for name in FAMILIES]
 PATHS = [
-    pytest.param(path, seconds, marks=() if seconds in (0.0, 0.6) else pytest.mark.long)
+    pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
     for path, delays in ((constant, (0.0, 0.3, 0.6, 1.5, 10.0)), (jittering, (0.6, 10.0)))
     for seconds in delays
 ]
@@ -86,7 +84,7 @@ def test_a_slow_path_costs_time_and_no_truth(
 
 
 @STORIES
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", usually(*KINDS))
 def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, story_of: type[Path]) -> None:
     story = story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP)
     story.wire.faults = Faults(**{kind: 0.2, "late": story.wire.most_late})
@@ -94,7 +92,7 @@ def test_replies_late_doubled_and_in_another_order_cost_no_truth(kind: str, stor
     assert story.wire.struck[kind] > 50
 
 
-@STORIES
+@pytest.mark.parametrize("story_of", usually(TrueIdsPath, OwnIdsPath))
 def test_a_stall_costs_no_truth(story_of: type[Path]) -> None:
     story_of([family(at) for at, family in enumerate(FAMILIES.values(), 1)], port=TCP).tell_of(stalling(15.0))
 

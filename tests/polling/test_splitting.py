@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
-from examples import examples
+from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lines import polled
@@ -129,7 +129,7 @@ def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("every", [None, 0.5])
-@pytest.mark.parametrize("longest", [1, 10])
+@pytest.mark.parametrize("longest", usually(10, 1))
 def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
     longest: int, every: float | None
 ) -> None:

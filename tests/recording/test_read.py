@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import pyarrow as pa
@@ -52,7 +53,7 @@ def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
 
 def test_the_wide_form_joins_what_is_in_several_batches(path: Path) -> None:
     wide = multidrop.read(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
-    table = pa.table(wide).to_pydict()
+    table = pa.table(wide).drop(["time"]).to_pydict()
     expected = {(each.time, each.register): each.value for each in recorded(path) if each.drive == "pump-1"}
     times = pa.table(wide).column("time").cast(pa.int64()).to_pylist()
     assert len(times) == len({time for time, _ in expected})
@@ -93,7 +94,9 @@ def test_a_truncated_end_is_left_out_and_counted(tmp_path: Path, suffix: str) ->
 def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
     path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
     path.write_text(path.read_text().replace("pump,", "pump;", 1))
-    for take in ("to_pandas", "to_polars", "wide"):
+    for take, library in (("to_pandas", "pandas"), ("to_polars", "polars"), ("wide", "json")):
+        if find_spec(library) is None:
+            continue
         with pytest.raises(ValueError, match=r"run\.csv, line 2: not a row of a recording"):
             getattr(multidrop.read(path), take)()
 

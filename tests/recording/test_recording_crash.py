@@ -19,7 +19,7 @@ import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, block, completion, counting, example
 from completions import add_rows
 from disks import full_at, read_only_directory
-from examples import examples
+from examples import examples, usually
 from recordings import rows_of
 from toy import Toy
 
@@ -142,7 +142,7 @@ for at in count():
 
 
 @pytest.mark.slow
-@growing
+@pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_killed_while_writing(tmp_path: Path, suffix: str) -> None:
     """SIGKILL at full speed: every batch whose write had returned is there."""
     for until in (1, 40, examples(240)):
