@@ -68,7 +68,7 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
         ("465537", '"465537" is outside "400001" to "465536"'),
         (
             40017,
-            "40017 may be the number 40017, or register 17 of table holding; write 0x9C51",
+            '40017 may be the number 40017, or register 17 of table holding; write "9C51H" for that number',
         ),
         (400017, "400017 may be the number 400017, or register 17 of table holding; write a smaller number"),
     ],
@@ -77,6 +77,13 @@ def test_what_is_refused(given: Any, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the sentence is compared below)
         Counting(0).address(given, None, "holding")
     assert sentence in str(refused.value)
+
+
+def test_a_number_that_is_refused_can_be_written_in_another_way() -> None:
+    """TOML's 0x9C41 is 40001 to whoever reads it: its hex has to be in quotes."""
+    for text in ("9C41H", "0x9C41"):
+        assert Counting(0).address(text, None, "holding") == (40001, "holding")
+        assert Counting(0).address_in_cell(text, None, "holding") == (40001, "holding")
 
 
 def test_a_digit_that_contradicts_its_table() -> None:

@@ -70,8 +70,7 @@ class Counting:
         return self.address(text, table, default)
 
     def _number(self, number: int, table: str) -> int:
-        digit = _DIGIT_OF_TABLE[table]
-        if digit != "0" and str(number).startswith(digit) and _NUMBERED.fullmatch(str(number)):
+        if is_ambiguous(number, table):
             raise ValueError(_ambiguous(str(number), number))
         return self._sent(number, number)
 
@@ -84,13 +83,19 @@ class Counting:
         return number - first
 
 
+def is_ambiguous(number: int, table: str) -> bool:
+    """Return True for a number of TOML that may be the manual's 40001 too: TOML has no hex to tell it by."""
+    digit = _DIGIT_OF_TABLE[table]
+    return digit != "0" and str(number).startswith(digit) and _NUMBERED.fullmatch(str(number)) is not None
+
+
 def _ambiguous(text: str, number: int) -> str:
-    right = f"0x{number:X} for that number" if number <= LAST_ADDRESS + 1 else "a smaller number"
+    right = f'"{number:X}H" for that number' if number <= LAST_ADDRESS + 1 else "a smaller number"
     table = _TABLE_OF_DIGIT[text[0]]
     numbered = int(text[1:])
     return (
         f"{text} may be the number {text}, or register {numbered} of table {table}; write {right}, "
-        f'or "{text}" in quotes in the TOML file (in a CSV file without counts_from) for that of the table'
+        f'or "{text}" for that of the table, both in quotes (in a CSV file without counts_from)'
     )
 
 

@@ -40,7 +40,9 @@ def read_devices(path: Path) -> list[ImportedDevice]:
         raise ValueError(f"{path}: {mistake}") from mistake
     found = [device for device in devices if device.registers or device.texts]
     if not found:
-        raise ValueError(f"{path} has no register that can be imported")
+        lost = [sentence for device in devices for sentence in device.lost]
+        why = f": {lost[0]}" if lost else ""
+        raise ValueError(f"{path} has no register that can be imported{why}")
     return found
 
 
@@ -53,7 +55,10 @@ def _yaml(data: bytes, path: Path) -> list[ImportedDevice]:
 
 
 def _toml(data: bytes, path: Path) -> list[ImportedDevice]:
-    return read_telegraf(parse_document(data))
+    document = parse_document(data)
+    if "family" in document:
+        raise ValueError("is a family's file already: see `multidrop check`")
+    return read_telegraf(document)
 
 
 def _json(data: bytes, path: Path) -> list[ImportedDevice]:

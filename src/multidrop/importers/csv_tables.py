@@ -127,8 +127,12 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Mapping[str, str], st
         register.gaps.append("whether its address counts from 0 or 1; 0 was assumed")
         if stated is None:
             register.gaps.append("its table; holding was assumed")
-    if cells.get("formula") or cells.get("is_scale", "").lower() == "true":
-        device.lost.append(f"{name}: its formula, or that it scales others, was not carried over")
+    step = cells.get("step", "")
+    if formula := cells.get("formula"):
+        register.gaps.append(f"its formula {formula} was not carried over: its counts are shown as they are")
+        step = "unknown"
+    if cells.get("is_scale", "").lower() == "true":
+        device.lost.append(f"{name}: that it scales others was not carried over")
     kind = cells.get("type", "") or "uint16"
     if kind.lower().startswith("string"):
         if not cells.get("length", "").isdecimal():
@@ -140,15 +144,16 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Mapping[str, str], st
     if table in ("coil", "discrete"):
         device.add(register)
         return
+    if part and kind.lower() not in ("bit", "bool"):
+        device.lost.append(f"{name}: a bit of a number of type {kind} has no meaning here")
+        return
     if part or kind.lower() in ("bit", "bool"):
         kind, register.details["part"] = "uint16", part or "0"
     if match := re.fullmatch(r"(u?int\d+|float|double)(be|le|sw|sb)", kind.lower()):
         kind, order = match[1], _SUFFIXES[match[2]]
     if note := cells.get("note"):
         register.details["note"] = note
-    _finish(
-        device, register, kind, order, cells.get("unit", ""), cells.get("step", ""), cells.get("offset", "")
-    )
+    _finish(device, register, kind, order, cells.get("unit", ""), step, cells.get("offset", ""))
 
 
 def _finish(
@@ -179,4 +184,5 @@ def _finish(
         scaled(register.details, step, offset)
     except ValueError:
         register.gaps.append(f"its scale {step!r} or offset {offset!r} is no number")
+        register.details["step"] = "unknown"
     device.add(register)

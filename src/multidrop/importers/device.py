@@ -80,7 +80,10 @@ _TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Add step and offset where they say something."""
+    """Add step and offset where they say something. A step may be "unknown": counts are shown then."""
+    if step == "unknown":
+        details["step"] = step
+        return
     if number(step, 1) != 1:
         details["step"] = number(step, 1)
     if number(offset, 0) != 0:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from multidrop.family_file.addresses import is_ambiguous
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.printable import printable
 
@@ -60,7 +61,8 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
 
 
 def _entry(register: ImportedRegister) -> str:
-    parts = [f"at = 0x{register.address:04X}"]
+    in_hex = f"0x{register.address:04X}"
+    parts = [f'at = "{in_hex}"' if is_ambiguous(register.address, register.table) else f"at = {in_hex}"]
     if register.table != "holding":
         parts.append(f"table = {_value(register.table)}")
     parts += [f"{key} = {_value(register.details[key])}" for key in _ORDER if key in register.details]

@@ -36,7 +36,7 @@ def read_home_assistant(text: str) -> list[ImportedDevice]:
     try:
         document = yaml.load(text, Loader)
     except yaml.YAMLError as failure:
-        raise ValueError(f"is not YAML: {failure}") from failure
+        raise ValueError(f"is not YAML: {' '.join(str(failure).split())}") from failure
     hubs = document.get("modbus", []) if isinstance(document, dict) else document
     found: dict[int | None, ImportedDevice] = {}
     for hub in hubs if isinstance(hubs, list) else [hubs]:

@@ -17,7 +17,8 @@ _ORDERS = {
     ("big_endian", "little_endian"): "BADC",
     ("little_endian", "little_endian"): "DCBA",
 }
-_LOST = ("write_address", "condition", "round_to", "unsupported_value", "sporadic")
+_INVALID = ("error_value", "unsupported_value")
+_LOST = ("write_address", "condition", "round_to", "sporadic")
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
@@ -76,7 +77,7 @@ def _number(
         register.details["part"] = "0-7"
     if len(rest) == 2:
         low, width = int(rest[0]), int(rest[1])
-        register.details["part"] = f"{low}-{low + width - 1}"
+        register.details["part"] = f"{low}-{low + width - 1}" if width > 1 else str(low)
     word = str(channel.get("word_order", template.get("word_order", "big_endian")))
     byte = str(channel.get("byte_order", template.get("byte_order", "big_endian")))
     order = _ORDERS.get((word, byte), "")
@@ -85,6 +86,7 @@ def _number(
     if order:
         register.details["order"] = order
     scaled(register.details, channel.get("scale"), channel.get("offset"))
-    if "error_value" in channel:
-        register.details["invalid"] = int(str(channel["error_value"]), 0)
+    invalid = [int(str(channel[key]), 0) for key in _INVALID if key in channel]
+    if invalid:
+        register.details["invalid"] = invalid[0] if len(invalid) == 1 else invalid
     return True
