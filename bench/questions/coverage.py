@@ -35,7 +35,7 @@ def load(folder: Path) -> tuple[list[Template], list[str]]:
 
 
 class Coverage:
-    """What came of each entry of some templates."""
+    """Counts of what came of the entries of some templates."""
 
     def __init__(self, templates: Iterable[Template]) -> None:
         self.by_template = [
