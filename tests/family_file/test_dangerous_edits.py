@@ -1,8 +1,8 @@
 """Edits of files with verbs: each that could start a motor unasked, or keep a stop from working, is refused.
 
 Two judges: a table of edits that are known to be dangerous, and a program that makes every edit of some kinds
-(`verb_edits`) and has what is not refused drive a motor that obeys its document alone (`nasty_drives`). All of
-them: `EDITS=all pytest -m '' tests/family_file/test_dangerous_edits.py -k survives`.
+(`verb_edits`) and has what is not refused drive a motor that obeys its document alone (`nasty_drives`).
+All of them: `EDITS=all pytest -m '' tests/family_file/test_dangerous_edits.py -k survives`.
 """
 
 from __future__ import annotations
