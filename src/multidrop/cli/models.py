@@ -14,6 +14,7 @@ from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
+from multidrop.drive.read_limits import read_limit
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
@@ -154,7 +155,7 @@ def _option(option: Option) -> str:
 def _table_heading(table: Table, family: type[Drive]) -> str:
     codes = []
     if table.read is not None:
-        codes.append(f"read {table.read:02X}H, {family.most_registers.get(table, 1)} at most")
+        codes.append(f"read {table.read:02X}H, {read_limit(family, table)} at most")
     if table.write is not None:
         codes.append(f"write {table.write:02X}H")
     return f"{table.name}s ({'; '.join(codes)})"
