@@ -54,6 +54,8 @@ Register;Address;Type;Unit;Scale;Notes
 Speed;0x0010;uint16;rpm;1;
 Temp 1;17;int16;°C;0,1;
 1st;18;int16;;2;
+Odd;19;int16;;x;
+None;20;int16;;0;
 """
 TELEGRAF = """\
 [[inputs.modbus]]
@@ -242,7 +244,9 @@ def test_a_table_of_one_s_own(tmp_path: Path) -> None:
     device = only(tmp_path, "own.csv", OWN)
     text = family_text(device, "own.csv")
     assert "# gap: speed: whether its address counts from 0 or 1; 0 was assumed" in text
-    assert "# gap: temp_1: its scale '0,1' or offset '' is no number" in text
+    assert "# gap: temp_1: the comma of 0,1 was taken for a decimal point" in text
+    assert "# gap: odd: only its count is read: its scale 'x' or offset '' is no number" in text
+    assert entries(device)["temp_1"]["step"] == 0.1
     assert list(loaded(tmp_path, device, "speed", "temp_1", "r_1st")) == ["speed", "temp_1", "r_1st"]
 
 

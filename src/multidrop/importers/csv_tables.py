@@ -152,5 +152,7 @@ def _number(
     try:
         scaled(register.details, step, offset)
     except ValueError:
-        register.gaps.append(f"its scale {step!r} or offset {offset!r} is no number")
+        register.lacks = f"its scale {step[:40]!r} or offset {offset[:40]!r} is no number"
+    if "," in step + offset and not register.lacks:
+        register.gaps.append(f"the comma of {step or offset} was taken for a decimal point")
     device.add(register)

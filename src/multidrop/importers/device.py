@@ -13,6 +13,7 @@ from multidrop.drive.family import TAKEN_NAMES
 from multidrop.family_file.names import OF_ENUMERATIONS, unusable
 
 WRITTEN = "it is written there; what a write does is not known here"
+ONLY_WRITTEN = "is only written: a command is never imported"
 MOST_ENTRIES = 20_000  # of one file
 _LONGEST_NAME = 50
 _TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
@@ -75,11 +76,11 @@ class ImportedDevice:
         if not 0 <= found.address <= 0xFFFF:
             self.lose(found.name, "its address is none from 0 to 65535")
             return
+        spelt, found.name = found.name, self.names.free(found.name)
         if not found.is_read:
-            self.lose(found.name, "is only written: a command is never imported")
+            self.lose(spelt, ONLY_WRITTEN)
             self.commands.append(found)
             return
-        spelt, found.name = found.name, self.names.free(found.name)
         if spelt != found.name and "note" not in found.details and not is_text:
             found.details["note"] = spelt
         (self.texts if is_text else self.registers).append(found)

@@ -45,9 +45,9 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Add step and offset where they say something. Raises ValueError for what is no number."""
+    """Add step and offset where they say something; a step of 0 says nothing. Raises as `number` does."""
     found = number(step, 1), number(offset, 0)
-    if found[0] != 1:
+    if found[0] not in (0, 1):
         details["step"] = found[0]
     if found[1] != 0:
         details["offset"] = found[1]
@@ -57,7 +57,10 @@ def number(given: Any, default: float) -> float:
     """Return a number that may be text; `default` where there is none. Raises ValueError for other text."""
     if given in (None, ""):
         return default
-    found = float(given)
+    text = str(given)
+    if re.fullmatch(r"-?\d+,\d+", text):  # a decimal comma
+        text = text.replace(",", ".")
+    found = float(text)
     if not math.isfinite(found):
         raise ValueError(f"{str(given)[:40]!r} is no number")
     return int(found) if found == int(found) and abs(found) < 1e15 else found
