@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
 from typing import Any
 
 import pytest
 
-from multidrop.family_file.addresses import Counting
+from multidrop.family_file.addresses import Counting, sent_as
 
 
 @pytest.mark.parametrize(
@@ -66,7 +67,7 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
         ("FFFFFH", "FFFFFH is outside 0 to FFFFH"),
         ("40000", '"40000" is outside "40001" to "465536"'),
         ("465537", '"465537" is outside "400001" to "465536"'),
-        (40017, "40017 may be the number 40017, or the 17. of table holding; write 0x9C51 for that number"),
+        (40017, '40017 may be the number 40017, or the 17. of table holding; write "9C51H" for that number'),
         (400017, "400017 may be the number 400017, or the 17. of table holding; write a smaller number"),
     ],
 )
@@ -74,6 +75,13 @@ def test_what_is_refused(given: Any, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the sentence is compared below)
         Counting(0).address(given, None, "holding")
     assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("table", ["holding", "input", "coil", "discrete"])
+def test_every_address_can_be_written_as_it_is_sent(table: str) -> None:
+    for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
+        written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
+        assert Counting(0).address(written, table, "holding") == (address, table)
 
 
 def test_a_digit_that_contradicts_its_table() -> None:

@@ -84,8 +84,14 @@ class Counting:
         return number - first
 
 
+def sent_as(address: int, table: str) -> str:
+    """Return the TOML of an address that is sent as it is, where `counts_from` is 0."""
+    is_plain = not _NUMBERED.fullmatch(str(address)) or _TABLE_OF_DIGIT[str(address)[0]] != table
+    return f"0x{address:04X}" if is_plain else f'"{address:X}H"'
+
+
 def _ambiguous(text: str, number: int) -> str:
-    right = f"0x{number:X} for that number" if number <= LAST_ADDRESS + 1 else "a smaller number"
+    right = f'"{number:X}H" for that number' if number <= LAST_ADDRESS + 1 else "a smaller number"
     table = _TABLE_OF_DIGIT[text[0]]
     numbered = int(text[1:])
     return (

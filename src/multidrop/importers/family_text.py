@@ -6,8 +6,13 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from multidrop.family_file.addresses import sent_as
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.printable import printable
+
+MOST_LOST = 500  # that the file tells
+_LONGEST = 200  # characters of a text
+_MOST_POINTS = 20  # of a text; TOML's reader takes a line of very many for a key
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -31,12 +36,16 @@ def family_text(device: ImportedDevice, source: str) -> str:
         if registers:
             lines += ["", f"[{section}]"]
         for register in registers:
-            lines += [
-                *(f"# gap: {register.name}: {_comment(gap)}" for gap in register.gaps),
-                _entry(register),
+            gaps = [
+                *register.gaps,
+                *([f"only its count is read: {register.lacks}"] if register.lacks else ()),
             ]
+            lines += [*(f"# gap: {register.name}: {_comment(gap)}" for gap in gaps), entry_line(register)]
     if device.lost:
-        lines += ["", "# Not carried over:", *(f"# - {_comment(sentence)}" for sentence in device.lost)]
+        left = len(device.lost) - MOST_LOST
+        lines += ["", "# Not carried over:"]
+        lines += [f"# - {_comment(str(lost))}" for lost in device.lost[:MOST_LOST]]
+        lines += [f"# - and {left} more"] if left > 0 else []
     return "\n".join([*lines, ""])
 
 
@@ -59,8 +68,9 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
     )
 
 
-def _entry(register: ImportedRegister) -> str:
-    parts = [f"at = 0x{register.address:04X}"]
+def entry_line(register: ImportedRegister) -> str:
+    """Return the register's line in its section."""
+    parts = [f"at = {sent_as(register.address, register.table)}"]
     if register.table != "holding":
         parts.append(f"table = {_value(register.table)}")
     parts += [f"{key} = {_value(register.details[key])}" for key in _ORDER if key in register.details]
@@ -74,7 +84,7 @@ def _value(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, str):
-        text = "".join(character if character.isprintable() else " " for character in value[:500])
+        text = "".join(character if character.isprintable() else " " for character in _short(value))
         return json.dumps(text, ensure_ascii=False)
     return repr(value)
 
@@ -85,4 +95,8 @@ def _pairs(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _comment(text: str) -> str:
-    return printable(text.replace("\n", " "))[:500]
+    return printable(_short(text).replace("\n", " "))
+
+
+def _short(text: str) -> str:
+    return text[:_LONGEST].replace(".", " ") if text[:_LONGEST].count(".") > _MOST_POINTS else text[:_LONGEST]
