@@ -85,7 +85,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "default = 70 is outside its span of 0 to 60": {"span": (0, 60), "default": 70},
     "default = 'slow' is no number": {"default": "slow"},
     "table = 'coil' is no table": {"table": "coil"},
-    "a input register cannot be written": {"table": INPUT},
+    "an input register cannot be written": {"table": INPUT},
     "kept = 'RAM' is none of": {"kept": "RAM"},
     "harmless = <Run.STOP: 0> is no tuple of raw counts": {"harmless": Run.STOP},
     "never = True is no text": {"never": True},
@@ -94,6 +94,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "function 15 cannot write a word: its table has 06H or 10H for it": {"table": Table("relay", 3, 0x0F)},
     "function 101 cannot read a word": {"table": Table("fifo", 101, 0x10)},
     "ram_address 10000H is outside 0 to FFFFH": {"ram_address": 0x10000},
+    "its ram_address is its own address, which is the one that wears": {"ram_address": 5},
 }
 
 
@@ -236,6 +237,19 @@ def test_two_settings_at_one_place_mean_the_same() -> None:
     assert told(volts=setting(8), other=setting(8, table=several, number_format=NumberFormat.U32))
 
 
+def test_nothing_else_reaches_what_commands_the_motor() -> None:
+    run = command(0x20, Run, harmless=(0,))
+    assert told(run=run, speed=setting(9, "rpm", ram_address=0x20)) == (
+        "speed: its ram_address is that of run, which commands the motor",
+    )
+    wide = setting(9, "rpm", ram_address=0x1F, number_format=NumberFormat.U32)
+    assert told(run=run, speed=wide) == ("speed: its ram_address is that of run, which commands the motor",)
+    assert told(run=run, again=command(0x20, ram_address=0x20)) != ()
+    (mistake,) = told(run=run, again=command(0x20, harmless=(0, 1)))
+    assert mistake.startswith("again: run is written at the same address with another format, step, access")
+    assert declare(run=run, speed=setting(9, "rpm", ram_address=0x21)).registers
+
+
 def test_what_may_share_its_place() -> None:
     family = declare(
         volts=setting(8, "V"),
@@ -274,7 +288,7 @@ def test_a_register_has_one_name_and_one_class() -> None:
 
 def test_the_words_of_a_register_are_what_its_table_can_do() -> None:
     blind = Table("output", None, 0x06)
-    assert told(v=reading(1, table=blind)) == ("v: a output cannot be read, and so holds no reading",)
+    assert told(v=reading(1, table=blind)) == ("v: an output cannot be read, and so holds no reading",)
     assert told(v=reading(1, harmless=(0,)))
     assert declare(v=command(1, table=blind, harmless=(0,)))
     assert declare(v=setting(1, table=INPUT, never="it is the maker's"))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from commands import Run
 from families import Meter, write_meter
+from simulated_bus import SimulatedBus
 
 from multidrop import INPUT, Bus, Drive, Refused, load_family, load_plant, open_reader
 from multidrop.control.eeprom_ledger import Ledger
@@ -150,6 +151,22 @@ def test_a_file_that_could_move_a_motor_writes_nothing_unconfirmed(
             bus.write(drive, drive.register(name), drive.register(name).parse(value))
         assert refused.value.rule == "nobody has confirmed what it is"
         assert simulated_writes(line) == []
+
+
+def test_an_unconfirmed_file_broadcasts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does stop_all send what it calls a broadcast, for nobody has held that against a stop."""
+    path = tmp_path / "fan.toml"
+    head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
+    path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")
+    fan = load_family(path)
+    hall = SimulatedBus(monkeypatch, simulated(fan(1)), simulated(fan(2)))
+    first, second = hall.attach(fan(1)), hall.attach(fan(2))
+    with pytest.raises(Refused, match="declare confirmed = 1"):
+        hall.bus.broadcast(first.control, 0x047F)
+    for drive in (first, second):
+        hall.bus.check_identity(drive)
+    hall.bus.stop_all(seconds=1)
+    assert hall.written == []
 
 
 def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:

@@ -198,6 +198,17 @@ EDITS: dict[str, tuple[Change, str]] = {
         lambda document: document["look"]["stands"][1].update(below=1000),
         "for a standstill",
     ),
+    "a stop look at a frequency in no known unit": (
+        lambda document: (
+            document["reading"]["output_frequency"].update(unit="hz"),
+            document["look"]["stands"][1].update(below=30),
+        ),
+        "in hz for a standstill",
+    ),
+    "a stop look at a signed part of the frequency": (
+        lambda document: document["reading"]["output_frequency"].update(number_format="I16", part=[0, 14]),
+        "which is reverse",
+    ),
     "a running look that is called stopped": (section("state", runs="stopped"), "running|may hold|stand"),
     "nothing says what a running drive shows": (no("shows", "running"), "missing"),
     "nothing says what a tripped drive shows": (no("shows", "fault"), "missing"),

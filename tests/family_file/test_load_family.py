@@ -225,7 +225,7 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
             ["t.toml: [reading] class: 'class' cannot be a register's"],
         ),
         (HEAD + "[reading]\na = { at = 1, harmless = [0] }\n", ["[reading] a: a reading is never written"]),
-        (HEAD + '[setting]\na = { at = "30001" }\n', ["a input register cannot be written"]),
+        (HEAD + '[setting]\na = { at = "30001" }\n', ["an input register cannot be written"]),
         (
             HEAD + "[setting]\na = { at = 1 }\nb = { at = 1, step = 2 }\n",
             ["b: a is written at the same address"],

@@ -60,6 +60,13 @@ def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:
             control = command(1, IntFlag("Bits", {"jog": 1 << 8}))
 
 
+def test_nothing_beside_the_roles_is_harmless() -> None:
+    with pytest.raises(DeclarationError, match="sleeve: harmless counts are those of its control"):
+
+        class Sleeved(Atv320):
+            sleeve = command(0x50, harmless=(1,))
+
+
 def test_all_mistakes_of_a_family_are_told_at_once() -> None:
     class Words(IntEnum):
         RUN = 1

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
-from multidrop.control.rules import is_harmless, raw_count
+from multidrop.control.rules import check_broadcast, is_harmless, is_stop, raw_count
 from multidrop.control.writer import Writer
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
@@ -53,6 +53,8 @@ class Broadcaster:
         if raw not in register.broadcast:
             raise Refused(f"{first.title} has no harmless broadcast of {register.name} = {value}")
         for drive in drives:
+            check_broadcast(drive, register, raw)
+        for drive in drives:
             self._performer.check_identity(drive)
         if is_harmless(register, raw):
             self._latches.rise(drives)
@@ -74,7 +76,7 @@ class Broadcaster:
         control = drives[0].registers.get("control") if drives else None
         if len(drives) < 2 or not _are_alike(drives) or not known or drives[0].framing is Framing.TCP:
             return False
-        if control is None or not control.broadcast:
+        if control is None or not control.broadcast or not is_stop(drives[0], control, control.broadcast[0]):
             return False
         with suppress(Exception):
             self._writer.broadcast(drives[0], control, control.broadcast[0])

@@ -76,7 +76,7 @@ def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # any address may be the wrong one
     if is_harmless(register, raw):
-        if is_unproven and not _has(drive, "stop"):
+        if is_unproven and not is_stop(drive, register, raw):
             drive.check_confirmed(register.name)
         return
     if (register.access is Access.COMMAND or is_unproven) and not register.commands:
@@ -102,6 +102,17 @@ _MOVING = ("start", "stop", "jog", "reset_fault")
 
 def _has(drive: Drive, name: str) -> bool:
     return getattr(type(drive), name) is not getattr(Drive, name)
+
+
+def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
+    """Raise Refused where nobody has confirmed what a file or a class calls a broadcast, unless it stops."""
+    if not is_stop(drive, register, raw):
+        drive.check_confirmed(register.name)
+
+
+def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
+    """Return True for a harmless count of a family that has a stop: in a file each is one of its words."""
+    return is_harmless(register, raw) and _has(drive, "stop")
 
 
 def is_harmless(register: Register[Any], raw: float) -> bool:

@@ -193,6 +193,8 @@ def _format(register: Register[Any]) -> Iterator[str]:
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
             yield f"{name} {at:04X}H: its {register.words} words reach beyond FFFFH"
+    if register.ram_address == register.address:
+        yield "its ram_address is its own address, which is the one that wears the EEPROM"
     yield from number_errors(register)
     if register.is_float and register.values is not None:
         names = register.values.__name__
@@ -225,11 +227,15 @@ def _access(register: Register[Any]) -> Iterator[str]:
     """Find accesses for which the table has no function code."""
     table, word = register.table, register.access.value
     if register.access is not Access.COMMAND and table.read is None:
-        yield f"a {table.name} cannot be read, and so holds no {word}"
+        yield f"{_a(table.name)} cannot be read, and so holds no {word}"
     if register.access is not Access.READING and table.write is None and not register.never:
-        yield f"a {table.name} cannot be written, and so holds no {word}"
+        yield f"{_a(table.name)} cannot be written, and so holds no {word}"
     if register.access is Access.READING and (register.harmless or register.broadcast or register.moves):
         yield "a reading is never written: nothing can be harmless or move anything"
+
+
+def _a(name: str) -> str:
+    return f"an {name}" if name[0] in "aeiou" else f"a {name}"
 
 
 # ---- several registers ----
@@ -238,7 +244,9 @@ def _access(register: Register[Any]) -> Iterator[str]:
 def _shared(registers: list[Register[Any]]) -> Iterator[str]:
     """Find registers that are written at the same address and do not mean the same there.
 
-    A reading may share its address with anything, and different tables may use the same addresses.
+    A reading may share its address with anything, and different tables may use the same addresses. What
+    commands the motor is reached by no alias in RAM of another register, and by none with other harmless
+    counts: a plain write would send what verbs alone send.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}
@@ -248,15 +256,24 @@ def _shared(registers: list[Register[Any]]) -> Iterator[str]:
             if _meaning(one) != _meaning(other):
                 yield (
                     f"{other.name}: {one.name} is written at the same address "
-                    f"with another format, step or access; one of the two is wrong"
+                    f"with another format, step, access or harmless counts; one of the two is wrong"
                 )
         for place in places:
             at.setdefault(place, []).append(other)
+    for one in (each for each in written if each.ram_address is not None):
+        alias = {(_space(one.table), address + _to_alias(one)) for address in _addresses(one)}
+        for other in dict.fromkeys(other for place in alias for other in at.get(place, ())):
+            if other.commands:
+                yield f"{one.name}: its ram_address is that of {other.name}, which commands the motor"
 
 
 def _space(table: Table) -> object:
     modbus = table.carrier in (Carrier.BIT, Carrier.WORD)
     return (table.carrier, _SAME_SPACE.get(table.write or 0, table.write)) if modbus else table
+
+
+def _to_alias(register: Register[Any]) -> int:
+    return (register.ram_address or 0) - register.address
 
 
 def _addresses(register: Register[Any]) -> range:
@@ -265,4 +282,5 @@ def _addresses(register: Register[Any]) -> range:
 
 def _meaning(register: Register[Any]) -> object:
     coding = register.coding
-    return register.address, coding.core_format, coding.factors, register.access, register.commands
+    harmless = frozenset(register.harmless or ())
+    return register.address, coding.core_format, coding.factors, register.access, register.commands, harmless

@@ -17,10 +17,8 @@ from multidrop.family_file.looks import Criterion, Look, limits_of
 from multidrop.family_file.sections import FAULT, RUNNING, STANDING
 from multidrop.toml_check import TomlPlace
 
-MOTIONS = (
-    "output_frequency",
-    "motor_speed",
-)  # readings that tell a motor that stands from one that runs down
+# Readings that tell a motor that stands from one that runs down.
+MOTIONS = ("output_frequency", "motor_speed")
 NEARLY_ZERO = {"Hz": 1.0, "rpm": 60.0, "%": 2.0}  # the most, in a look that says that a motor stands
 
 Registers = Mapping[str, Register[Any]]
@@ -86,10 +84,11 @@ def _standstill(look: Look, declared: DeclaredVerbs, registers: Registers) -> It
 
 
 def _nearly_zero(criterion: Criterion, register: Register[Any], is_motion: bool) -> Iterator[str]:
-    most = NEARLY_ZERO.get(register.unit)
+    most, name, unit = NEARLY_ZERO.get(register.unit), criterion.register, register.unit
+    if most is None and is_motion:
+        yield f"takes {name} in {unit or 'no unit'} for a standstill; it is to be in {', '.join(NEARLY_ZERO)}"
     if most is None or register.values is not None:
         return
-    name, unit = criterion.register, register.unit
     if criterion.values is not None:
         if any(abs(value) > most for value in criterion.values):
             yield f"takes {name} of more than {most:g} {unit} for a standstill"

@@ -13,7 +13,6 @@ from fractions import Fraction
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.number_format import raw_span
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, read
 from multidrop.family_file.places import number
@@ -271,11 +270,7 @@ _PARSERS = {"has": _bits, "lacks": _bits, "is": _values, "below": _bound, "above
 
 def limits_of(register: Register[Any]) -> tuple[float, float]:
     """Return the least and the greatest value that the register can show."""
-    bottom, top = raw_span(register.number_format)
-    part = getattr(register, "part", None)
-    if part is not None:
-        bottom, top = Fraction(0), Fraction((1 << part[1] - part[0] + 1) - 1)
-    ends = sorted(float(register.decode(_raw(raw))) for raw in (bottom, top))
+    ends = sorted(float(register.decode(_raw(raw))) for raw in register.coding.raw_span)
     return ends[0], ends[1]
 
 

@@ -88,6 +88,8 @@ class Profile(Drive):
             yield from role_errors(name, cls.roles[name], register)
         elif name in {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}:
             yield f"{name}: this is a name that every profile has for something else; call it otherwise"
+        elif register.harmless:
+            yield f"{name}: harmless counts are those of its control, which the profile says; leave it out"
         if name == "reference" and register.span is not None and register.span[0] < 0:
             yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
         if name == "reference" and ((register.step or 0) < 0 or getattr(register, "offset", None)):
