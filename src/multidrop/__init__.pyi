@@ -70,6 +70,7 @@ from multidrop.plant.model import Polled as Polled
 from multidrop.plant.model import PolledDrive as PolledDrive
 from multidrop.poller import Poller as Poller
 from multidrop.polling.batch import Batch as Batch
+from multidrop.polling.batch import BatchColumns as BatchColumns
 from multidrop.polling.batch import Row as Row
 from multidrop.polling.wide import WideRows as WideRows
 from multidrop.recording import convert as convert
