@@ -174,7 +174,11 @@ def test_sunspec(tmp_path: Path) -> None:
     assert found["mn"]["length"] == 16
     assert any("mend every `at`" in sentence for sentence in told(device))
     assert "mppt.DCA: its group repeats as often as the device says" in told(device)
-    assert loaded(tmp_path, device, "a", "a_sf")["a"].address == 40001
+    registers = loaded(tmp_path, device, "a", "a_sf", "wh", "net")
+    assert registers["a"].address == 40001
+    assert registers["wh"].number_in(b"\xff" * 8, 0) is None
+    assert registers["net"].number_in(b"\x80" + bytes(7), 0) is None
+    assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
 
 
 def test_wb(tmp_path: Path) -> None:

@@ -21,7 +21,22 @@ from readers import read
 ALL = [f"{suffix}\n{text}".encode() for suffix, texts in FILES.items() for text in texts]
 TOKENS = re.compile(rb"[A-Za-z_]+|[0-9.]+|\s+|.", re.DOTALL)
 ODD = (
-    *(b"", b"-1", b"0", b"65535", b"65536", b"1e999", b"nan", b"-0.0", b"1e-320", b"0x", b"9" * 30, b"\xff"),
+    *(
+        b"",
+        b"-1",
+        b"0",
+        b"65535",
+        b"65536",
+        b"1e999",
+        b"nan",
+        b"-0.0",
+        b"1e-320",
+        b"0x",
+        b"9" * 30,
+        b"18446744073709551615",
+        b"0x8000000000000000",
+        b"\xff",
+    ),
     *(
         b"null",
         b"[]",
@@ -84,8 +99,11 @@ def test_a_damaged_file_is_a_family_or_one_sentence(tmp_path: Path, seed: int) -
 # ---- anything that such a file may say ----
 
 
+LARGE = st.sampled_from(
+    [1 << 31, 1 << 32, (1 << 63) - 1, 1 << 63, (1 << 64) - 1, 1 << 64, -(1 << 63), -(1 << 64)]
+)
 ANYTHING = st.one_of(
-    *(st.none(), st.booleans(), st.integers(-5, 70_000), st.floats(), st.text(max_size=12)),
+    *(st.none(), st.booleans(), st.integers(-5, 70_000), LARGE, st.floats(), st.text(max_size=12)),
     st.sampled_from(["0x10", "3:1:2", "u32", "float64", "ABCD", "little_endian", "string", "holding", "nan"]),
     st.lists(st.integers(-2, 70_000), max_size=3),
     st.dictionaries(st.text(max_size=4), st.integers(), max_size=2),

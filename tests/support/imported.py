@@ -115,6 +115,8 @@ SUNSPEC = {
             {"name": "St", "type": "enum16", "size": 1, "symbols": [{"name": "OFF", "value": 1}]},
             {"name": "W", "type": "float32", "size": 2, "units": "W"},
             {"name": "Mn", "type": "string", "size": 16},
+            {"name": "Wh", "type": "uint64", "size": 4, "symbols": []},
+            {"name": "Net", "type": "int64", "size": 4},
         ],
         "groups": [{"name": "mppt", "points": [{"name": "DCA", "type": "uint16", "size": 1}]}],
     },

@@ -36,6 +36,9 @@ def family_text(device: ImportedDevice, source: str) -> str:
         "counts_from = 0  # the addresses below are those that are sent",
         "# gap: baudrates, formats, together: what the manual says of the line",
     ]
+    if device.readable:
+        first, last = (sent_as(at, "holding") for at in (device.readable[0], device.readable[-1]))
+        lines.append(f"gaps = {{ holding = [{first}, {last}] }}")
     for section, registers in (("reading", device.registers), ("text", device.texts)):
         if registers:
             lines += ["", f"[{section}]"]
