@@ -181,6 +181,21 @@ def test_sunspec(tmp_path: Path) -> None:
     assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
 
 
+def test_a_scale_register_out_of_reach_is_told_and_left_out(tmp_path: Path) -> None:
+    """One request reads both, and reads 125 registers at most."""
+    points = [
+        {"name": "A", "type": "int16", "size": 1, "sf": "S"},
+        {"name": "gap", "type": "pad", "size": 130},
+        {"name": "S", "type": "sunssf", "size": 1},
+    ]
+    device = only(tmp_path, "far.json", {"group": {"points": points}})
+    assert "scale_register" not in entries(device)["a"]
+    assert "# gap: a: only its count is read: one request reads at most 125 registers" in family_text(
+        device, "x"
+    )
+    assert loaded(tmp_path, device, "a", "s")["a"].address == 40000
+
+
 def test_wb(tmp_path: Path) -> None:
     device = only(tmp_path, "config-own.json", WB)
     found = entries(device)

@@ -110,21 +110,58 @@ ANYTHING = st.one_of(
 )
 
 
-def entries_of(keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
-    """Return lists of entries with some of these keys, and any values."""
-    return st.lists(st.dictionaries(st.sampled_from(keys.split()), ANYTHING, max_size=8), max_size=5)
+PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
+    "address": st.sampled_from(
+        [0, 1, 2, 10_001, 30_001, 40_001, 65_532, 65_534, 65_535, "0x10", "3:4:2", "9:9:9"]
+    ),
+    "name": st.sampled_from(["a", "A", "class", "address", "1st", "", "\u202e", "a.b" * 99, "sf"]),
+    "reg_type": st.sampled_from(["holding", "input", "coil", "holding_multi"]),
+    "register_type": st.sampled_from(["holding", "read", "coil"]),
+    "input_type": st.sampled_from(["holding", "input", "coil"]),
+    "format": st.sampled_from(
+        ["u8", "s8", "u16", "s16", "u32", "u64", "float", "double", "bcd8", "string", "string8"]
+    ),
+    "type": st.sampled_from(
+        ["int16", "uint32", "sunssf", "string", "pad", "bitfield32", "enum16", "float64"]
+    ),
+    "data_type": st.sampled_from(["int16", "uint32", "int64", "float32", "string"]),
+    "value_type": st.sampled_from(["U_WORD", "S_DWORD_R", "U_QWORD", "FP32"]),
+    "size": st.integers(-1, 200),
+    "sf": st.sampled_from(["a", "a_2", "sf", -2, 400]),
+    "symbols": st.lists(st.fixed_dictionaries({"name": st.text(max_size=4), "value": st.integers(-1, 99)})),
+    "error_value": st.one_of(LARGE, st.sampled_from(["0x7FFF", "nan"])),
+    "nan_value": LARGE,
+    "enum": st.lists(st.integers(-1, 99), max_size=5),
+    "enum_titles": st.lists(st.sampled_from(["on", "On", "class", "name", "real", "1", "é"]), max_size=5),
+    "string_data_size": st.integers(-1, 400),
+    "scale": st.sampled_from([0, -1, 0.1, 1e-300, 1e300, "0,1"]),
+    "write_address": st.integers(0, 70_000),
+}
+
+
+def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
+    """Return lists of entries that have what is needed, and some other keys with values that may be none."""
+    value = {key: PLAUSIBLE.get(key, ANYTHING) for key in (*needed.split(), *keys.split())}
+    plausible = st.fixed_dictionaries(
+        {key: value[key] for key in needed.split()}, optional={key: value[key] for key in keys.split()}
+    )
+    anyhow = st.dictionaries(st.sampled_from(list(value)), ANYTHING, max_size=8)
+    return st.lists(st.one_of(plausible, plausible, anyhow), max_size=6)
 
 
 CHANNELS = entries_of(
-    "name address reg_type format scale offset error_value enum enum_titles readonly units word_order"
-    " byte_order write_address string_data_size consists_of"
+    "address format",
+    "name reg_type scale offset error_value enum enum_titles readonly units word_order byte_order"
+    " write_address string_data_size consists_of",
 )
-POINTS = entries_of("name type size sf units access symbols label")
+POINTS = entries_of("name type size", "sf units access symbols label")
 SENSORS = entries_of(
-    "name slave address input_type data_type swap scale offset nan_value count virtual_count scan_interval"
+    "name address",
+    "slave input_type data_type swap scale offset nan_value count virtual_count scan_interval",
 )
 ENTITIES = entries_of(
-    "name register_type address value_type bitmask offset filters lambda optionsmap register_count"
+    "address register_type",
+    "name value_type bitmask offset filters lambda optionsmap register_count",
 )
 ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), max_size=7), max_size=5)
 
