@@ -115,7 +115,11 @@ def _why_not(entry: ImportedRegister) -> str:
     except ValueError as refusal:
         return str(refusal)
     if entry.details.get("scale_register"):
-        return "" if not entry.is_written else "a register with a scale register is never written"
+        return (
+            ""
+            if not entry.is_written
+            else "a number whose power of ten is in another register is never written"
+        )
     return _refusal({register.name: register})
 
 

@@ -17,6 +17,7 @@ from multidrop.importers.sunspec import is_sunspec, read_sunspec
 from multidrop.importers.telegraf import read_telegraf
 from multidrop.importers.wb import json_without_comments, read_wb
 from multidrop.importers.yaml_text import parse_yaml
+from multidrop.printable import printable
 from multidrop.toml_check import parse_document
 
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
@@ -33,7 +34,8 @@ def read_devices(path: Path) -> list[ImportedDevice]:
     devices = all_devices(path)
     found = [device for device in devices if device.registers or device.texts]
     if not found:
-        reasons = "; ".join(map(str, [lost for device in devices for lost in device.lost][:3]))
+        lost = [printable(str(lost))[:200] for device in devices for lost in device.lost]
+        reasons = "; ".join(lost[:3])
         raise ValueError(f"{path} has no register that can be imported{reasons and f': {reasons}'}")
     return found
 
@@ -55,11 +57,10 @@ def all_devices(path: Path) -> list[ImportedDevice]:
         for device in devices:
             settle(device)
     except (KeyError, AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
-        raise ValueError(
-            f"{path} is not laid out as its kind of file is: {type(failure).__name__} {str(failure)[:200]}"
-        ) from failure
+        kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
+        raise ValueError(f"{path} is not laid out as its kind of file is: {kind}") from failure
     except ValueError as mistake:
-        raise ValueError(f"{path}: {mistake}") from mistake
+        raise ValueError(f"{path}: {printable(str(mistake))[:1000]}") from mistake
     return devices
 
 

@@ -28,7 +28,9 @@ _ALIASES = {  # of columns, in lower case
     "length": ("len", "length", "count"),
     "access": ("attribute", "access"),
 }
-_TYPE = re.compile(r"(u?int\d+|float|double)(be|le|sw|sb)")  # ioBroker's
+_TYPE = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's
+_BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
+_TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
 _SUFFIXES = {"be": "", "le": "DCBA", "sw": "CDAB", "sb": "BADC"}
 _TABLE_WORDS = {
     **{"holding": "holding", "input": "input", "coil": "coil", "discrete": "discrete"},
@@ -42,7 +44,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
         raise ValueError("has zero bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise ValueError("is empty")
+        raise ValueError("is empty: it has no line but comments")
     delimiter = max((",", ";", "\t"), key=lines[0].count)
     try:
         rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter))
@@ -120,8 +122,11 @@ def _text(device: ImportedDevice, register: ImportedRegister, length: str, kind:
         return
     register.details.pop("note", None)
     register.details["length"] = int(length[:6])
-    if kind == "stringle":
-        register.details["order"] = "BA"
+    if kind not in _TEXT_ORDERS:
+        device.lose(register.name, f"a text of the type {kind[:40]}")
+        return
+    if order := _TEXT_ORDERS[kind]:
+        register.details["order"] = order
     device.add(register, is_text=True)
 
 
@@ -135,6 +140,9 @@ def _number(
     order: str | None = None
     if (tag and tag.part) or kind in ("bit", "bool"):
         kind, register.details["part"] = "uint16", (tag.part if tag else "") or "0"
+    if kind in _BYTES:
+        register.details["part"] = _BYTES[kind]
+        kind = "int16" if kind.startswith("int") else "uint16"
     if match := _TYPE.fullmatch(kind):
         kind, order = match[1], _SUFFIXES[match[2]]
     found = number_format(kind)

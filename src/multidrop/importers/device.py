@@ -66,6 +66,7 @@ class ImportedDevice:
     texts: list[ImportedRegister] = field(default_factory=list)
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
+    readable: range = range(0)  # holding registers, of which any may be read across
     names: Names = field(default_factory=lambda: Names())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from multidrop.family_file.addresses import sent_as
+from multidrop.family_file.csv_table import MOST_BYTES
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.printable import printable
 
@@ -21,7 +22,10 @@ _ORDER = (
 
 
 def family_text(device: ImportedDevice, source: str) -> str:
-    """Return the text of a family file. It declares readings and texts alone: nothing in it writes."""
+    """Return the text of a family file. It declares readings and texts alone: nothing in it writes.
+
+    Raises ValueError where it would be longer than a family file may be.
+    """
     lines = [
         f"# Imported from {_comment(source)}: compare each line with the manual, and mend each `gap:`.",
         "# What could be written there is a reading here: make it a [setting] or a [command] once the manual",
@@ -32,6 +36,9 @@ def family_text(device: ImportedDevice, source: str) -> str:
         "counts_from = 0  # the addresses below are those that are sent",
         "# gap: baudrates, formats, together: what the manual says of the line",
     ]
+    if device.readable:
+        first, last = (sent_as(at, "holding") for at in (device.readable[0], device.readable[-1]))
+        lines.append(f"gaps = {{ holding = [{first}, {last}] }}")
     for section, registers in (("reading", device.registers), ("text", device.texts)):
         if registers:
             lines += ["", f"[{section}]"]
@@ -46,11 +53,23 @@ def family_text(device: ImportedDevice, source: str) -> str:
         lines += ["", "# Not carried over:"]
         lines += [f"# - {_comment(str(lost))}" for lost in device.lost[:MOST_LOST]]
         lines += [f"# - and {left} more"] if left > 0 else []
-    return "\n".join([*lines, ""])
+    text = "\n".join([*lines, ""])
+    if len(text.encode()) > MOST_BYTES:
+        raise ValueError(
+            f"the family file of {_comment(device.title)!r} would have more than {MOST_BYTES} bytes"
+        )
+    return text
 
 
 def plant_text(device: ImportedDevice, family_file: str) -> str:
-    """Return the text of a plant file with this device. Raises ValueError where its address is not known."""
+    """Return the text of a plant file with this device.
+
+    Raises ValueError where its address is not known, or where it has nothing that is polled.
+    """
+    if not device.registers:
+        raise ValueError(
+            "the device has texts alone, which are never polled: no plant file can be made of it"
+        )
     if device.address is None:
         raise ValueError("the file does not say the device's address: no plant file can be made of it")
     return "\n".join(

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
-from multidrop.drive.register import Access, Register
+from multidrop.drive.register import HOLDING, Access, Register
 from multidrop.drive.text import Text
 from multidrop.family_file.addresses import Counting
 from multidrop.family_file.registers import MOST_REGISTERS, Declared
 from multidrop.family_file.texts import MOST_TEXTS, texts_of
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.family_text import entry_line
-from multidrop.toml_check import TomlPlace
+from multidrop.toml_check import TomlPlace, parse_document
 
 _PLACE = Path("entry")
 
@@ -54,7 +53,7 @@ def declare(found: ImportedRegister, access: Access = Access.READING) -> Registe
     """Return the register that a family's file makes of this one. Raises ValueError with its reasons."""
     place = TomlPlace(_PLACE)
     declared = Declared(Counting(0), {}, "single")
-    ((name, given),) = tomllib.loads(entry_line(found)).items()
+    ((name, given),) = parse_document(entry_line(found).encode()).items()
     if access is not Access.READING:
         given |= found.of_writes
     declared.add(name, access, given, place, declared.counting.address)
@@ -70,7 +69,7 @@ def declare(found: ImportedRegister, access: Access = Access.READING) -> Registe
 def declare_text(found: ImportedRegister) -> Text:
     """Return the text that a family's file makes of this one. Raises ValueError with its reasons."""
     place = TomlPlace(_PLACE)
-    texts = texts_of(tomllib.loads(entry_line(found)), Counting(0), {}, place)
+    texts = texts_of(parse_document(entry_line(found).encode()), Counting(0), {}, place)
     if place.config_errors:
         label = f"{_PLACE}: [text] {found.name}: "
         raise ValueError("; ".join(mistake.removeprefix(label) for mistake in place.config_errors))
@@ -80,7 +79,8 @@ def declare_text(found: ImportedRegister) -> Text:
 def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
     """Take away what registers are to each other until one class holds them all."""
     by_name = {found.name: found for found in device.registers}
-    while wrong := _refused_together(held):
+    gaps = {HOLDING: device.readable} if device.readable else {}
+    while wrong := _refused_together({**held, "readable_gaps": gaps}):
         named = {name: sentence for name, sentence in wrong.items() if name in by_name}
         if not named:
             raise ValueError(f"its registers are not one family: {'; '.join(wrong.values())}")
@@ -95,10 +95,10 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
                 device.lose(name, sentence)
 
 
-def _refused_together(held: dict[str, Register[Any]]) -> dict[str, str]:
-    """Return why one class cannot hold these, by register; nothing where it can."""
+def _refused_together(members: dict[str, Any]) -> dict[str, str]:
+    """Return why one class cannot have these members, by register; nothing where it can."""
     try:
-        type("Imported", (Drive,), {"__doc__": "Of an importer.", **held})
+        type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:
         split = [mistake.partition(": ") for mistake in refusal.mistakes]
         return {name: sentence for name, _, sentence in split}

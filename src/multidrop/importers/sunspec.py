@@ -14,7 +14,8 @@ FIRST = 40000  # assumed: a model's place is not in its file
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
-    **{"int64": 1 << 63, "uint64": (1 << 64) - 1, "acc64": 0, "bitfield64": (1 << 64) - 1},
+    # As signed numbers: those of 64 bits do not fit into TOML otherwise.
+    **{"int64": -(1 << 63), "uint64": -1, "acc64": 0, "bitfield64": -1},
     **{"float32": math.nan, "float64": math.nan, "sunssf": 0x8000},
 }
 
@@ -40,6 +41,8 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
         with device.entry(str(point["name"])):
             _add(device, point, address, names)
         address += int(point["size"])
+    if FIRST < address <= 0x10000:
+        device.readable = range(FIRST, address)  # a model is one block without holes
     for register in device.registers:
         _tie(register, names)
     for repeated in group.get("groups", []):
