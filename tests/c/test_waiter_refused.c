@@ -1,4 +1,4 @@
-/* Waiting as this system can, and where the system refuses epoll_pwait2(), as old kernels and some containers do. */
+/* Waiting as this system can, and where it refuses epoll_pwait2(), as old kernels and some containers do. */
 #define _GNU_SOURCE
 #include "internal.h"
 

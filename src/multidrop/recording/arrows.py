@@ -56,7 +56,9 @@ class ArrowsWriter(AppendingWriter):
     def _append_message(self, source: Any) -> None:
         self._message.seek(0)
         self._encoder.write_stream(source)
-        self._append(self._message.getbuffer()[: self._message.tell()])
+        # Released here: a view that an exception's traceback keeps would forbid the next message.
+        with self._message.getbuffer() as room, room[: self._message.tell()] as message:
+            self._append(message)
 
     def close(self) -> None:
         self._encoder.release()
