@@ -94,6 +94,28 @@ def test_a_family_that_ships_as_a_file_is_checked_by_its_name(run: Run) -> None:
     assert "No mistake found in abb-acs355" in words(out)
 
 
+def test_a_name_that_is_no_file_is_told_what_to_do(run: Run, tmp_path: Path) -> None:
+    assert "see `multidrop models innovert-ibd`" in run("check", "innovert-ibd")[2]
+    assert "did you mean abb-acs355" in run("check", "abb-acs35")[2]
+    (tmp_path / "plant.toml").write_text('[[line]]\nname = "L"\n')
+    (line,) = run("check", tmp_path / "plant.toml")[2].splitlines()
+    assert line.endswith("is a plant file, as its [[line]] says, which `multidrop plan` checks")
+
+
+def test_a_sheet_is_read_beside_the_manual(run: Run, tmp_path: Path) -> None:
+    """Bits by their numbers, words in hex, names apart from sentences; a watchdog only of what moves."""
+    _, out, _ = run("check", "abb-acs355")
+    assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
+    assert "verbs alone write it, but for 047EH, 047CH, 0476H" in words(out)
+    assert "state running forward when forward (" in words(run("check", DATA / "enum.toml")[1])
+    assert "watchdog" in run("models", DATA / "coil.toml")[1]
+    path = write_meter(tmp_path)
+    assert "watchdog" not in run("models", path)[1]
+    with path.open("a") as file:
+        file.write("[text]\nserial_number = { at = '30500', length = 4 }\n")
+    assert "01F3H serial_number input register 8 characters" in words(run("models", path)[1])
+
+
 def test_check_prints_json(run: Run, fan: Path) -> None:
     status, out, _ = run("check", fan, "--json")
     found = json.loads(out)

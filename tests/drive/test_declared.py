@@ -108,7 +108,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "part = (7, 4) is the wrong way round, or below bit 0": {"part": (7, 4)},
     "part = (-1, 4) is the wrong way round, or below bit 0": {"part": (-1, 4)},
     "part = 3 is not the lowest and the highest bit, such as (0, 7)": {"part": 3},
-    "part = (0, 16) is beyond the 16 bits of its number": {"part": (0, 16)},
+    "its part ends at bit 16, and its number has bits 0 to 15": {"part": (0, 16)},
     "part is for whole numbers, not for number_format = F32": {
         "part": (0, 3),
         "number_format": NumberFormat.F32,

@@ -142,7 +142,7 @@ def test_a_text_that_no_request_reads_is_refused(details: tuple[int, int], sente
 def test_a_text_s_other_mistakes() -> None:
     with pytest.raises(ValueError, match="order = 'CDAB' of a text is none of 'AB', 'BA' and 'B'"):
         text(1, 2, order="CDAB")
-    with pytest.raises(ValueError, match="a text is in HOLDING or INPUT registers"):
+    with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):
         text(1, 2, table=COIL)
     with pytest.raises(DeclarationError, match="bus: this is a name that every drive has"):
         type("Wrong", (Drive,), {"bus": text(1, 2)})
@@ -170,5 +170,5 @@ def test_the_command_line_prints_texts_and_what_has_no_value(run: Run, tmp_path:
         "serial": {"value": "EM3-0042"},
     }
     told = run("models", model)[1]
-    assert "0014H  serial  8 characters  section 2" in told
+    assert "0014H  serial  input register  8 characters  section 2" in told
     assert "no value: 7FFFH" in told

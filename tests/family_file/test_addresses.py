@@ -67,8 +67,11 @@ def test_what_is_sent_of_a_cell(cell: str, counts_from: int | None, sent: tuple[
         ("FFFFFH", "FFFFFH is outside 0 to FFFFH"),
         ("40000", '"40000" is outside "40001" to "465536"'),
         ("465537", '"465537" is outside "400001" to "465536"'),
-        (40017, '40017 may be the number 40017, or the 17. of table holding; write "9C51H" for that number'),
-        (400017, "400017 may be the number 400017, or the 17. of table holding; write a smaller number"),
+        (
+            40017,
+            '40017 may be the number 40017, or register 17 of table holding; write "9C51H" for that number',
+        ),
+        (400017, "400017 may be the number 400017, or register 17 of table holding; write a smaller number"),
     ],
 )
 def test_what_is_refused(given: Any, sentence: str) -> None:
@@ -96,7 +99,7 @@ def test_a_digit_that_contradicts_its_table() -> None:
     [
         ("1E10", "1E10 is a power of ten, which a spreadsheet makes of hex; write 1E10H"),
         ("1.00E+10", "is a power of ten"),
-        ("40001", "40001 may be the number 40001, or the 1. of table holding"),
+        ("40001", "40001 may be the number 40001, or register 1 of table holding"),
         ("4x0001", '"4x0001" is no address'),
         ("\uff19", "is no address"),
         ("1" * 400, "is outside 0 to FFFFH"),

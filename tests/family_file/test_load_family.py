@@ -173,7 +173,7 @@ TOLD = [
     "twenty.toml: [reading] speed: unknown key 'stepp'; did you mean 'step'?",
     'twenty.toml: [reading] voltage: at: "40001" begins with 4, which is table holding, and table is '
     '"input"; leave table out, or write the number that its table has',
-    "twenty.toml: [reading] level: at: 40002 may be the number 40002, or the 2. of table holding; write "
+    "twenty.toml: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; write "
     '"9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without counts_from) '
     "for that of the table",
     'twenty.toml: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
@@ -213,7 +213,10 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
         ("[family", ["t.toml: is not TOML: "]),
         (HEAD, ["t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"]),
         (HEAD + "[readings]\na = { at = 1 }\n", ["t.toml: unknown key 'readings'; did you mean 'reading'?"]),
-        ('[[line]]\nname = "L"\n', ["t.toml: is a plant file, as its [[line]] says"]),
+        (
+            '[[line]]\nname = "L"\n',
+            ["is a plant file, as its [[line]] says, which `multidrop plan` checks"],
+        ),
         (HEAD + "[reading]\na = 5\n", ["t.toml: [reading] a: 5 is no register; write { at = 0x0010"]),
         (HEAD + "[reading]\na = {}\n", ["t.toml: [reading] a: its address is missing; add at = 0x2000"]),
         (
@@ -258,6 +261,7 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
             ["gaps: input = [9, 1] is the wrong"],
         ),
         (HEAD + "silence = '2 s'\n[reading]\na = { at = 1 }\n", ["silence = '2 s' is more than 1 s"]),
+        (HEAD + "framings = ['tcp']\n[reading]\na = { at = 1 }\n", ["'tcp' is none of rtu, ascii"]),
         (HEAD + "framings = ['delixi']\n[reading]\na = { at = 1 }\n", ["'delixi' is none of rtu, ascii"]),
         (
             HEAD + "exceptions = { 300 = 'x' }\n[reading]\na = { at = 1 }\n",
@@ -343,7 +347,7 @@ def test_all_cells_of_a_csv_file(tmp_path: Path) -> None:
 
 def test_what_is_no_file(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "none.toml", Path("/dev/zero")):
-        with pytest.raises(FamilyError, match="there is no such file to read the family's file from"):
+        with pytest.raises(FamilyError, match="there is no such file"):
             load_family(path)
 
 
@@ -374,7 +378,10 @@ def test_texts(tmp_path: Path) -> None:
         ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
         ("a = { at = 1, length = 126 }", "a text of 126 registers: one request reads 1 to 125"),
         ("a = { at = 1, length = 2, order = 'CDAB' }", "order = 'CDAB' of a text"),
-        ("a = { at = '00001', length = 2 }", "a text is in HOLDING or INPUT registers"),
+        (
+            "a = { at = '00001', length = 2 }",
+            "in holding or input registers, and 'coil' is neither",
+        ),
         ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
     ],
 )

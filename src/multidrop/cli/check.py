@@ -17,7 +17,8 @@ from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register
 from multidrop.drive.verbs import MOVING
-from multidrop.drives.registry import SHIPPED, shipped_family
+from multidrop.drives import MODELS
+from multidrop.drives.registry import find_model
 from multidrop.family_file.loader import FamilyError, load_family
 from multidrop.family_file.step_words import declared_in_words
 
@@ -33,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     try:
-        name = str(arguments.file)
-        family = shipped_family(name) if name in SHIPPED else load_family(arguments.file)
+        family = _family(arguments.file)
     except FamilyError as wrong:
         if arguments.json:
             print_text(json.dumps({"mistakes": wrong.mistakes}, indent=2))
@@ -61,11 +61,21 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _family(file: Path) -> type[Drive]:
+    """Return the family of a file, or a shipped one by its name. Raises ValueError for any other."""
+    name = str(file)
+    if name in MODELS:
+        raise ValueError(f"{name} is built in, and no file declares it; see `multidrop models {name}`")
+    is_name = not file.suffix and not file.exists()
+    return find_model(name) if is_name else load_family(file)
+
+
 def _lines(remarks: list[Remark]) -> Iterator[str]:
     if not remarks:
         yield "  nothing"
+    width = max([INDENT, *(len(name) + 2 for name, _ in remarks)])
     for name, sentence in remarks:
-        yield from wrapped(sentence, f"  {name:<{INDENT}}", " " * (INDENT + 2))
+        yield from wrapped(sentence, f"  {name:<{width}}", " " * (width + 2))
 
 
 def _verdict(family: type[Drive], file: Path) -> str:

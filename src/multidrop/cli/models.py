@@ -7,11 +7,12 @@ import inspect
 import json
 import math
 from collections.abc import Iterator
+from enum import Flag
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import aligned, wrapped
+from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit, stated_limit
@@ -80,12 +81,13 @@ def sheet(family: type[Drive]) -> str:
     for heading, entries in (("exceptions", exceptions), ("options", options)):
         if entries:
             lines += ["", heading]
+            width = max(map(len, entries))
             for name, meaning in entries.items():
-                lines += wrapped(meaning, f"  {name}  ", " " * 8)
+                lines += wrapped(meaning, f"  {name:<{width}}  ", " " * 8)
     for table in dict.fromkeys(register.table for register in family.registers.values()):
         lines += ["", _table_heading(table, family), *_registers(family, table)]
     if family.texts:
-        lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<")]
+        lines += ["", "texts (read on demand)", *aligned(map(_text_row, family.texts.values()), "<<<<<")]
     if family.__doc__:
         lines.append("")
         for line in inspect.cleandoc(family.__doc__).splitlines():
@@ -118,7 +120,8 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
         yield "line", family.line_parameters
     if family.remote != Drive.remote:
         yield "remote", family.remote
-    yield "watchdog", family.watchdog
+    if _verbs(family) or "confirmed" in family.options or family.watchdog != Drive.watchdog:
+        yield "watchdog", family.watchdog
 
 
 def _gain(family: type[Drive]) -> ReadingGain | None:
@@ -199,7 +202,8 @@ def _row(register: Register[Any]) -> tuple[str, ...]:
 
 
 def _text_row(text: Text) -> tuple[str, ...]:
-    return f"  {text.address:04X}H", text.name, f"{2 * text.length} characters", text.place
+    length = text.length * (1 if text.order == "B" else 2)
+    return f"  {text.address:04X}H", text.name, text.table.name, f"{length} characters", text.place
 
 
 def _remarks(register: Register[Any]) -> Iterator[str]:
@@ -221,15 +225,27 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
     if register.moves is not None:
         yield "a write may move the motor" if register.moves else "a write moves nothing"
     if register.harmless is not None:
-        harmless = ", ".join(register.format(register.decode(raw)) for raw in register.harmless)
+        harmless = ", ".join(_word(register, raw) for raw in register.harmless)
         yield f"verbs alone write it, but for {harmless}" if harmless else "verbs alone write it"
     if register.never_together:
         yield "never together: " + ", ".join(_bits(register, mask) for mask in register.never_together)
     if register.never:
         yield f"never written: {register.never}"
     if register.values is not None:
-        yield ", ".join(f"{member.value} {member.name}" for member in register.values)
+        yield ", ".join(_member(member) for member in register.values)
     yield from (text.rstrip(".") for text in (register.note, register.outside, register.place) if text)
+
+
+def _word(register: Register[Any], raw: int) -> str:
+    """Return the name of a raw count, or the word where the names of its bits would fill lines."""
+    name = register.format(register.decode(raw))
+    return name if len(name) <= 2 * LONGEST_NAME else f"{raw:04X}H"
+
+
+def _member(member: Any) -> str:
+    if isinstance(member, Flag) and member.value.bit_count() == 1:
+        return f"bit {member.value.bit_length() - 1} {member.name}"
+    return f"{member.value} {member.name}"
 
 
 def _number(register: Register[Any]) -> Iterator[str]:

@@ -50,7 +50,7 @@ def _part(register: Register[Any]) -> Iterator[str]:
         yield f"part is for whole numbers, not for number_format = {register.number_format.name}"
     elif register.part[1] >= width(register.number_format):
         bits = width(register.number_format)
-        yield f"part = ({register.part[0]}, {register.part[1]}) is beyond the {bits} bits of its number"
+        yield f"its part ends at bit {register.part[1]}, and its number has bits 0 to {bits - 1}"
     if register.access is not Access.READING:
         yield "a part is never written, as the other bits of its word would be too: declare a reading"
 

@@ -34,7 +34,8 @@ class Text:
         if self.order not in _ORDERS:
             raise ValueError(f"order = {self.order!r} of a text is none of 'AB', 'BA' and 'B'")
         if not isinstance(self.table, Table) or self.table.read not in (0x03, 0x04):
-            raise ValueError(f"a text is in HOLDING or INPUT registers, not in {self.table!r}")
+            other = self.table.name if isinstance(self.table, Table) else self.table
+            raise ValueError(f"a text is in holding or input registers, and {other!r} is neither")
 
     def __set_name__(self, owner: type, name: str) -> None:
         if not self.name:

@@ -95,7 +95,7 @@ def _ambiguous(text: str, number: int) -> str:
     table = _TABLE_OF_DIGIT[text[0]]
     numbered = int(text[1:])
     return (
-        f"{text} may be the number {text}, or the {numbered}. of table {table}; write {right}, "
+        f"{text} may be the number {text}, or register {numbered} of table {table}; write {right}, "
         f'or "{text}" in quotes in the TOML file (in a CSV file without counts_from) for that of the table'
     )
 

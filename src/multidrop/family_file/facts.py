@@ -122,7 +122,7 @@ def _by_framing(formats: Any, framings: tuple[Framing, ...], place: TomlPlace) -
 
 
 def _framings(value: list[Any]) -> tuple[Framing, ...]:
-    known = {str(framing): framing for framing in Framing if framing is not Framing.DELIXI}
+    known = {str(framing): framing for framing in (Framing.RTU, Framing.ASCII)}
     wrong = [each for each in value if not isinstance(each, str) or each.lower() not in known]
     if wrong:
         raise ValueError(f"{shown(wrong[0])} is none of {', '.join(known)}")

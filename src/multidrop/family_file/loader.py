@@ -95,7 +95,7 @@ def _bytes(path: Path, what: str) -> bytes:
     """Return a file's bytes; ValueError, without the path, for what is no file or too long."""
     try:
         if not path.is_file():
-            raise ValueError(f"there is no such file to read the {what} from")
+            raise ValueError("there is no such file")
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as failure:
@@ -120,6 +120,9 @@ def _family(
     document: Mapping[str, Any], path: Path, place: TomlPlace, files: dict[Path, bytes]
 ) -> type[Drive] | None:
     """Return the class; None where anything is wrong."""
+    if "line" in document:
+        place.wrong("is a plant file, as its [[line]] says, which `multidrop plan` checks")
+        return None
     _check_sections(document, place)
     of_family = place.within("[family]")
     of_document = document.get("family", {})
@@ -138,7 +141,7 @@ def _family(
         )
     texts = texts_of(document.get("text", {}), counting, declared.places, place)
     options = _options(document.get("option", {}), declared.places, place)
-    if not declared.places and not texts and not given.get("registers"):
+    if not declared.places and not document.get("text") and not given.get("registers"):
         place.wrong("declares no register; add [reading] and NAME = { at = 0x0010 }")
     if len(declared.places) > MOST_REGISTERS:
         place.wrong(f"declares more than {MOST_REGISTERS} registers; leave out those that nobody reads")
@@ -175,12 +178,10 @@ def _base(profile: str | None, document: Mapping[str, Any], place: TomlPlace) ->
 
 
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
-    if "line" in document:
-        place.wrong("is a plant file, as its [[line]] says; a family's file has [family] and [reading]")
     sections = dict.fromkeys(SECTIONS)
-    if unknown := {name: None for name in document if name not in (*SECTIONS, "line")}:
+    if unknown := {name: None for name in document if name not in SECTIONS}:
         place.unknown(unknown, sections)
-    if "family" not in document and "line" not in document:
+    if "family" not in document:
         place.wrong("has no [family]; add it, with the title and the manual")
 
 
