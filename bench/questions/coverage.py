@@ -42,7 +42,7 @@ def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
 
 
 class Coverage:
-    """What came of each entry of some devices."""
+    """Counts of what came of the entries of some devices."""
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]

@@ -1,4 +1,4 @@
-"""What a family holds of a device that an importer read, entry by entry, as the library itself decides."""
+"""Find the entries of an imported device that a family holds, as the library itself decides."""
 
 from __future__ import annotations
 

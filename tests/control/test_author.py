@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from simulated_bus import SimulatedBus, one
@@ -120,7 +121,8 @@ def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
 def test_a_name_that_would_spoil_the_log_is_refused(audited: Audited, who: str) -> None:
     with pytest.raises(ValueError, match="is not 1 to 200 printable characters"), written_by(who):
         audited.drive.set_frequency(20)
-    with pytest.raises(TypeError, match="way = 7 is no text"), written_by("anna", 7):  # type: ignore[arg-type]
+    way: Any = 7
+    with pytest.raises(TypeError, match="way = 7 is no text"), written_by("anna", way):
         audited.drive.set_frequency(20)
     assert audited.hall.written == []
 

@@ -72,7 +72,7 @@ def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
 
 @pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
 def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) -> None:
-    """Where nothing is stated the server refuses whatever the file does not declare."""
+    """The server refuses whatever the file does not declare."""
     assert len(HELD) == 40
     family = family_file(tmp_path, stated=stated)
     rows: list[Row] = []

@@ -67,7 +67,7 @@ class ImportedDevice:
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
     readable: range = range(0)  # holding registers, of which any may be read across
-    names: Names = field(default_factory=lambda: Names())
+    names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
         """Add a register under a name that no other has; what cannot be one is lost."""
@@ -101,7 +101,7 @@ class ImportedDevice:
             self.lose(name, f"it cannot be read: {type(failure).__name__} {str(failure)[:100]}")
 
 
-class Names:
+class UniqueNames:
     """Names for Python that are as near as can be to what was spelt, each given once."""
 
     def __init__(self, taken: Collection[str] = _TAKEN) -> None:
@@ -133,7 +133,7 @@ def names_of(pairs: Mapping[str, Any]) -> dict[str, int]:
 
     Two of one number are one: the first name stands.
     """
-    names, found = Names(OF_ENUMERATIONS), dict[str, int]()
+    names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
     for spelt, number in pairs.items():
         if isinstance(number, bool) or not isinstance(number, int) or number in found.values():
             continue
