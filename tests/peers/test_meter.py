@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from lines import rows_of, until
+from lines import HOST_LATE, rows_of, until
 from meter import ADDRESSES
 from peers import require_module
 from ptys import linked_ptys
@@ -80,7 +80,7 @@ def test_all_40_values_of_a_poll_are_the_server_s(tmp_path: Path, stated: bool) 
         plant = load_plant(plant_file(tmp_path, port, family))
         with Poller(plant) as poller:
             until(lambda: rows.extend(rows_of(poller)) or len(rows) > 400)
-    assert {row.status for row in rows} <= {"ok", "no reply"}  # of a busy machine
+    assert {row.status for row in rows} <= {"ok"} | HOST_LATE
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 

@@ -73,9 +73,9 @@ class Decoder:
             raise ValueError("there are names of no column")
         count, (_, ends, text) = _parts(table, body, 3)
         _check_text(ends, text)
-        places = ends[: 4 * (count + 1)].cast("i") if count else [0]
-        if len(places) != count + 1:
+        if count and len(ends) < 4 * (count + 1):
             raise ValueError("its lengths do not fit together")
+        places = ends[: 4 * (count + 1)].cast("i") if count else [0]
         names = []
         for begin, end in pairwise(places):
             if not 0 <= begin <= end <= len(text):
