@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 from commands import Run, running
@@ -33,6 +34,25 @@ def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: 
         status, shown, _ = run("read", port, "innovert-ibd", "1", "output_current")
         assert status == 0
         assert "output_current" in shown
+
+
+def test_a_port_of_this_machine_is_served_as_the_plant_names_it(tmp_path: Path, run: Run) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    plant = tmp_path / "plant.toml"
+    plant.write_text(PLANT.format(port=port))
+    with running("simulate", plant, "--unpaced") as (_, said):
+        assert said.readline() == f"ready net {port}\n"
+        assert "output_current" in run("read", plant, "pump", "output_current")[1]
+
+
+def test_a_pseudo_terminal_needs_a_place(tmp_path: Path, run: Run) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(PLANT.format(port="/dev/ttyUSB0"))
+    assert run("simulate", plant)[::2] == (
+        2,
+        "multidrop: line net gets a pseudo-terminal: name a directory for it with --ports DIR\n",
+    )
 
 
 def test_scan_finds_drives_behind_a_gateway_and_writes_their_plant(tmp_path: Path, run: Run) -> None:

@@ -83,6 +83,15 @@ def test_each_switch_of_settings_adds_its_time() -> None:
     assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
 
 
+def test_a_network_port_has_nothing_to_switch() -> None:
+    drives = [InvtCHE(1, baudrate=9600), InvtCHE(2, baudrate=19200)]
+    for drive in drives:
+        drive.take_framing_of("tcp://10.0.0.7")
+    exchanges = [each for drive in drives for each in asked(drive, None, "output_frequency")]
+    assert predict(exchanges).switches == 0
+    assert predict(exchanges, switching=0.01).cycle == predict(exchanges).cycle
+
+
 def test_a_suggestion_reckons_with_the_switching() -> None:
     drives = [ErmanERG220(1), YD1000(2)]
     exchanges = [it for drive in drives for it in asked(drive, 0.06, "output_frequency")]

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from multidrop.cli.support.output import print_text
 from multidrop.drive.network import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
-from multidrop.sim import FaultyWire, Simulator, Wire, load_faults, serve, simulated
+from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 
-ANY_TCP = "tcp://127.0.0.1:0"  # for a line on tcp://: any free port of this machine
+ANY_TCP = "tcp://127.0.0.1:0"  # for a line on another machine: any free port of this one
+LOOPBACK = ("127.0.0.1", "localhost")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "plant", metavar="PLANT.toml", help="the drives; each line's port is ignored, but for tcp://"
+        "plant",
+        metavar="PLANT.toml",
+        help="the drives; each line's port is ignored, but for tcp:// of this machine",
     )
     parser.add_argument(
-        "--ports", metavar="DIR", type=Path, required=True, help="where a link to each line's port is put"
+        "--ports",
+        metavar="DIR",
+        type=Path,
+        help="where a link to each line's port is put; needed where a line is not on tcp://",
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
     parser.add_argument("--faults", metavar="FILE", help="what befalls the bytes, as said below")
@@ -31,24 +38,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
     faults = load_faults(arguments.faults) if arguments.faults else Faults()
-    if arguments.ports.exists() and not arguments.ports.is_dir():
-        raise ValueError(
-            f"{arguments.ports} is a file: name a directory with --ports, which is made if need be"
-        )
-    arguments.ports.mkdir(parents=True, exist_ok=True)
-    serve([_wire(line, arguments.ports, faults, arguments.unpaced) for line in plant.lines], _announce)
+    directory: Path | None = arguments.ports
+    if directory is None and (serial := [line.name for line in plant.lines if not speaks_tcp(line.port)]):
+        raise ValueError(f"line {serial[0]} gets a pseudo-terminal: name a directory for it with --ports DIR")
+    if directory is not None and directory.exists() and not directory.is_dir():
+        raise ValueError(f"{directory} is a file: name a directory with --ports, which is made if need be")
+    ports = [_port(line, directory) for line in plant.lines]
+    if directory is not None:
+        directory.mkdir(parents=True, exist_ok=True)
+    wires = [
+        FaultyWire(_drives(line), faults, name=line.name, port=port, unpaced=arguments.unpaced)
+        for line, port in zip(plant.lines, ports, strict=True)
+    ]
+    serve(wires, _announce)
     return 0
 
 
-def _wire(line: PlantLine, directory: Path, faults: Faults, unpaced: bool) -> Wire:
+def _drives(line: PlantLine) -> list[SimulatedDrive]:
+    return [simulated(polled.drive) for polled in line.drives]
+
+
+def _port(line: PlantLine, directory: Path | None) -> str:
+    """Return the port that simulates a line's; ValueError where a link cannot be made."""
+    if speaks_tcp(line.port):
+        url = urlsplit(line.port)
+        return line.port if url.hostname in LOOPBACK and url.port else ANY_TCP
+    assert directory is not None
     link = directory / line.name
     if link.parent != directory:
         raise ValueError(f"line {line.name!r} has a / in its name, which the link to its port cannot have")
     if link.is_symlink() or link.exists():
         raise ValueError(f"{link} is there already: remove it, or choose another directory with --ports")
-    drives = [simulated(polled.drive) for polled in line.drives]
-    port = ANY_TCP if speaks_tcp(line.port) else str(link)
-    return FaultyWire(drives, faults, name=line.name, port=port, unpaced=unpaced)
+    return str(link)
 
 
 def _announce(simulator: Simulator) -> None:

@@ -51,8 +51,13 @@ def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
 
     `switching` is the time that the port takes to change baud rate or format once the silence is over.
     """
-    switched = switching if before.settings != after.settings else 0.0
+    switched = switching if switches(before, after) else 0.0
     return max(silence(before), silence(after)) + switched
+
+
+def switches(before: Drive, after: Drive) -> bool:
+    """Return True where the port changes baud rate or format between them; a network port has none."""
+    return before.settings != after.settings and Framing.TCP not in (before.framing, after.framing)
 
 
 def kind(drive: Drive) -> tuple[float, str]:
@@ -81,5 +86,5 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
     """Return the cost of visiting a drive between two others: ns, which compare well, and switches."""
     seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
-    switches = sum(one.settings != other.settings for one, other in pairwise((before, drive, after)))
-    return round(seconds * 1e9), switches - (before.settings != after.settings)
+    more = sum(switches(one, other) for one, other in pairwise((before, drive, after)))
+    return round(seconds * 1e9), more - switches(before, after)

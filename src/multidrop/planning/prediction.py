@@ -15,7 +15,7 @@ from multidrop.core import build_request, characters_on_wire, reply_length
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Planned
-from multidrop.planning.bus_time import gap, in_order, kind, sending, silence
+from multidrop.planning.bus_time import gap, in_order, kind, sending, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # s of each exchange in which a common machine wakes up and writes the request
@@ -106,11 +106,11 @@ def predict(
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
-    cycle, switches, before = 0.0, 0, jobs[-1].planned.drive
+    cycle, switched, before = 0.0, 0, jobs[-1].planned.drive
     for job in jobs:
         drive = job.planned.drive
         cycle += job.own + gap(before, drive, switching)
-        switches += drive.settings != before.settings
+        switched += switches(before, drive)
         before = drive
         groups.setdefault((drive, job.planned.every), []).append(job)
     if has_rests:
@@ -126,7 +126,7 @@ def predict(
         for (drive, every), group in groups.items()
     ]
     utilisation = load if has_rests or not turn else max(load, 1.0)
-    return Prediction(cycle, switches, utilisation, tuple(rates))
+    return Prediction(cycle, switched, utilisation, tuple(rates))
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
