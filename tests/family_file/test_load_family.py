@@ -383,6 +383,7 @@ def test_texts(tmp_path: Path) -> None:
             "in holding or input registers, and 'coil' is neither",
         ),
         ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
+        ("name = { at = 1, length = 2 }", "[text] name: every drive has this name for something else"),
     ],
 )
 def test_mistakes_of_texts(tmp_path: Path, entry: str, told: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from multidrop.drive.family import TAKEN_NAMES
 from multidrop.drive.text import Text, text
 from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.names import unusable
@@ -37,10 +38,12 @@ def texts_of(
         why = unusable(name)
         if why:
             at.wrong(f"{shown(name)} cannot be a text's name: {why}")
+        elif name in TAKEN_NAMES:
+            at.wrong("every drive has this name for something else; call it otherwise")
         elif name in registers:
             at.wrong("a register has this name too; call one of the two otherwise")
         declared = _text(at.check(given, TEXT_KEYS), counting, at)
-        if declared is not None and not why:
+        if declared is not None and not why and name not in TAKEN_NAMES:
             found[name] = declared
     return found
 
