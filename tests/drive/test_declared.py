@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import Any
 
 import pytest
@@ -113,6 +113,17 @@ PARTS: dict[str, dict[str, Any]] = {
         "part": (0, 3),
         "number_format": NumberFormat.F32,
     },
+    "FAR = 131072 is not within 0 to 65535, which its number can be": {
+        "what": IntFlag("Bits", {"FAR": 1 << 17})
+    },
+    "HIGH = 16 is not within 0 to 15, which its number can be": {
+        "what": IntFlag("Bits", {"HIGH": 16}),
+        "part": (4, 7),
+    },
+    "LOW = -1 is not within 0 to 15, which its number can be": {
+        "what": IntEnum("Names", {"LOW": -1}),
+        "part": (4, 7),
+    },
     "part is for numbers in words, and a coil holds none": {"part": (0, 0), "table": COIL},
     "number_format = U32_EITHER leaves its words open": {
         "invalid": 1,
@@ -127,7 +138,8 @@ PARTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("mistake", PARTS)
 def test_a_mistake_of_a_reading_is_told(mistake: str) -> None:
-    (sentence,) = told(level=reading(5, **PARTS[mistake]))
+    details = dict(PARTS[mistake])
+    (sentence,) = told(level=reading(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
 
 

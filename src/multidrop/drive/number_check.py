@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import IntFlag
+from fractions import Fraction
 from typing import Any
 
 from multidrop.core import NumberFormat
@@ -25,6 +27,7 @@ def number_errors(register: Register[Any]) -> Iterator[str]:
     yield from _order(register)
     yield from _part(register)
     yield from _invalid(register)
+    yield from _named(register)
     if register.number_format is NumberFormat.I8 and register.access is not Access.READING:
         yield "number_format = I8 is one byte of a word, whose other byte is not known: it is never written"
 
@@ -53,6 +56,18 @@ def _part(register: Register[Any]) -> Iterator[str]:
         yield f"its part ends at bit {register.part[1]}, and its number has bits 0 to {bits - 1}"
     if register.access is not Access.READING:
         yield "a part is never written, as the other bits of its word would be too: declare a reading"
+
+
+def _named(register: Register[Any]) -> Iterator[str]:
+    """Find names that the register cannot show: a look for a fault would wait for it in vain."""
+    if register.values is None or (register.part is not None and register.number_format not in _PARTED):
+        return
+    least, most = register.coding.raw_span
+    if issubclass(register.values, IntFlag):  # its highest bit too, of a signed number
+        least, most = Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
+    for member in register.values:
+        if not least <= member.value <= most:
+            yield f"{member.name} = {member.value} is not within {least} to {most}, which its number can be"
 
 
 def _invalid(register: Register[Any]) -> Iterator[str]:
