@@ -175,6 +175,12 @@ EDITS: dict[str, tuple[Change, str]] = {
         step("start", 8, value={"forward": 0x047F, "reverse": 0x047D, "without": "as it turns"}),
         "cannot tell how it turns",
     ),
+    "a jog with the word that starts": (
+        lambda document: document["verb"].update(
+            jog={"steps": [steps("start")(document)[0], WRITE_047F, {"started": True}]}
+        ),
+        "jog word 047FH starts the motor, as 047FH does",
+    ),
     "reset writes nothing": (without("reset_fault", 1), "writes nothing"),
     "reset awaits that it runs": (inserted("reset_fault", 3, {"started": True}), "belongs to a start"),
     "reset has directions": (
@@ -204,6 +210,13 @@ EDITS: dict[str, tuple[Change, str]] = {
             document["look"]["stands"][1].update(below=30),
         ),
         "in hz for a standstill",
+    ),
+    "a stop look at a frequency that the device scales": (
+        lambda document: (
+            document["reading"]["output_frequency"].update(scale_register="power"),
+            document["reading"].update(power={"at": "40102", "number_format": "I16"}),
+        ),
+        "whose scale the device may change",
     ),
     "a stop look at a signed part of the frequency": (
         lambda document: document["reading"]["output_frequency"].update(number_format="I16", part=[0, 14]),
@@ -272,6 +285,14 @@ EDITS: dict[str, tuple[Change, str]] = {
     "a setpoint is broadcast": (
         lambda document: document["command"]["reference"].update(broadcast=[0, 20000]),
         "only 0",
+    ),
+    "a setpoint that falls as its count rises": (
+        lambda document: document["command"]["reference"].update(step=-0.005, number_format="I16"),
+        "its count 0 is to be 0",
+    ),
+    "a setpoint whose count 0 is not 0": (
+        lambda document: document["command"]["reference"].update(offset=-50),
+        "its count 0 is to be 0",
     ),
     "100 % of nothing": (section("set_frequency", of="nothing"), "neither an option nor"),
 }

@@ -261,6 +261,8 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
             ["gaps: input = [9, 1] is the wrong"],
         ),
         (HEAD + "silence = '2 s'\n[reading]\na = { at = 1 }\n", ["silence = '2 s' is more than 1 s"]),
+        (HEAD + "response_timeout = '11 s'\n[reading]\na = { at = 1 }\n", ["'11 s' is more than 10 s"]),
+        (HEAD + "[reading]\nstart = { at = 1 }\n", ["[reading] start: this is a name that every drive has"]),
         (HEAD + "framings = ['tcp']\n[reading]\na = { at = 1 }\n", ["'tcp' is none of rtu, ascii"]),
         (HEAD + "framings = ['delixi']\n[reading]\na = { at = 1 }\n", ["'delixi' is none of rtu, ascii"]),
         (

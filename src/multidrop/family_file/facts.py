@@ -43,7 +43,7 @@ _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": 
 _TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
 MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
-LONGEST_WAIT = 60.0  # s
+LONGEST_WAIT = 10.0  # s; a stop of any drive on the line may have to wait for it
 _LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
 

@@ -87,6 +87,8 @@ def _nearly_zero(criterion: Criterion, register: Register[Any], is_motion: bool)
     most, name, unit = NEARLY_ZERO.get(register.unit), criterion.register, register.unit
     if most is None and is_motion:
         yield f"takes {name} in {unit or 'no unit'} for a standstill; it is to be in {', '.join(NEARLY_ZERO)}"
+    if is_motion and register.scale_register:
+        yield f"takes {name} for a standstill, whose scale the device may change: look at another register"
     if most is None or register.values is not None:
         return
     if criterion.values is not None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from multidrop.drive.family import TAKEN_NAMES
 from multidrop.drive.register import HOLDING_MULTIPLE, Access, Carrier, Register, command, reading, setting
 from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.names import enumeration, flags, unusable
@@ -69,6 +70,9 @@ class Declared:
         """Note the name's place; False where it cannot be used."""
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
+            return False
+        if name in TAKEN_NAMES:  # a verb of the file would take its place without a word
+            place.wrong("this is a name that every drive has for something else; call it otherwise")
             return False
         if name in self.places:
             first = self.places[name]

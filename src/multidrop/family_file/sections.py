@@ -103,6 +103,8 @@ def _not_a_setpoint(name: str, register: Register[Any]) -> list[str]:
         )
     if register.unit not in ("Hz", "%") or register.step is None:
         wrong.append(f"{name} is in {register.unit or 'no unit'}: a setpoint is in Hz or %, with its step")
+    if (register.step or 0) < 0 or register.offset:
+        wrong.append(f"{name} has a step below 0 or an offset: its count 0 is to be 0, a greater one more")
     if register.harmless:
         wrong.append(f"{name} has harmless words, as what runs the motor has: a setpoint is another register")
     if register.span is None:

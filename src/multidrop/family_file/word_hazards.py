@@ -119,11 +119,26 @@ def _words(declared: DeclaredVerbs, registers: Registers, name: str) -> Iterator
     if starts and not stop:
         yield "a start writes it, and stop does not insist on a word of it without `when`"
         return
+    yield from _jogs(declared, register, name, stop[0] if stop else 0)
     for word in starts:
         if word in resets:
             yield f"{shown(register, word)} starts the motor and resets a fault: these never go together"
     if is_bits(register):
         yield from _bits(register, stop[0] if stop else 0, starts, resets)
+
+
+def _jogs(declared: DeclaredVerbs, register: Register[Any], name: str, stop: int) -> Iterator[str]:
+    """Find words of a jog that start: it asks for no setpoint."""
+    written = [
+        step
+        for step in declared.steps.get("start", ())
+        if isinstance(step, Writes) and not isinstance(step, Insists) and step.register == name
+    ]
+    for word in words_of(declared, ("jog",), name, insisted=False):
+        for started in written[-1].words.all if written else ():
+            added = started & ~stop
+            if word == started or (is_bits(register) and added and word & added == added):
+                yield f"jog word {shown(register, word)} starts the motor, as {shown(register, started)} does"
 
 
 def _bits(register: Register[Any], stop: int, starts: list[int], resets: list[int]) -> Iterator[str]:
