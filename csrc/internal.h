@@ -5,6 +5,7 @@
 #include "multidrop.h"
 
 #include <stdatomic.h>
+#include <time.h>
 
 /* cdef: begin */
 /* ---- line.c: one line as a state machine; bytes and time come in as arguments ---- */
@@ -347,6 +348,13 @@ void md_wakeup_silence(struct md_wakeup *wakeup);
 /* ---- times ---- */
 
 #define MD_NEVER INT64_MAX
+#define MD_SECOND_NS INT64_C(1000000000)
+
+/* Its fields are 32 bits wide on some systems. */
+static inline struct timespec timespec_of(int64_t ns)
+{
+    return (struct timespec){.tv_sec = (time_t)(ns / MD_SECOND_NS), .tv_nsec = (long)(ns % MD_SECOND_NS)};
+}
 
 static inline int64_t later(int64_t a, int64_t b)
 {

@@ -179,6 +179,16 @@ void md_columns_free(struct md_columns *columns);
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
                  int32_t *out_offsets, uint8_t *out, size_t room);
 
+/* ---- narrow.c: columns as recordings hold them ---- */
+
+/* The next float that is no less. */
+void md_narrow_up(const int64_t *numbers, size_t n, float *out);
+/* Whole numbers of floats, 0 where the bitmap `valid` (NULL: all are) has none; -1 where one is none. */
+int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
+/* The numbers of codes below `known`; return the place of the first code whose number is negative, else n. */
+size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
+void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
+
 /* ---- delay.c, late.c, counters.c: what is known of a drive; return a time in ns ---- */
 
 /* Counts of a drive's exchanges; all but longest_ns only grow. Values are those of the exchange's block. */

@@ -28,7 +28,9 @@ static size_t next_at(int framing, const uint8_t *bytes, size_t len)
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len)
 {
     struct md_message reply;
-    int reason = len ? MD_INCOMPLETE : MD_NO_REPLY;
+    int reason = MD_NO_REPLY;
+    if (len)
+        reason = MD_INCOMPLETE;
     for (size_t at = 0; at < len; at += next_at(framing, bytes + at, len - at)) {
         int why = md_parse_reply(framing, bytes + at, len - at, request, &reply);
         if (why == MD_INCOMPLETE)

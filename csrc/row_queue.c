@@ -9,7 +9,6 @@
 #include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 
 static const int64_t CLOCK_HOLDS_NS = 50000000; /* until the difference to UTC is read again */
 
@@ -49,10 +48,10 @@ static int wait_until(pthread_cond_t *condition, pthread_mutex_t *mutex, int64_t
 {
 #ifdef __APPLE__
     int64_t left = later(until_ns - md_now_ns(), 0);
-    struct timespec span = {.tv_sec = left / 1000000000, .tv_nsec = left % 1000000000};
+    struct timespec span = timespec_of(left);
     return pthread_cond_timedwait_relative_np(condition, mutex, &span);
 #else
-    struct timespec until = {.tv_sec = until_ns / 1000000000, .tv_nsec = until_ns % 1000000000};
+    struct timespec until = timespec_of(until_ns);
     return pthread_cond_timedwait(condition, mutex, &until);
 #endif
 }

@@ -11,6 +11,10 @@
 #ifdef __linux__
 #include <asm/termbits.h>
 #include <sys/ioctl.h>
+#ifndef TCGETS2 /* musl leaves them out; its requests are ints */
+#define TCGETS2 ((int)_IOR('T', 0x2A, struct termios2))
+#define TCSETS2 ((int)_IOW('T', 0x2B, struct termios2))
+#endif
 typedef struct termios2 attributes;
 
 static int get(int fd, attributes *now)

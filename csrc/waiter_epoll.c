@@ -5,33 +5,43 @@
 #include <poll.h>
 #include <stdlib.h>
 #include <sys/epoll.h>
-#include <time.h>
+#include <sys/syscall.h>
 #include <unistd.h>
+
+#ifndef SYS_epoll_pwait2
+#define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11; no kernel has a call of this number */
+#endif
 
 enum { EVENTS = 256 }; /* taken at a time */
 
-typedef int wait_function(int epoll, struct epoll_event *events, int most, const struct timespec *span,
-                          const sigset_t *signals);
+typedef int wait_function(int epoll, struct epoll_event *events, int most, int64_t timeout_ns);
 
 struct md_waiter {
     int epoll;
     wait_function *wait;
 };
 
-/* epoll_pwait2() where the system has none: before Linux 5.11, and where a container forbids it. */
-static int poll_first(int epoll, struct epoll_event *events, int most, const struct timespec *span,
-                      const sigset_t *signals)
+/* By the kernel's number: C libraries before glibc 2.35 and musl have no function for it. Both of its times
+ * are 64 bits wide, whatever time_t is. */
+static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
+{
+    const int64_t span[] = {timeout_ns / MD_SECOND_NS, timeout_ns % MD_SECOND_NS};
+    return (int)syscall(SYS_epoll_pwait2, epoll, events, most, timeout_ns < 0 ? NULL : span, NULL, (size_t)0);
+}
+
+/* Where there is no epoll_pwait2(): before Linux 5.11, and where a container forbids it. */
+static int poll_first(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     struct pollfd any = {.fd = epoll, .events = POLLIN};
-    int n = ppoll(&any, 1, span, signals);
+    struct timespec span = timespec_of(timeout_ns);
+    int n = ppoll(&any, 1, timeout_ns < 0 ? NULL : &span, NULL);
     return n > 0 ? epoll_wait(epoll, events, most, 0) : n;
 }
 
 static wait_function *best_wait(int epoll)
 {
     struct epoll_event event;
-    struct timespec at_once = {0};
-    return epoll_pwait2(epoll, &event, 1, &at_once, NULL) < 0 ? poll_first : epoll_pwait2;
+    return wait_at_once(epoll, &event, 1, 0) < 0 ? poll_first : wait_at_once;
 }
 
 struct md_waiter *md_waiter_new(void)
@@ -74,9 +84,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns)
 {
     struct epoll_event events[EVENTS];
-    struct timespec span = {.tv_sec = timeout_ns / 1000000000, .tv_nsec = timeout_ns % 1000000000};
-    int most = room < EVENTS ? room : EVENTS;
-    int n = waiter->wait(waiter->epoll, events, most, timeout_ns < 0 ? NULL : &span, NULL);
+    int n = waiter->wait(waiter->epoll, events, room < EVENTS ? room : EVENTS, timeout_ns);
     for (int i = 0; i < n; i++)
         ready[i] = events[i].data.ptr;
     return n;

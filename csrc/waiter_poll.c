@@ -8,7 +8,6 @@
 #include <poll.h>
 #include <stdlib.h>
 #include <string.h>
-#include <time.h>
 
 struct md_waiter {
     struct pollfd *fds; /* looked away from: the complement of the descriptor, which poll() ignores */
@@ -90,7 +89,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
 static int wait_for_any(struct md_waiter *waiter, int64_t timeout_ns)
 {
 #ifdef __linux__
-    struct timespec span = {.tv_sec = timeout_ns / 1000000000, .tv_nsec = timeout_ns % 1000000000};
+    struct timespec span = timespec_of(timeout_ns);
     return ppoll(waiter->fds, (nfds_t)waiter->count, timeout_ns < 0 ? NULL : &span, NULL);
 #else
     int64_t ms = timeout_ns < 0 ? -1 : timeout_ns / 1000000;

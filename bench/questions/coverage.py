@@ -1,95 +1,107 @@
 """The share of your own device templates that the register model holds, and what the rest lacks.
 
-It takes a folder with templates of other programs: JSON of wb-mqtt-serial, CSV of modpoll. Each entry is
-declared as a register in a class of its own, so the library itself decides. None of the public collections is
-part of this repository: get one that its licence lets you use, or take what you wrote.
+It takes a folder with files of other programs, in any layout that `multidrop import` reads, and reads them as
+that does. Each entry is then declared as its program uses it, read or written, so the library itself decides.
+None of the public collections is part of this repository: get one that its licence lets you use, or take what
+you wrote.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from bench.support import modpoll_templates, wb_templates
+from bench.support.holding import DETAILS, Holding, family_of, holdings
 from bench.support.tables import heading, show
-from bench.support.templates import DETAILS, Holding, Template, details, family_of, hold
+from multidrop.importers import SUFFIXES, ImportedDevice, all_devices
 
-READERS: dict[str, Callable[[Path], Iterator[Template]]] = {
-    ".json": wb_templates.templates,
-    ".csv": modpoll_templates.templates,
-}
+MOST_SHOWN = 15  # rows of what is said besides
+_DETAIL = re.compile(
+    r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b"
+)  # a number in a reason: equal ones count together
 
 
-def load(folder: Path) -> tuple[list[Template], list[str]]:
-    """Return the templates of all files below a folder, and a sentence for each file that is none."""
-    found: list[Template] = []
+def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
+    """Return the devices of all files below a folder, and a sentence for each file that has none."""
+    found: list[ImportedDevice] = []
     unread: list[str] = []
-    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in READERS):
+    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
         try:
-            found += list(READERS[path.suffix.lower()](path))
-        except (ValueError, TypeError, KeyError, OSError, RecursionError) as failure:
-            unread.append(f"{path}: {failure}")
+            devices = all_devices(path)
+        except (ValueError, ImportError) as failure:
+            unread.append(str(failure) if str(failure).startswith(str(path)) else f"{path}: {failure}")
+            continue
+        filled = [device for device in devices if holdings(device)]
+        found += filled
+        if not filled:
+            unread.append(f"{path}: it has no register")
     return found, unread
 
 
 class Coverage:
-    """What came of each entry of some templates."""
+    """Counts of what came of the entries of some devices."""
 
-    def __init__(self, templates: Iterable[Template]) -> None:
-        self.by_template = [
-            (template, [hold(quantity) for quantity in template.quantities]) for template in templates
-        ]
-        self.refused = Counter[str]()  # by reason: templates whose entries are held, but not together
-        self.whole = sum(map(self._is_whole, self.by_template))
+    def __init__(self, devices: Iterable[ImportedDevice]) -> None:
+        self.by_device = [(device, holdings(device)) for device in devices]
+        self.refused = Counter[str]()  # by reason: devices whose entries are held, but not together
+        self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
-    def _is_whole(self, found: tuple[Template, list[Holding]]) -> bool:
-        template, entries = found
-        if not template.quantities or not all(entry.is_held and entry.is_written for entry in entries):
+    def _is_whole(self, entries: list[Holding]) -> bool:
+        if not entries or not all(entry.is_whole for entry in entries):
             return False
-        reason = family_of(template.quantities)
+        reason = family_of(entries)
         if reason:
             self.refused[reason] += 1
         return not reason
 
     @property
     def entries(self) -> list[Holding]:
-        return [entry for _, entries in self.by_template for entry in entries]
+        return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
         """Yield each detail, the entries that need it, and those of them that are held."""
         for key, words in DETAILS.items():
-            needing = [entry for entry in self.entries if key in details(entry.quantity)]
-            yield words, len(needing), sum(entry.is_held and entry.is_written for entry in needing)
+            needing = [entry for entry in self.entries if key in entry.details]
+            yield words, len(needing), sum(entry.is_whole for entry in needing)
 
     def lacking(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each reason, the entries that lack it, and the templates with one of them."""
-        entries, templates = Counter[str](), Counter[str]()
-        for _, found in self.by_template:
+        """Yield each reason, the entries that lack it, and the devices with one of them."""
+        entries, devices = Counter[str](), Counter[str]()
+        for _, found in self.by_device:
             reasons = [_lack(entry) for entry in found if entry.lacks]
             entries.update(reasons)
-            templates.update(set(reasons))
-        yield from ((reason, count, templates[reason]) for reason, count in entries.most_common())
+            devices.update(set(reasons))
+        yield from ((reason, count, devices[reason]) for reason, count in entries.most_common())
 
     def besides(self) -> Iterator[tuple[str, int]]:
-        """Yield what entries and devices say that a register or a family does not, and how many do."""
-        said = Counter(key for entry in self.entries for key in entry.quantity.besides)
-        said.update(f"{key} (devices)" for template, _ in self.by_template for key in template.besides)
-        yield from said.most_common()
+        """Yield what importers say of entries and devices that are held, and how often."""
+        said = Counter(
+            _DETAIL.sub("N", gap) for entry in self.entries if entry.entry for gap in entry.entry.gaps
+        )
+        said.update(
+            f"{lost.name} (devices)"
+            for device, _ in self.by_device
+            for lost in device.lost
+            if not lost.is_entry
+        )
+        yield from said.most_common(MOST_SHOWN)
 
 
 def _lack(entry: Holding) -> str:
-    return entry.lacks if not entry.is_held else f"is read, and not written: {entry.lacks}"
+    reason = _DETAIL.sub("N", entry.lacks)
+    return reason if not entry.is_held else f"is read, and not written: {reason}"
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
     """Print the shares, the details that are needed, and what lacks."""
-    entries, templates = coverage.entries, len(coverage.by_template)
-    held = sum(entry.is_held and entry.is_written for entry in entries)
+    entries, devices = coverage.entries, len(coverage.by_device)
+    held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)
     shares = (
-        ("templates, whole", templates, coverage.whole),
+        ("templates, whole", devices, coverage.whole),
         ("entries, as they are", len(entries), held),
         ("entries, for reading", len(entries), readable),
     )
@@ -101,7 +113,7 @@ def report(coverage: Coverage, unread: list[str]) -> None:
     for reason, count in coverage.refused.items():
         print(f"{count} templates are not one family, though each entry is held: {reason}")
     print()
-    show(("said besides the value, and not held", "times"), coverage.besides())
+    show((f"said of what is held, the first {MOST_SHOWN}", "times"), coverage.besides())
     for sentence in unread:
         print(f"not read: {sentence}")
 
@@ -116,11 +128,13 @@ def main() -> None:
     folder = parser.parse_args().folder
     if not folder.is_dir():
         parser.error(f"{folder} is no folder")
-    templates, unread = load(folder)
-    if not templates:
-        parser.error(f"{folder} has no template that can be read: {'; '.join(unread) or 'no .json, no .csv'}")
+    devices, unread = load(folder)
+    if not devices:
+        parser.error(
+            f"{folder} has no template that can be read: {'; '.join(unread[:5]) or ', '.join(SUFFIXES)}"
+        )
     heading("Templates that the register model holds")
-    report(Coverage(templates), unread)
+    report(Coverage(devices), unread)
 
 
 if __name__ == "__main__":

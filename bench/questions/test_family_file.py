@@ -31,6 +31,17 @@ def test_a_file_of_40_registers(benchmark: Any, meter: Path) -> None:
     benchmark(load)
 
 
+@pytest.mark.parametrize("name", ["tests/data/families/sdm630.toml", "tests/data/families/abb.toml"])
+def test_a_meter_and_a_motor_with_verbs(benchmark: Any, name: str) -> None:
+    path = Path(__file__).parents[2] / name
+
+    def load() -> None:
+        loader._loaded.clear()
+        loader.load_family(path)
+
+    benchmark(load)
+
+
 def test_the_same_file_again(benchmark: Any, meter: Path) -> None:
     loader.load_family(meter)
     benchmark(loader.load_family, meter)

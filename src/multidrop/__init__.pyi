@@ -2,6 +2,7 @@
 
 from multidrop.bus import Bus as Bus
 from multidrop.control.audit_log import read_audit as read_audit
+from multidrop.control.author import written_by as written_by
 from multidrop.control.eeprom_ledger import Ledger as Ledger
 from multidrop.control.outcome import Effect as Effect
 from multidrop.control.outcome import Outcome as Outcome
@@ -70,6 +71,7 @@ from multidrop.plant.model import Polled as Polled
 from multidrop.plant.model import PolledDrive as PolledDrive
 from multidrop.poller import Poller as Poller
 from multidrop.polling.batch import Batch as Batch
+from multidrop.polling.batch import BatchColumns as BatchColumns
 from multidrop.polling.batch import Row as Row
 from multidrop.polling.wide import WideRows as WideRows
 from multidrop.recording import convert as convert

@@ -73,10 +73,7 @@ class Bus:
         audit: Path | str | None = None,
         expiry: float = 1.0,
     ) -> None:
-        if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
-            raise ValueError(
-                f"expiry = {expiry!r} is not a number of seconds above 0 for a write's turn to come"
-            )
+        _checked_expiry(expiry, "a write")
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
@@ -255,6 +252,23 @@ class Bus:
         check_own_text(drive, text)
         return self._exchanges.text(drive, text)
 
+    def ask(self, drive: Drive, function: int, start: int, count: int, *, expiry: float = 1.0) -> bytes:
+        """Return what the drive has at any addresses, declared or not: a read past its register table.
+
+        `function` is 1 (coils), 2 (discrete inputs), 3 (holding registers) or 4 (input registers); `start`
+        the address as it is sent, from 0; `count` that of words or bits, at most as many as the family states
+        for one request, else 125 words or 2000 bits (application protocol V1.1b3, 6.1 to 6.4). The data is
+        as in the reply: words of two bytes, the most significant first; bits in whole bytes, the first bit
+        the least significant of the first byte.
+
+        Sent once, ahead of any polling, and never when it could not begin within `expiry` seconds. It is no
+        write: none is audited, no identity is checked, and a lost reply is NoReply. A late reply to another
+        request is never returned. An address to which the drive keeps silent costs its time-out and counts as
+        a failure of the drive. Raises NoReply, BadReply, DriveRefused, Expired or LineError; ValueError or
+        TypeError, and nothing is sent, for what no such request can say.
+        """
+        return self._exchanges.ask(drive, function, start, count, _checked_expiry(expiry, "a read"))
+
     # ---- writing ----
 
     def write(self, drive: Drive, register: Register[T], value: T) -> T:
@@ -354,3 +368,9 @@ class Bus:
     def reset_statistics(self) -> None:
         """Count from here on."""
         self._meter.reset()
+
+
+def _checked_expiry(expiry: float, what: str) -> float:
+    if isinstance(expiry, bool) or not isinstance(expiry, (int, float)) or not 0 < expiry < inf:
+        raise ValueError(f"expiry = {expiry!r} is not a number of seconds above 0 for {what}'s turn to come")
+    return expiry

@@ -429,7 +429,7 @@ static void check_columns(void)
     CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion,
                          1000) == 2);
     CHECK(time[0] == 1100 && sent[0] == 100 && uncertainty[0] == 30 && drive[0] == 7 && reg[1] == 9);
-    CHECK(status[0] == 0 && value[0] == 0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
+    CHECK(status[0] == 0 && value[0] == (double)0.3 && status[1] == -MD_BAD_LENGTH && value[1] == 0);
     CHECK((*valid & 3) == 1);
     CHECK(md_columns_add(&columns, &(struct md_block){.fields = fields, .count = 2, .drive = 7}, &completion,
                          1000) == 0 && columns.rows == 2);

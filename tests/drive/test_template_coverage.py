@@ -25,14 +25,14 @@ HELD = [  # as they are
     {"name": "power", "reg_type": "input", "address": 24, "format": "double"},
     {"name": "limit", "reg_type": "holding", "address": 30, "format": "float", "byte_order": "little_endian"},
     {"name": "cold", "reg_type": "input", "address": 40, "format": "s16", "error_value": "0x7FFF"},
-    {"name": "mode", "reg_type": "input", "address": "50:4:2"},
+    {"name": "mode", "reg_type": "input", "address": "50:4:2", "enum": [0, 1], "enum_titles": ["a", "b"]},
     {"name": "flag", "reg_type": "holding", "address": "50:0", "readonly": True},
     {"name": "small", "reg_type": "input", "address": 51, "format": "u8", "sporadic": True},
     {"name": "frost", "reg_type": "input", "address": 52, "format": "s8", "offset": -40},
     {"name": "count", "reg_type": "input", "address": 53, "format": "bcd32", "scale": -1},
     {"name": "alone", "reg_type": "holding_multi", "address": 60},
     {"name": "serial", "reg_type": "input", "address": 70, "format": "string8", "string_data_size": 5},
-    {"name": "only", "reg_type": "holding", "write_address": 91},
+    {"name": "only this", "reg_type": "holding", "write_address": 91},
     {"name": "version", "reg_type": "input", "address": 80, "format": "string", "string_data_size": 16},
 ]
 READ_ONLY = [{"name": "bit", "reg_type": "holding", "address": "55:1:1"}]
@@ -53,28 +53,27 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("bench.questions.coverage")
 
 
-def shares(bench: Any, folder: Path) -> dict[str, tuple[int, int]]:
-    templates, unread = bench.load(folder)
+def covered(bench: Any, folder: Path) -> Any:
+    devices, unread = bench.load(folder)
     assert unread == []
-    coverage = bench.Coverage(templates)
+    return bench.Coverage(devices)
+
+
+def shares(coverage: Any) -> dict[str, tuple[int, int]]:
     entries = coverage.entries
     return {
-        "templates": (len(templates), coverage.whole),
-        "entries": (len(entries), sum(entry.is_held and entry.is_written for entry in entries)),
+        "templates": (len(coverage.by_device), coverage.whole),
+        "entries": (len(entries), sum(entry.is_whole for entry in entries)),
         "read": (len(entries), sum(entry.is_held for entry in entries)),
     }
 
 
 def test_what_a_template_needs_is_held(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "all.json").write_text(wb(HELD))
-    assert shares(bench, tmp_path) == {
-        "templates": (1, 1),
-        "entries": (len(HELD), len(HELD)),
-        "read": (len(HELD), len(HELD)),
-    }
-    templates, _ = bench.load(tmp_path)
-    needed = {words: (count, held) for words, count, held in bench.Coverage(templates).needed()}
-    assert needed == {
+    coverage = covered(bench, tmp_path)
+    whole = (len(HELD), len(HELD))
+    assert shares(coverage) == {"templates": (1, 1), "entries": whole, "read": whole}
+    assert {words: (count, held) for words, count, held in coverage.needed()} == {
         "offset": (1, 1),
         "invalid counts": (1, 1),
         "bits of a word": (3, 3),
@@ -83,6 +82,8 @@ def test_what_a_template_needs_is_held(bench: Any, tmp_path: Path) -> None:
         "BCD": (1, 1),
         "signed 8 bit": (1, 1),
         "negative step": (1, 1),
+        "scale register": (0, 0),
+        "named values or bits": (1, 1),
         "text": (2, 2),
         "text of one character a register": (1, 1),
         "written by 16 alone": (1, 1),
@@ -95,19 +96,20 @@ def test_what_lacks_is_counted_with_its_reason(bench: Any, tmp_path: Path) -> No
     (tmp_path / "some.json").write_text(wb([*HELD, *READ_ONLY, *LACKING, *LACKING]))
     (tmp_path / "more.json").write_text(wb(LACKING[:1]))
     whole = len(HELD) + 1 + 2 * len(LACKING) + 1
-    assert shares(bench, tmp_path) == {
+    coverage = covered(bench, tmp_path)
+    assert shares(coverage) == {
         "templates": (2, 0),
         "entries": (whole, len(HELD)),
         "read": (whole, len(HELD) + 1),
     }
-    templates, _ = bench.load(tmp_path)
-    lacking = {reason: (count, found) for reason, count, found in bench.Coverage(templates).lacking()}
-    assert lacking.pop("register type press_counter") == (3, 2)
-    assert lacking.pop("signed 24 bit") == (2, 1)
+    lacking = {reason: (count, found) for reason, count, found in coverage.lacking()}
     (part,) = [reason for reason in lacking if reason.startswith("is read, and not written: a part is")]
     assert lacking.pop(part) == (1, 1)
-    assert list(lacking.values()) == [(2, 1)]
-    assert "is outside 0 to FFFFH" in next(iter(lacking))
+    assert lacking == {
+        "its register type press_counter has no table": (3, 2),
+        "its format s24 has no number format": (2, 1),
+        "its address is none from N to N": (2, 1),
+    }
 
 
 def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
@@ -117,17 +119,19 @@ def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: P
     (tmp_path / "a.json").write_text(
         "// http://x\n" + text.replace("}", "} /* so */ // too\n", 1).replace("]", ",\n]", 1)
     )
-    templates, unread = bench.load(tmp_path)
-    coverage = bench.Coverage(templates)
-    assert unread == []
+    coverage = covered(bench, tmp_path)
     assert (len(coverage.entries), coverage.whole) == (4, 1)
-    assert dict(coverage.besides()) == {"condition": 1, "setup (devices)": 1, "subdevices (devices)": 1}
+    assert dict(coverage.besides()) == {
+        "it is written there; what a write does is not known here": 2,
+        "condition was not carried over": 1,
+        "setup (devices)": 1,
+        "subdevices (devices)": 1,
+    }
 
 
 def test_entries_that_are_held_apart_and_not_together_are_told(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
-    templates, _ = bench.load(tmp_path)
-    coverage = bench.Coverage(templates)
+    coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)
     assert "is written at the same address" in next(iter(coverage.refused))
 
@@ -138,12 +142,13 @@ def test_other_protocols_and_files_that_are_none_are_left_out(bench: Any, tmp_pa
     (tmp_path / "other.json").write_text(wb(HELD[:1], protocol="uniel"))
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "list.json").write_text("[]")
-    (tmp_path / "table.csv").write_text("name,address\nvoltage,1\n")
+    (tmp_path / "empty.json").write_text(wb([]))
+    (tmp_path / "table.csv").write_text("name,value\nvoltage,1\n")
     (tmp_path / "notes.txt").write_text("no template")
-    templates, unread = bench.load(tmp_path)
-    assert [Path(template.path).name for template in templates] == ["modbus.json"]
-    names = [Path(sentence.partition(": ")[0]).name for sentence in unread]
-    assert names == ["broken.json", "list.json", "table.csv"]
+    devices, unread = bench.load(tmp_path)
+    assert len(devices) == 1
+    names = [Path(sentence.partition(": ")[0].partition(" is not")[0]).name for sentence in unread]
+    assert names == ["broken.json", "empty.json", "list.json", "other.json", "table.csv"]
 
 
 MODPOLL = """\
@@ -164,16 +169,42 @@ device,other,2
 poll,input_register,0x10,2,LE_LE
 ref,current,0x10,uint32,r
 """
+OTHERS = {
+    "neuron.csv": "name,address,type\na,1!400001#BL,FLOAT\nb,1!400003#WS,INT64\n",
+    "iobroker.tsv": "_address\tname\ttype\tformula\n300001\ta\tuint16be\t\n300002\tb\tuint16be\tx*2\n",
+    "telegraf.conf": '[[inputs.modbus]]\nholding_registers = [{ name = "a", data_type = "INT32",'
+    ' byte_order = "CDAB", address = [1, 2] }]\n',
+    "home.yaml": "modbus:\n  - sensors:\n    - { name: a, address: 1, slave: 1, swap: byte }\n",
+    "esp.yaml": "modbus_controller: { address: 1 }\nsensor:\n"
+    "  - { platform: modbus_controller, register_type: read, address: 1, value_type: S_QWORD_R }\n",
+    "sunspec.json": '{"id": 1, "group": {"points": [{"name": "A", "type": "int16", "size": 1, "sf": "S"},'
+    '{"name": "S", "type": "sunssf", "size": 1}], "groups": [{"name": "r", "points": [{"name": "B"}]}]}}',
+}
 
 
 def test_modpoll_s_tables_are_read(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "meter.csv").write_text(MODPOLL)
-    assert shares(bench, tmp_path) == {"templates": (2, 1), "entries": (9, 8), "read": (9, 8)}
-    templates, _ = bench.load(tmp_path)
-    coverage = bench.Coverage(templates)
-    assert list(coverage.lacking()) == [("format float16", 1, 1)]
+    coverage = covered(bench, tmp_path)
+    assert shares(coverage) == {"templates": (2, 1), "entries": (9, 7), "read": (9, 7)}
+    assert list(coverage.lacking()) == [
+        ("its type float16 has no number format", 1, 1),
+        ("which bits bool8 means is not known", 1, 1),
+    ]
     needed = {words: count for words, count, _ in coverage.needed()}
     assert (needed["order of bytes or words"], needed["bits of a word"], needed["text"]) == (3, 1, 1)
+
+
+def test_every_layout_of_the_importers_is_read(bench: Any, tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    for name, contents in OTHERS.items():
+        (tmp_path / name).write_text(contents)
+    coverage = covered(bench, tmp_path)
+    assert shares(coverage) == {"templates": (6, 3), "entries": (10, 7), "read": (10, 7)}
+    assert {reason for reason, _, _ in coverage.lacking()} == {
+        "its order of bytes #WS",
+        "its formula is a program",
+        "its group repeats as often as the device says",
+    }
 
 
 def test_the_script_prints_its_tables(tmp_path: Path) -> None:
@@ -184,7 +215,7 @@ def test_the_script_prints_its_tables(tmp_path: Path) -> None:
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
     assert "templates, whole 1 0 0.0%" in lines
     assert f"entries, as they are {whole} {len(HELD)} {len(HELD) / whole:.1%}" in lines
-    assert "register type press_counter 1 1" in lines
+    assert "its register type press_counter has no table 1 1" in lines
     assert lines[-1].startswith(f"not read: {tmp_path}/b.json: ")
 
 

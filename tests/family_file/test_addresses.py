@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import tomllib
 from typing import Any
 
 import pytest
 
-from multidrop.family_file.addresses import Counting
+from multidrop.family_file.addresses import Counting, sent_as
 
 
 @pytest.mark.parametrize(
@@ -79,11 +80,11 @@ def test_what_is_refused(given: Any, sentence: str) -> None:
     assert sentence in str(refused.value)
 
 
-def test_a_number_that_is_refused_can_be_written_in_another_way() -> None:
-    """TOML's 0x9C41 is 40001 to whoever reads it: its hex has to be in quotes."""
-    for text in ("9C41H", "0x9C41"):
-        assert Counting(0).address(text, None, "holding") == (40001, "holding")
-        assert Counting(0).address_in_cell(text, None, "holding") == (40001, "holding")
+@pytest.mark.parametrize("table", ["holding", "input", "coil", "discrete"])
+def test_every_address_can_be_written_as_it_is_sent(table: str) -> None:
+    for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
+        written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
+        assert Counting(0).address(written, table, "holding") == (address, table)
 
 
 def test_a_digit_that_contradicts_its_table() -> None:

@@ -174,8 +174,8 @@ TOLD = [
     'twenty.toml: [reading] voltage: at: "40001" begins with 4, which is table holding, and table is '
     '"input"; leave table out, or write the number that its table has',
     "twenty.toml: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; write "
-    '"9C42H" for that number, or "40002" for that of the table, both in quotes (in a CSV file without '
-    "counts_from)",
+    '"9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without counts_from) '
+    "for that of the table",
     'twenty.toml: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
     "twenty.toml: [reading] mode: values: on and off are both 0; each has its own",
     "twenty.toml: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",

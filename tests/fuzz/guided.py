@@ -20,13 +20,14 @@ from readers import read
 import multidrop.capture
 import multidrop.drives.registry
 import multidrop.family_file
+import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
 import multidrop.sim.faults
 import multidrop.toml_check
 from multidrop.capture import decoding
 
-PACKAGES = (multidrop.capture, multidrop.family_file, multidrop.recording)
+PACKAGES = (multidrop.capture, multidrop.family_file, multidrop.importers, multidrop.recording)
 MODULES = (
     multidrop.plant.model,
     multidrop.toml_check,

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from batches import counting, example
 from families import METER, METER_CSV
 from frames import PRINTED, Printed
+from imported import FILES
 from readers import PLANT
 
 from multidrop.capture import CaptureWriter, Side
@@ -132,6 +133,12 @@ def family() -> Iterator[bytes]:
     yield meter.encode() + b"\n\0\n" + METER_CSV.encode()
 
 
+def imported() -> Iterator[bytes]:
+    for suffix, texts in FILES.items():
+        for text in texts:
+            yield f"{suffix}\n{text}".encode()
+
+
 def faults() -> Iterator[bytes]:
     yield b'seed = 7\ndrop = 0.01\nflip = 0.5\nlate = "100 ms"\nburst = 32\nhang_up = 0\naway = "1 s"\n'
 
@@ -160,6 +167,7 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "columns": columns,
     "plant": plant,
     "family": family,
+    "import": imported,
     "faults": faults,
     "arrows": lambda: recorded(".arrows"),
     "csv": lambda: recorded(".csv"),

@@ -47,6 +47,7 @@ NOT_RUN = {
     ".venv/bin/pytest": "runs the tests themselves",
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
+    "tools/wheels": "compiles for five machines: many minutes",
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
     ".venv/bin/python -m sphinx": "is a test of its own, below",
     ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",

@@ -10,118 +10,12 @@ from typing import Any
 
 import pytest
 from commands import Run
+from imported import ESPHOME, HOME, IOBROKER, MODPOLL, NEURON, OWN, SUNSPEC, TELEGRAF, WB
 
 from multidrop import load_family
 from multidrop.drive.register import Access, Register
 from multidrop.importers import family_text, plant_text, read_devices
 from multidrop.importers.device import ImportedDevice
-
-IOBROKER = (
-    "_address\tname\tdescription\tunit\ttype\tlen\tfactor\toffset\tformula\trole\n"
-    "300001\tVoltage L1\tphase 1\tV\tuint16be\t1\t0.1\t0\t\tvalue\n"
-    "400011\tSetpoint\t\t°C\tint16be\t1\t0.5\t\tx*2\tlevel\n"
-    "300003\tEnergy\t\tkWh\tfloatsw\t2\t1\t0\t\tvalue\n"
-)
-MODPOLL = """\
-# a comment
-device,meter,7,,
-poll,input_register,0,20,BE_BE
-ref,voltage,0,uint16,r,V,0.1
-ref,power,2,int16,rw,W,
-poll,coil,0,12,BE_BE
-ref,coils,0,bool8,rw
-poll,holding_register,40000,20,BE_LE
-ref,energy,40008,uint32,r,kWh,
-"""
-NEURON = """\
-group,name,address,attribute,type,description,decimal
-g,volt,1!400001,Read,UINT16,,0.1
-g,hot,1!400002.3,Read,BIT,,
-g,power,1!300011#BB,Read,INT32,,
-g,work,1!300013#LL,Read,FLOAT,,
-g,unsure,1!300015,Read,FLOAT,,
-"""
-OWN = """\
-Register;Address;Type;Unit;Scale;Notes
-Speed;0x0010;uint16;rpm;1;
-Temp 1;17;int16;°C;0,1;
-1st;18;int16;;2;
-"""
-TELEGRAF = """\
-[[inputs.modbus]]
-name = "meter"
-slave_id = 3
-coils = [{ name = "relay", address = [4] }]
-holding_registers = [
-  { name = "power", byte_order = "AB", data_type = "INT16", scale = 0.1, address = [10] },
-  { name = "energy", byte_order = "ABCD", data_type = "UINT32", scale = 1.0, address = [12, 13] },
-  { name = "swapped", byte_order = "CDAB", data_type = "FLOAT32-IEEE", scale = 1.0, address = [14, 15] },
-]
-[[inputs.modbus]]
-name = "other"
-[[inputs.modbus.request]]
-slave_id = 4
-byte_order = "ABCD"
-register = "input"
-fields = [
-  { address = 0, type = "FLOAT32", name = "volt" },
-  { address = 2, type = "UINT16", name = "skipped", omit = true },
-  { address = 3, type = "FLOAT16", name = "half" },
-]
-"""
-HOME = """\
-modbus:
-  - name: hub
-    type: serial
-    port: !secret port
-    sensors:
-      - { name: Room temperature, slave: 1, address: 5, input_type: input, data_type: int16, scale: 0.1,
-          unit_of_measurement: °C, scan_interval: 30 }
-      - { name: Work, slave: 1, address: 6, data_type: uint32 }
-      - { name: Serial, slave: 1, address: 20, data_type: string, count: 4 }
-    switches:
-      - { name: Pump, slave: 1, address: 9, write_type: coil }
-    climates:
-      - { name: Zone, slave: 1, address: 30 }
-"""
-SUNSPEC = {
-    "id": 103,
-    "group": {
-        "name": "inverter",
-        "points": [
-            {"name": "ID", "type": "uint16", "size": 1},
-            {"name": "A", "type": "uint16", "size": 1, "sf": "A_SF", "units": "A", "label": "Amps"},
-            {"name": "A_SF", "type": "sunssf", "size": 1},
-            {"name": "St", "type": "enum16", "size": 1, "symbols": [{"name": "OFF", "value": 1}]},
-            {"name": "W", "type": "float32", "size": 2, "units": "W"},
-            {"name": "Mn", "type": "string", "size": 16},
-        ],
-        "groups": [{"name": "mppt"}],
-    },
-}
-WB = {
-    "title": "Own meter",
-    "device": {
-        "name": "own",
-        "channels": [
-            {
-                "name": "Voltage",
-                "reg_type": "input",
-                "address": "0x0010",
-                "format": "u32",
-                "scale": 0.01,
-                "units": "V",
-            },
-            {"name": "Status bit", "reg_type": "holding", "address": "3:4:2"},
-            {"name": "Relay", "reg_type": "coil", "address": 0},
-            {"name": "Odd", "reg_type": "press_counter", "address": 1},
-        ],
-        "parameters": {
-            "mode": {"address": 9, "format": "s16", "error_value": "0x7FFF", "unsupported_value": 9}
-        },
-        "setup": [{"title": "x", "address": 1, "value": 1}],
-    },
-}
 
 
 def devices(folder: Path, name: str, contents: str | dict[str, Any]) -> list[ImportedDevice]:
@@ -133,6 +27,11 @@ def devices(folder: Path, name: str, contents: str | dict[str, Any]) -> list[Imp
 def only(folder: Path, name: str, contents: str | dict[str, Any]) -> ImportedDevice:
     (device,) = devices(folder, name, contents)
     return device
+
+
+def told(device: ImportedDevice) -> list[str]:
+    """Return the sentences on what was not carried over."""
+    return [str(lost) for lost in device.lost]
 
 
 def entries(device: ImportedDevice) -> dict[str, Any]:
@@ -162,21 +61,22 @@ def test_iobroker(tmp_path: Path) -> None:
     assert found["energy"] == {
         "at": 2, "table": "input", "unit": "kWh", "number_format": "F32", "order": "CDAB", "note": "Energy",
     }  # fmt: skip
-    assert device.lost == []
+    assert told(device) == []
+    assert "# gap: setpoint: only its count is read: its formula is a program" in family_text(device, "x")
     registers = loaded(tmp_path, device, "voltage_l1", "setpoint")
-    assert (registers["setpoint"].address, registers["setpoint"].step) == (10, None)
-    assert "# gap: setpoint: its formula x*2 was not carried over" in family_text(device, "t")
+    assert (registers["setpoint"].address, registers["setpoint"].step) == (10, 0.5)
 
 
 def test_modpoll(tmp_path: Path) -> None:
     device = only(tmp_path, "config.csv", MODPOLL)
     assert (device.title, device.address) == ("meter", 7)
     assert entries(device)["energy"] == {
-        "at": "0x9C48", "unit": "kWh", "number_format": "U32", "order": "CDAB",
+        "at": "9C48H", "unit": "kWh", "number_format": "U32", "order": "CDAB",
     }  # fmt: skip
-    assert device.lost == ["coils: which bits bool8 means is not known"]
-    assert "# gap: power: it is written there" in family_text(device, "x")
-    registers = loaded(tmp_path, device, "voltage", "power")
+    assert told(device) == ["coils: which bits bool8 means is not known"]
+    assert "# gap: energy: it is written there" in family_text(device, "x")
+    registers = loaded(tmp_path, device, "voltage", "power", "energy")
+    assert registers["energy"].address == 40008
     assert (registers["voltage"].table.name, registers["voltage"].step) == ("input register", 0.1)
 
 
@@ -186,9 +86,18 @@ def test_neuron(tmp_path: Path) -> None:
     assert device.address == 1
     assert found["volt"] == {"at": 0, "step": 0.1}
     assert found["hot"] == {"at": 1, "part": "3"}
-    assert found["power"] == {"at": 10, "table": "input", "number_format": "I32"}
-    assert found["work"]["order"] == "DCBA"
-    assert "# gap: unsure: the order of its words is not stated" in family_text(device, "x")
+    assert found["power"] == {"at": 10, "table": "input", "number_format": "I32", "order": "DCBA"}
+    assert [found[name].get("order") for name in ("work", "swapped", "words", "small")] == [
+        None, "BADC", "CDAB", "BA",
+    ]  # fmt: skip
+    assert [found[name] for name in ("label", "tag")] == [
+        {"at": 30, "length": 5}, {"at": 40, "length": 4, "order": "B"},
+    ]  # fmt: skip
+    text = family_text(device, "x")
+    assert "# gap: unsure: its order of bytes is its node's; ABCD was assumed, as Neuron does" in text
+    assert "# gap: wide: only its count is read: its order of bytes #WS" in text
+    assert "# gap: setpoint: it is written there; what a write does is not known here" in text
+    assert told(device) == ["bytes: a text of one character a register, in its high byte"]
     assert loaded(tmp_path, device, "volt", "power")["power"].words == 2
 
 
@@ -196,18 +105,26 @@ def test_a_table_of_one_s_own(tmp_path: Path) -> None:
     device = only(tmp_path, "own.csv", OWN)
     text = family_text(device, "own.csv")
     assert "# gap: speed: whether its address counts from 0 or 1; 0 was assumed" in text
-    assert "# gap: temp_1: its scale '0,1' or offset '' is no number" in text
-    registers = loaded(tmp_path, device, "speed", "temp_1", "r_1st")
-    assert list(registers) == ["speed", "temp_1", "r_1st"]
-    assert registers["temp_1"].step is None
+    assert "# gap: temp_1: the comma of 0,1 was taken for a decimal point" in text
+    assert "# gap: odd: only its count is read: its scale 'x' or offset '' is no number" in text
+    assert entries(device)["temp_1"]["step"] == 0.1
+    assert list(loaded(tmp_path, device, "speed", "temp_1", "r_1st")) == ["speed", "temp_1", "r_1st"]
 
 
 def test_telegraf(tmp_path: Path) -> None:
     meter, other = devices(tmp_path, "telegraf.conf", TELEGRAF)
     assert (meter.address, other.address) == (3, 4)
+    assert entries(meter)["long"] == {"at": 16, "number_format": "U64", "order": "CDAB"}
+    assert entries(meter)["last"] == {"at": 20, "number_format": "I64", "order": "DCBA"}
     assert entries(meter)["swapped"] == {"at": 14, "number_format": "F32", "order": "CDAB"}
-    assert entries(other)["volt"] == {"at": 0, "table": "input", "number_format": "F32"}
-    assert other.lost == [
+    found = entries(other)
+    assert found["volt"] == {"at": 0, "table": "input", "number_format": "F32"}
+    assert found["work"] == {"at": 4, "table": "input", "number_format": "I64"}
+    assert (found["flag"]["part"], found["high"]["part"]) == ("5", "8-15")
+    assert found["firmware"] == {"at": 10, "table": "input", "length": 8}
+    assert found["wide"] == {"at": 30, "number_format": "F64", "order": "CDAB"}
+    assert found["narrow"] == {"at": 34}
+    assert told(other) == [
         "skipped: it is marked omit, and was left out",
         "half: its type FLOAT16 has no number format",
     ]
@@ -225,7 +142,21 @@ def test_home_assistant(tmp_path: Path) -> None:
         "note": "Room temperature",
     }  # fmt: skip
     assert found["serial"]["length"] == 4
-    assert device.lost == ["Zone: a climate has no counterpart"]
+    assert [(found[name]["at"], found[name]["order"]) for name in ("phase", "phase_1", "phase_2")] == [
+        (40, "DCBA"), (42, "DCBA"), (44, "DCBA"),
+    ]  # fmt: skip
+    assert [(found[name]["at"], found[name]["order"]) for name in ("old", "old_1")] == [
+        (50, "CDAB"), (54, "CDAB"),
+    ]  # fmt: skip
+    assert [found[name]["at"] for name in ("door", "door_1")] == [3, 4]
+    assert found["phase"]["invalid"] == "NaN"
+    assert found["alarm"]["part"] == "0"
+    assert told(device) == [
+        "Odd: its type custom has no number format",
+        "Far_1: its address is none from 0 to 65535",
+        "Many: it cannot be read: ValueError virtual_count = 5000 is not 0 to 1000",
+        "Zone: a climate has no counterpart",
+    ]
     text = family_text(device, "x")
     assert "# gap: room_temperature: it was read every 30 s: `every` in the plant file" in text
     assert "# gap: pump: it is written there; what a write does is not known here" in text
@@ -238,12 +169,31 @@ def test_sunspec(tmp_path: Path) -> None:
     device = only(tmp_path, "model_103.json", SUNSPEC)
     found = entries(device)
     assert found["a"]["scale_register"] == "a_sf"
-    assert (found["a"]["at"], found["w"]["at"], found["mn"]["at"]) == ("0x9C41", "0x9C44", "0x9C46")
+    assert (found["a"]["at"], found["w"]["at"], found["mn"]["at"]) == ("9C41H", "9C44H", "9C46H")
     assert (found["w"]["invalid"], found["st"]["values"]) == ("NaN", {"off": 1})
     assert found["mn"]["length"] == 16
-    assert any("mend every `at`" in sentence for sentence in device.lost)
-    assert any("mppt repeats" in sentence for sentence in device.lost)
-    assert loaded(tmp_path, device, "a", "a_sf")["a"].address == 40001
+    assert any("mend every `at`" in sentence for sentence in told(device))
+    assert "mppt.DCA: its group repeats as often as the device says" in told(device)
+    registers = loaded(tmp_path, device, "a", "a_sf", "wh", "net")
+    assert registers["a"].address == 40001
+    assert registers["wh"].number_in(b"\xff" * 8, 0) is None
+    assert registers["net"].number_in(b"\x80" + bytes(7), 0) is None
+    assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
+
+
+def test_a_scale_register_out_of_reach_is_told_and_left_out(tmp_path: Path) -> None:
+    """One request reads both, and reads 125 registers at most."""
+    points = [
+        {"name": "A", "type": "int16", "size": 1, "sf": "S"},
+        {"name": "gap", "type": "pad", "size": 130},
+        {"name": "S", "type": "sunssf", "size": 1},
+    ]
+    device = only(tmp_path, "far.json", {"group": {"points": points}})
+    assert "scale_register" not in entries(device)["a"]
+    assert "# gap: a: only its count is read: one request reads at most 125 registers" in family_text(
+        device, "x"
+    )
+    assert loaded(tmp_path, device, "a", "s")["a"].address == 40000
 
 
 def test_wb(tmp_path: Path) -> None:
@@ -253,15 +203,71 @@ def test_wb(tmp_path: Path) -> None:
         "at": 16, "table": "input", "unit": "V", "step": 0.01, "number_format": "U32", "note": "Voltage",
     }  # fmt: skip
     assert found["status_bit"]["part"] == "4-5"
-    assert (found["mode"]["number_format"], found["mode"]["invalid"]) == ("I16", [0x7FFF, 9])
-    assert device.lost == [
-        "Odd: it has no table or address that can be read",
+    assert (found["mode"]["number_format"], found["mode"]["invalid"]) == ("I16", 0x7FFF)
+    assert found["serial"] == {"at": 40, "table": "input", "length": 8, "order": "B"}
+    assert found["mode_of_work"]["values"] == {"off": 0, "r_1st_stage": 1}
+    assert told(device) == [
+        "Order: is only written: a command is never imported",
+        "Odd: its register type press_counter has no table",
         "setup: writes at every start are never sent, for they wear the EEPROM",
     ]
     assert loaded(tmp_path, device, "voltage", "relay")["voltage"].words == 2
 
 
+def test_esphome(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    device = only(tmp_path, "pump.yaml", ESPHOME)
+    found = entries(device)
+    assert (device.title, device.address) == ("pump-node", 26)
+    assert found["level"] == {
+        "at": 16, "table": "input", "unit": "m", "number_format": "F32", "order": "CDAB", "note": "Level",
+    }  # fmt: skip
+    assert (found["part"]["part"], found["shown"]["step"]) == ("4-11", 0.1)
+    assert (found["running"]["at"], found["running"]["table"]) == (3, "coil")
+    assert found["label"] == {"at": 40, "length": 4}
+    assert found["mode"]["values"] == {"auto": 1, "hand": 2}
+    text = family_text(device, "x")
+    assert "# gap: split: only its count is read: bits that are not side by side: 0x101" in text
+    assert "# gap: shown: not all of its filters were carried over: lambda" in text
+    assert "# gap: computed: only its count is read: its lambda is a program" in text
+    assert told(device) == [
+        "Raw: its value type RAW has no number format",
+        "speed: is only written: a command is never imported",
+    ]
+    assert loaded(tmp_path, device, "level", "part", "running")["part"].part == (4, 11)
+
+
 # ---- what is refused ----
+
+
+def bomb(levels: int) -> str:
+    """Return YAML in which each list has the one before it ten times."""
+    lists = "".join(
+        f"a{at}: &a{at} [{', '.join([f'*a{at - 1}' if at else '1'] * 10)}]\n" for at in range(levels)
+    )
+    return f"{lists}modbus: *a{levels - 1}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (bomb(9), "has more than 50000 entries, aliases counted as what they stand for"),
+        ("a: &a [*a]\nmodbus: *a\n", "has more than 50000 entries"),
+        ("modbus: [" + "1," * 60_000 + "]", "has more than 50000 entries"),
+        ("[" * 50_000, "is YAML that is nested too deeply"),
+        ("a" * 1_000_001, "has more than 1000000 characters"),
+        ("modbus: !!python/object/apply:os.system [true]", "is not YAML"),
+        ("modbus: [}", "is not YAML"),
+    ],
+)
+def test_yaml_that_would_be_costly_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    pytest.importorskip("yaml")
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(told)):
+        read_devices(tmp_path / "a.yaml")
+
+
+# ---- of any file ----
 
 
 @pytest.mark.parametrize(
@@ -285,23 +291,6 @@ def test_what_is_no_table_is_refused(tmp_path: Path, name: str, text: str, told:
         read_devices(path)
 
 
-def test_why_nothing_can_be_imported_is_told_on_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("name;address\nx;1,5\n")
-    with pytest.raises(ValueError, match=r'that can be imported: x: "1,5" is no address'):
-        read_devices(path)
-    path = tmp_path / "a.toml"
-    path.write_text('[family]\ntitle = "T"\n')
-    with pytest.raises(ValueError, match="is a family's file already"):
-        read_devices(path)
-    pytest.importorskip("yaml")
-    path = tmp_path / "a.yaml"
-    path.write_text("a: [")
-    with pytest.raises(ValueError, match="is not YAML") as refused:
-        read_devices(path)
-    assert "\n" not in str(refused.value)
-
-
 def test_texts_of_a_file_cannot_leave_their_places(tmp_path: Path) -> None:
     name = 'a"]\n[command]\nrun = { at = 1 }\n'
     document = {"device": {"channels": [{"name": name, "reg_type": "holding", "address": 1, "units": name}]}}
@@ -317,11 +306,19 @@ def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "meter.toml", "plant.toml"))
     source.write_text(MODPOLL)
     status, out, err = run("import", source, "--out", family, "--plant", plant)
-    assert (status, "not carried over: coils" in err) == (0, True)
+    assert (status, "not carried over: coils: which bits bool8 means" in err) == (0, True)
     assert f"multidrop check {family}" in out
     assert run("check", family)[0] == 0
     assert run("plan", plant)[0] == 0
     assert run("import", source, "--out", family)[0] == 2
+
+
+def test_a_device_of_texts_alone_gets_no_plant(run: Run, tmp_path: Path) -> None:
+    source, family, plant = (tmp_path / name for name in ("c.csv", "label.toml", "plant.toml"))
+    source.write_text("name,address,type\nlabel,1!400001.8,STRING\n")
+    status, _, err = run("import", source, "--out", family, "--plant", plant)
+    assert (status, "texts alone, which are never polled" in err) == (2, True)
+    assert not family.exists()
 
 
 def test_import_asks_which_device(run: Run, tmp_path: Path) -> None:

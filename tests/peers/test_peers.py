@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -64,6 +65,20 @@ def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
             "relay": 1,  # coil 5
             "door": 1,
         }
+
+
+def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
+    """Registers and coils that nothing declares hold what the servers' own sources say."""
+    port, framing = server
+    with Bus(port) as bus:
+        device = bus.attach(Device, ADDRESS, framing=framing)
+        for function in (3, 4):
+            assert bus.ask(device, function, 50, 3) == struct.pack(">3H", 1050, 1051, 1052)
+        for function in (1, 2):
+            assert bus.ask(device, function, 1, 10) == bytes([0b01010101, 0b01])
+        with pytest.raises(DriveRefused) as refusal:
+            bus.ask(device, 3, 40000, 1)
+        assert refusal.value.code == 2
 
 
 def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 
@@ -12,7 +13,7 @@ from batches import EXAMPLE, SECOND, UTC_0, block, completion, counting, example
 from completions import add_miss, add_rows
 from recordings import SCHEMA, rows_of
 
-from multidrop.core import Columns, Names, Status
+from multidrop.core import Columns, Names, RowQueue, Status
 from multidrop.polling.batch import Batch, Row
 
 
@@ -132,3 +133,54 @@ def test_every_status_can_be_spelt() -> None:
 def test_importing_the_library_does_not_import_nanoarrow() -> None:
     code = "import sys, multidrop.polling.batch, multidrop.recording; sys.exit('nanoarrow' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# ---- columns as they lie in memory ----
+
+
+def test_columns_have_the_rows_and_the_names_of_their_codes() -> None:
+    columns = example().columns()
+    drives, registers, statuses = columns.drives, columns.registers, columns.statuses
+    rows = [
+        Row(time, sent, near, drives[drive], registers[register], value, statuses[status])
+        for time, sent, near, drive, register, value, status in zip(*columns[:7], strict=True)
+    ]
+    assert [row._replace(uncertainty_ns=None, value=None) for row in rows] == [
+        row._replace(uncertainty_ns=None, value=None) for row in EXAMPLE
+    ]
+    samples = [at for at, status in enumerate(columns.status) if status == 0]
+    assert [rows[at] for at in samples] == [row for row in EXAMPLE if row.status == "ok"]
+    assert bytes(columns.valid) == bytes([sum(1 << at for at in samples)])
+
+
+def test_columns_have_the_types_that_are_promised() -> None:
+    columns = counting(20).columns()
+    formats = {"time": "q", "monotonic_ns": "q", "uncertainty_ns": "q", "value": "d"}
+    formats |= dict.fromkeys(("drive", "register", "status"), "H") | {"valid": "B"}
+    for name, kind in formats.items():
+        view = getattr(columns, name)
+        assert (view.format, view.shape, view.readonly) == (kind, (3 if name == "valid" else 20,), True)
+    numpy = pytest.importorskip("numpy")
+    assert numpy.asarray(columns.value)[:9].tolist() == list(range(9))
+
+
+def test_columns_outlive_their_batch() -> None:
+    """Chunks that a queue takes back are filled anew: not while a view of them is held."""
+    queue = RowQueue()
+    names = Names(["a"])
+    kept = []
+    for at in range(200):
+        queue.add_miss(block(0, 0), Status.NO_REPLY, at)
+        taken = queue.take()
+        assert taken is not None
+        kept.append(Batch(taken, names, names).columns().monotonic_ns)
+        del taken
+    gc.collect()
+    assert [list(view) for view in kept] == [[at] for at in range(200)]
+
+
+def test_names_that_come_later_leave_the_codes_as_they_were() -> None:
+    names = Names(["a"])
+    first = Batch(Columns(1), names, names).columns()
+    assert names.number("b") == 1
+    assert (first.drives, Batch(Columns(1), names, names).columns().drives) == (("a",), ("a", "b"))

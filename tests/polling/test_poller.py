@@ -18,7 +18,7 @@ from typing import Any
 import checksums
 import pytest
 from leftovers import descriptors, threads
-from lines import PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
+from lines import HOST_LATE, PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
 from serial import Serial
 from toy import Toy
 from worlds import World, WorldWire
@@ -32,19 +32,7 @@ from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 
-# What a machine that has much else to do may add to what a test is about.
 NOT_SENT = {str(Status.NOT_ASKED), str(Status.LATE_ANSWER_DUE)}
-HOST_LATE = {
-    str(it)
-    for it in (
-        Status.NO_REPLY,
-        Status.CUT_SHORT,
-        Status.LATE_ANSWER_DUE,
-        Status.NOT_ASKED,
-        Status.EXPIRED,
-        Status.POLL_ENDED,
-    )
-}
 
 
 class Quick(Toy):

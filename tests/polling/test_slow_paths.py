@@ -18,7 +18,7 @@ from variants import LINES, of_all_variants, of_one_variant
 from multidrop import bus
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
-from multidrop.core import Message
+from multidrop.core import Framing, Message
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
@@ -96,6 +96,36 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
                 else:
                     assert value == proof(drive, register)
                     read[drive.name] += 1
+    assert set(read) == {drive.name for drive in drives}
+
+
+@pytest.mark.parametrize(("path", "seconds"), PATHS)
+@pytest.mark.parametrize("name", [name for name in LINES if "native" not in name])
+def test_what_a_bus_is_asked_for_over_a_slow_path_is_true(
+    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+) -> None:
+    """Reads past the table, each once, beside reads of the same function and length from other addresses."""
+    drives = [drive for drive in of_one_variant(LINES[name]) if drive.framing is not Framing.DELIXI]
+    opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
+    plain = {
+        drive: [each for each in drive.readings() if each.words == 1 and each not in drive.known_counts()][:5]
+        for drive in drives
+    }
+    read: Counter[str] = Counter()
+    with opened:
+        for _ in range(24):
+            for drive, registers in plain.items():
+                for turn, register in enumerate(registers):
+                    try:
+                        if turn % 2:
+                            assert opened.read(drive, register) == proof(drive, register)
+                            continue
+                        data = opened.ask(drive, register.table.read, register.address, 1, expiry=30.0)
+                    except BusError:
+                        line.sleep(0.05)
+                    else:
+                        assert register.number_in(data, 0) == proof(drive, register)
+                        read[drive.name] += 1
     assert set(read) == {drive.name for drive in drives}
 
 

@@ -14,13 +14,15 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-from batches import EXAMPLE, METADATA, counting, example
+from batches import EXAMPLE, METADATA, block, completion, counting, example
+from completions import add_miss, add_rows
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recordings import SCHEMA, rows_of
+from recordings import FILE_SCHEMA, SCHEMA, is_kept, record_as_before, rows_of
 
-from multidrop.polling.batch import Row, Rows
+from multidrop.core import Columns, Names, Status
+from multidrop.polling.batch import Batch, Row, Rows
 from multidrop.recording import (
     FORMATS,
     Metadata,
@@ -123,7 +125,7 @@ def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
     with pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()) as stream:
         table = stream.read_all()
     table.validate(full=True)
-    assert table.schema.equals(SCHEMA)
+    assert table.schema.equals(FILE_SCHEMA)
     assert json.loads(table.schema.metadata[b"multidrop"]) == METADATA
     assert rows_of(table) == RECORDED
 
@@ -162,11 +164,16 @@ def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
     assert text == [row[1:] for row in RECORDED]
 
 
-def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_before", [False, True])
+def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path, is_before: bool) -> None:
     path = tmp_path / "a.arrows"
-    with open_writer(path, METADATA) as writer:
-        writer.write(from_rows([Row(0, 0, None, "h\u00e9", "r", None, "no reply")] * 2))
-    content, whole, cut = path.read_bytes(), struct.pack("<3i", 0, 3, 6), struct.pack("<3i", 0, 2, 6)
+    some = from_rows([Row(0, 0, None, name, "r", None, "no reply") for name in ("h\u00e9", "x")])
+    if is_before:
+        record_as_before(path, some)
+    else:
+        with open_writer(path, METADATA) as writer:
+            writer.write(some)
+    content, whole, cut = path.read_bytes(), struct.pack("<3i", 0, 3, 4), struct.pack("<3i", 0, 2, 4)
     assert content.count(whole) == 1
     path.write_bytes(content.replace(whole, cut))
     with pytest.raises(ValueError, match="is damaged after row 0: its text is not UTF-8"):
@@ -229,7 +236,9 @@ def test_any_rows(tmp_path_factory: pytest.TempPathFactory, suffix: str, some: l
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     with open_writer(path, {}) as writer:
         writer.write(from_rows(some))
-    assert rows(open_reader(path)) == some
+    found = rows(open_reader(path))
+    assert len(found) == len(some)
+    assert found == some or (suffix == ".arrows" and all(map(is_kept, found, some)))
 
 
 @every_format
@@ -246,7 +255,10 @@ def test_any_batches_converted(
             writer.write(from_rows(some))
     written = [row for some in batches for row in some]
     assert convert(folder / f"a{suffix}", folder / f"b{target}") == len(written)
-    assert repr(rows(open_reader(folder / f"b{target}"))) == repr(written)
+    found = rows(open_reader(folder / f"b{target}"))
+    assert len(found) == len(written)
+    is_rounded = ".arrows" in (suffix, target)
+    assert repr(found) == repr(written) or (is_rounded and all(map(is_kept, found, written)))
 
 
 def as_text(name: str) -> str:
@@ -337,7 +349,7 @@ def test_target_is_untouched_when_the_source_is_not_a_recording(tmp_path: Path) 
     assert rows(open_reader(target)) == RECORDED
 
 
-DAMAGED_AT = {".arrows": b"okok", ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
+DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".parquet": b"PAR1"}  # behind it
 
 
 @every_format
@@ -423,3 +435,124 @@ def test_neither_arrows_nor_csv_need_pyarrow(
     for name in ("pyarrow", "numpy", "pandas", "polars"):
         monkeypatch.setitem(sys.modules, name, None)
     assert rows(open_reader(record(tmp_path / f"a{suffix}"))) == RECORDED
+
+
+# ---- dictionaries ----
+
+
+def test_recordings_from_before_are_read_and_converted(tmp_path: Path) -> None:
+    batches = (example(), counting(2000), counting(500, 2000))
+    path = record_as_before(tmp_path / "a.arrows", *batches, metadata=json.dumps(METADATA).encode())
+    reader = open_reader(path)
+    assert (reader.metadata, reader.truncated, rows(reader)) == (METADATA, 0, RECORDED)
+    assert convert(path, tmp_path / "b.arrows") == 2505
+    assert rows(open_reader(tmp_path / "b.arrows")) == RECORDED
+    assert (tmp_path / "b.arrows").stat().st_size < path.stat().st_size * 0.6
+
+
+def test_pandas_and_duckdb_take_arrows_through_pyarrow(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+    table = pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()).read_all()
+    frame = table.to_pandas()
+    assert isinstance(frame["drive"].dtype, pandas.CategoricalDtype)
+    assert list(frame["drive"]) == [row.drive for row in RECORDED]
+    columns = "epoch_ns(time), monotonic_ns, uncertainty_ns, drive, register, value, status"
+    for taken in (table, open_reader(tmp_path / "a.arrows")):
+        found = duckdb.from_arrow(taken).query("taken", f"select {columns} from taken").fetchall()
+        assert [Row(*row) for row in found] == RECORDED
+
+
+class Grown:
+    """Batches whose drives become more, as those of a poller to which drives are added."""
+
+    def __init__(self) -> None:
+        self.names = Names(["pump-0"])
+        self.rows: list[Row] = []
+
+    def batch(self) -> Batch:
+        columns = Columns(len(self.names))
+        for drive in range(len(self.names)):
+            assert add_rows(columns, block(drive, 0), completion(1, first_ns=2, words=(100 * drive,)), 0)
+        batch = Batch(columns, self.names, Names(["speed"]))
+        self.rows += batch
+        self.names.number(f"pump-{len(self.names)}")
+        return batch
+
+
+def test_drives_that_come_later_have_their_names_for_every_reader(tmp_path: Path) -> None:
+    """polars and nanoarrow read no deltas of dictionaries: each changed one is written anew."""
+    polars = pytest.importorskip("polars", reason="needs polars")
+    nanoarrow = pytest.importorskip("nanoarrow")
+    path, grown = tmp_path / "a.arrows", Grown()
+    with open_writer(path, {}) as writer:
+        for _ in range(300):
+            writer.write(grown.batch())
+    names = [row.drive for row in grown.rows]
+    assert [row.drive for row in rows(open_reader(path))] == names
+    assert pa.ipc.open_stream(path.read_bytes()).read_all().column("drive").to_pylist() == names
+    assert polars.read_ipc_stream(path)["drive"].to_list() == names
+    with path.open("rb") as file:
+        stream = nanoarrow.ArrayStream.from_readable(file)
+        assert [name for part in stream for name in part.child(3).iter_py()] == names
+
+
+def test_a_stream_that_another_program_wrote_anew_is_read(tmp_path: Path) -> None:
+    """Its dictionaries have other ids, and come as deltas where it likes."""
+    path, grown = record(tmp_path / "a.arrows"), Grown()
+    table = pa.ipc.open_stream(path.read_bytes()).read_all()
+    with pa.ipc.new_stream(tmp_path / "b.arrows", table.schema) as stream:
+        stream.write_table(table)
+    reader = open_reader(tmp_path / "b.arrows")
+    assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
+    options = pa.ipc.IpcWriteOptions(emit_dictionary_deltas=True)
+    with pa.ipc.new_stream(tmp_path / "c.arrows", FILE_SCHEMA, options=options) as stream:
+        for _ in range(5):
+            stream.write_batch(pa.record_batch(grown.batch()).cast(FILE_SCHEMA))
+    assert rows(open_reader(tmp_path / "c.arrows")) == grown.rows
+
+
+@pytest.mark.parametrize("count", [255, 256, 257, 1000])
+def test_more_statuses_than_a_byte_has_values(tmp_path: Path, count: int) -> None:
+    some = [Row(at, at, None, "a", "b", None, f"status {at % count}") for at in range(2500)]
+    path = tmp_path / "a.arrows"
+    with open_writer(path, {}) as writer:
+        writer.write(from_rows(some))
+    assert rows(open_reader(path)) == some
+    assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == some
+
+
+def test_all_exceptions_of_a_line_at_once(tmp_path: Path) -> None:
+    """The core's own codes: 255 exceptions, and a good reply between them."""
+    columns = Columns(1024)
+    for code in range(512):
+        reply = completion(code + 1, first_ns=code + 2, words=(7,), exception=code % 256)
+        assert add_rows(columns, block(0, 0), reply, 0)
+    for status in list(Status)[1:]:
+        assert add_miss(columns, block(0, 0), status, 1000, 0)
+    batch = Batch(columns, Names(["a"]), Names(["b"]))
+    assert len({row.status for row in batch}) > 256
+    path = tmp_path / "a.arrows"
+    with open_writer(path, {}) as writer:
+        writer.write(batch)
+        writer.write(batch)
+        assert writer.rows == 2 * len(batch)
+    assert rows(open_reader(path)) == [*batch, *batch]
+    assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == [*batch, *batch]
+
+
+def test_a_row_takes_35_bytes_at_most(tmp_path: Path) -> None:
+    """31 drives of 10 values at 10 Hz, in batches of a tenth of a second, some of them misses."""
+    drives = Names([f"pump-{number}" for number in range(31)])
+    registers = Names([f"some_register_{number}" for number in range(10)])
+    with open_writer(tmp_path / "a.arrows", METADATA) as writer:
+        for _ in range(100):
+            columns = Columns(310)
+            for drive in range(31):
+                layout = block(drive, *range(10))
+                if drive == 7:
+                    assert add_miss(columns, layout, Status.NO_REPLY, 1, 0)
+                else:
+                    assert add_rows(columns, layout, completion(1, first_ns=2, words=(1,) * 10), 0)
+            writer.write(Batch(columns, drives, registers))
+    assert (tmp_path / "a.arrows").stat().st_size <= 35 * writer.rows

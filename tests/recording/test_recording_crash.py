@@ -23,10 +23,11 @@ from examples import examples, usually
 from recordings import rows_of
 from toy import Toy
 
-from multidrop.core import Columns
+from multidrop.core import Columns, Names
 from multidrop.polling.batch import Batch, Row
 from multidrop.recording import FORMATS, RecordingError, RecordingReader, open_reader, open_writer, repair
 from multidrop.recording.append_file import AppendFile
+from multidrop.recording.rows import from_rows
 
 growing = pytest.mark.parametrize("suffix", [".arrows", ".csv"])
 ROWS = 20  # of a batch
@@ -63,6 +64,62 @@ def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> No
         assert reader.truncated == cut - lengths[batches]
         assert reader.metadata == METADATA
         assert rows(reader) == expected[: batches * ROWS]
+
+
+def test_a_cut_between_names_and_their_rows_leaves_what_all_can_read(tmp_path: Path) -> None:
+    """Dictionaries go before their batch, and a cut may leave some of them, and no batch."""
+    polars = pytest.importorskip("polars", reason="needs polars")
+    path = tmp_path / "a.arrows"
+    lengths, names = [], Names(["pump-0"])
+    with open_writer(path, METADATA) as writer:
+        lengths.append(path.stat().st_size)
+        for batch in range(4):
+            columns = Columns(1)
+            assert add_rows(columns, block(batch, 0), completion(1, first_ns=2, words=(batch,)), 0)
+            writer.write(Batch(columns, names, names))
+            lengths.append(path.stat().st_size)
+            names.number(f"pump-{batch + 1}")
+    whole = path.read_bytes()
+    for cut in {*range(lengths[0], len(whole), 24), *lengths, len(whole)}:
+        path.write_bytes(whole[:cut])
+        batches = sum(length <= cut for length in lengths) - 1
+        assert repair(path) == cut - lengths[batches]
+        expected = [f"pump-{batch}" for batch in range(batches)]
+        assert [row.drive for row in rows(open_reader(path))] == expected
+        assert pa.ipc.open_stream(path.read_bytes()).read_all().column("drive").to_pylist() == expected
+        assert polars.read_ipc_stream(path)["drive"].to_list() == expected
+
+
+def test_names_of_a_batch_that_had_no_room_are_written_with_the_next(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    with open_writer(path, METADATA) as writer:
+        for room in (0, 100, 700):
+            with full_at(path.stat().st_size + room), pytest.raises(RecordingError):
+                writer.write(counting(ROWS))
+        writer.write(counting(ROWS))
+    with pa.ipc.open_stream(path.read_bytes()) as stream:
+        assert rows_of(stream.read_all()) == list(counting(ROWS))
+
+
+def test_a_recording_behind_another_is_not_read_as_its_end(tmp_path: Path) -> None:
+    """Two recordings, one behind the other: codes of the second mean other names."""
+    first, second = tmp_path / "a.arrows", tmp_path / "b.arrows"
+    record(first, 2)
+    with open_writer(second, METADATA) as writer:
+        writer.write(example())
+    first.write_bytes(first.read_bytes() + second.read_bytes())
+    with pytest.raises(ValueError, match=f"is damaged after row {2 * ROWS}: there is a message that is not"):
+        rows(open_reader(first))
+
+
+def test_names_that_would_fill_the_memory_are_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.arrows"
+    row = Row(1, 1, None, "x" * 2**20, "r", None, "no reply")
+    with open_writer(path, METADATA) as writer:
+        writer.write(from_rows([row] * 300))
+    assert path.stat().st_size < 2**21
+    with pytest.raises(ValueError, match="a batch of 300 rows with names too long for so many"):
+        rows(open_reader(path))
 
 
 def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from multidrop.core import Status
 from multidrop.drive import Drive
 from multidrop.drive.register import Register
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
@@ -21,6 +22,18 @@ from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
 PATIENCE = 120.0  # s, for what comes at once but on a machine that has much else to do
+# What a machine that has much else to do may add to what a test is about.
+HOST_LATE = {
+    str(status)
+    for status in (
+        Status.NO_REPLY,
+        Status.CUT_SHORT,
+        Status.LATE_ANSWER_DUE,
+        Status.NOT_ASKED,
+        Status.EXPIRED,
+        Status.POLL_ENDED,
+    )
+}
 patient = pytest.mark.usefixtures("_patient")  # drives are waited for as long as it takes
 
 

@@ -64,6 +64,35 @@ SCHEMA = pa.schema(
     ]
 )
 
+FILE_SCHEMA = pa.schema(  # of .arrows: names are dictionaries, and a bound is rounded up
+    [
+        *(SCHEMA.field(name) for name in ("time", "monotonic_ns")),
+        pa.field("uncertainty_ns", pa.float32()),
+        pa.field("drive", pa.dictionary(pa.uint16(), pa.string()), nullable=False),
+        pa.field("register", pa.dictionary(pa.uint16(), pa.string()), nullable=False),
+        SCHEMA.field("value"),
+        pa.field("status", pa.dictionary(pa.uint8(), pa.string()), nullable=False),
+    ]
+)
+
+
+def is_kept(found: Row, written: Row) -> bool:
+    """Return True where a row came back from .arrows: its uncertainty is no less, and hardly more."""
+    bound, least = found.uncertainty_ns, written.uncertainty_ns
+    if bound is None or least is None:
+        is_near = bound is least
+    else:
+        is_near = 0 <= bound - least <= (abs(least) // 2**23 if abs(least) > 2**24 else 0)
+    return is_near and repr(found._replace(uncertainty_ns=0)) == repr(written._replace(uncertainty_ns=0))
+
+
+def record_as_before(path: Path, *batches: Any, metadata: bytes = b"{}") -> Path:
+    """Write batches as until 0.1, by pyarrow: texts, and whole nanoseconds."""
+    with pa.ipc.new_stream(path, SCHEMA.with_metadata({"multidrop": metadata})) as stream:
+        for batch in batches:
+            stream.write_batch(pa.record_batch(batch).cast(SCHEMA))
+    return path
+
 
 def rows_of(table: pa.Table | pa.RecordBatch) -> list[Row]:
     """Return the rows as pyarrow sees them, with the time as a number."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from lines import until
+from lines import PATIENCE, rows_of, until
 
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, build_request, parse_request
@@ -18,6 +18,7 @@ from multidrop.drive.register import HOLDING, reading
 from multidrop.drives import YD1000, DelixiNative, InnovertIBD
 from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Refused
 from multidrop.plant.loader import PlantError, load_plant
+from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.opening import unopened
@@ -184,6 +185,58 @@ def test_a_plant_file_tells_each_mistake(tmp_path: Path) -> None:
     assert "framing rtu is a serial line's, and tcp://10.0.0.7 speaks Modbus TCP" in said
     assert "transaction is a fact of tcp:// ports, and /dev/ttyUSB0 is none" in said
     assert "framing tcp is that of tcp:// ports" in said
+
+
+# ---- several lines of one gateway ----
+
+
+def plant_of_two(path: Path, port: str, second: int) -> Path:
+    path.write_text(
+        "".join(
+            f'[[line]]\nname = "net-{number}"\nport = "{port}"\n'
+            f'[[line.drive]]\nname = "pump-{number}"\nmodel = "innovert-ibd"\naddress = {address}\n'
+            'poll = ["output_current"]\n'
+            for number, address in enumerate((1, second), 1)
+        )
+    )
+    return path
+
+
+def answer_when_both_asked(listening: socket.socket) -> None:
+    """Reply to no connection's first request before the other's is there."""
+    both_asked, answered = threading.Barrier(2), set[int]()
+
+    def serve(connection: socket.socket) -> None:
+        with connection, suppress(OSError, threading.BrokenBarrierError):
+            while request := connection.recv(260):
+                asked = parse_request(Framing.TCP, request)[1]
+                assert asked is not None
+                if asked.address not in answered:
+                    both_asked.wait(PATIENCE)
+                    answered.add(asked.address)
+                held = Message(
+                    asked.address, 3, data=bytes([0, asked.address]), transaction=asked.transaction
+                )
+                connection.sendall(build_reply(Framing.TCP, held))
+
+    for _ in range(2):
+        threading.Thread(target=serve, args=[listening.accept()[0]], daemon=True).start()
+
+
+def test_two_lines_of_one_gateway_have_a_request_under_way_each(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=answer_when_both_asked, args=[listening], daemon=True).start()
+        port = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        found: set[tuple[str, object]] = set()
+        with Poller(load_plant(plant_of_two(tmp_path / "plant.toml", port, 2))) as poller:
+            until(lambda: found.update((row.drive, row.value) for row in rows_of(poller)) or len(found) > 1)
+    assert found - {("pump-1", None), ("pump-2", None)} <= {("pump-1", 0.1), ("pump-2", 0.2)}
+
+
+def test_one_unit_is_on_one_line_of_its_gateway(tmp_path: Path) -> None:
+    sentence = r'line "net-2", drive "pump-2": address 1 is that of line "net-1", drive "pump-1" already'
+    with pytest.raises(PlantError, match=sentence):
+        load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
 
 
 # ---- far ends of another kind ----

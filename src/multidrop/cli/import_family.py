@@ -12,7 +12,10 @@ from multidrop.importers import ImportedDevice, family_text, plant_text, read_de
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "file", metavar="FILE", type=Path, help="CSV, TSV, YAML (Home Assistant), TOML (Telegraf) or JSON"
+        "file",
+        metavar="FILE",
+        type=Path,
+        help="CSV, TSV, YAML (Home Assistant, ESPHome), TOML (Telegraf) or JSON",
     )
     parser.add_argument("--address", metavar="N", type=int, help="the device, where the file has several")
     parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; printed without it")

@@ -41,7 +41,12 @@ class AuditLog:
 
 
 def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
-    """Yield the records of a log in order, without those that a crash truncated."""
+    """Yield the records of a log in order, without those that a crash truncated.
+
+    Each has `time` (UTC), `port`, `drive`, `model`, `address`, `write`, `sent` (the frame) and `outcome`, and
+    where they are known `held` (what the drive holds since), `why`, `by` and `way` (see `written_by`). Raises
+    OSError.
+    """
     with Path(path).open("rb") as lines:
         for line in lines:
             try:

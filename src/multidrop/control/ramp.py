@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from contextvars import copy_context
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register
@@ -37,7 +38,7 @@ def _stop(drives: Sequence[Drive]) -> None:
         with suppress(BusError, ValueError):
             drive.stop()
 
-    threads = [threading.Thread(target=stop, args=[drive]) for drive in drives]
+    threads = [threading.Thread(target=copy_context().run, args=[stop, drive]) for drive in drives]
     for thread in threads:
         thread.start()
     for thread in threads:

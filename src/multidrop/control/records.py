@@ -11,6 +11,7 @@ from contextlib import suppress
 from typing import Any
 
 from multidrop.control.audit_log import AuditLog
+from multidrop.control.author import present_author
 from multidrop.control.eeprom_ledger import LEAST_INTERVAL, Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.control.rules import refused
@@ -70,7 +71,7 @@ class WriteRecords:
             "sent": frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper(),
             "outcome": effect.value,
         }
-        more = {"held": None if held is None else float(held), "why": why}
+        more = {"held": None if held is None else float(held), "why": why, **present_author()._asdict()}
         record |= {key: text for key, text in more.items() if text not in (None, "")}
         self._unlogged.append((clock.utc_ns(), record))
 
@@ -85,7 +86,12 @@ class WriteRecords:
 
     def _append(self, at_ns: int, record: dict[str, Any]) -> None:
         why = f": {record['why']}" if "why" in record else ""
-        _log.info("%s: %s: %s%s", record["drive"], record["write"], record["outcome"], why)
+        by = (
+            f" (by {', '.join(record[key] for key in ('by', 'way') if key in record)})"
+            if "by" in record
+            else ""
+        )
+        _log.info("%s: %s: %s%s%s", record["drive"], record["write"], record["outcome"], why, by)
         audit = self.audit
         if audit is None:
             return

@@ -215,6 +215,7 @@ class Names:
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)
         self._numbers = {name: number for number, name in enumerate(self._names)}
+        self._listed = tuple(self._names)
         self._spelling = self._spell()
 
     def number(self, name: str) -> int:
@@ -229,6 +230,13 @@ class Names:
 
     def __len__(self) -> int:
         return len(self._names)
+
+    @property
+    def listed(self) -> tuple[str, ...]:
+        """All names so far, each in the place that its number says; the same tuple while none is added."""
+        if len(self._listed) != len(self._names):
+            self._listed = tuple(self._names)
+        return self._listed
 
     def _spell(self) -> Spelling:
         encoded = [name.encode() for name in self._names]

@@ -14,6 +14,7 @@ from multidrop.drive.register import Carrier, Register, Table
 
 # The application protocol V1.1b3, 6.1 to 6.4; Delixi's own frames have room for one.
 STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}
+FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # that read, by code
 LONGEST_INTERVAL = 10.0  # s
 
 
@@ -27,6 +28,19 @@ def read_limit(family: Any, table: Table) -> int:
     """Return how many registers one read may take: as stated, else as many as the standard allows."""
     stated = stated_limit(family, table)
     return STANDARD_LIMITS[table.carrier] if stated is None else stated
+
+
+def function_limit(family: Any, function: int) -> int:
+    """Return how many addresses one read by this function may take, whatever lies there.
+
+    That is the least that the family states for it, but as many as its longest register has.
+    """
+    standard = STANDARD_LIMITS[FUNCTIONS[function]]
+    stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]
+    if not stated:
+        return standard
+    held = [len(register.reach) for register in family.registers.values() if register.table.read == function]
+    return min(standard, max(min(stated), *held, 1))
 
 
 def stated_gaps(family: Any, table: Table) -> list[range]:

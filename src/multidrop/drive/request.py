@@ -5,11 +5,13 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from multidrop.core import Message
+from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
+from multidrop.drive.read_limits import FUNCTIONS, function_limit
 from multidrop.drive.register import Carrier, Register, Table
 
 _WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once
+_ADDRESSES = 0x10000  # of each of a drive's four tables (application protocol V1.1b3, 4.3)
 
 
 def read_request(drive: Drive, table: Table, start: int, count: int) -> Message:
@@ -46,3 +48,26 @@ def write_request(drive: Drive, register: Register[Any], raw: float, address: in
     if register.words == 1:
         return Message(to, table.write, at, count=1 if table.write == _WRITE_WORDS else 0, data=words)
     return Message(to, _WRITE_WORDS, at, count=register.words, data=words)
+
+
+def any_read(drive: Drive, function: int, start: int, count: int) -> Message:
+    """Return the request that reads addresses by one of Modbus' functions 01 to 04, declared or not.
+
+    Raises TypeError for what is no whole number, and ValueError for another function, a drive that speaks no
+    Modbus, and a span that no request, or no request to this family, can read.
+    """
+    for name, number in (("function", function), ("start", start), ("count", count)):
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise TypeError(f"{name} = {number!r} is no whole number")
+    if drive.framing is Framing.DELIXI:
+        raise ValueError(f"{drive.name} speaks Delixi's own protocol, which has none of Modbus' functions")
+    if function not in FUNCTIONS:
+        raise ValueError(f"function = {function} is none of those that read: 1, 2, 3 and 4")
+    if not 0 <= start < _ADDRESSES:
+        raise ValueError(f"start = {start} is no address from 0 to {_ADDRESSES - 1}")
+    most = function_limit(drive, function)
+    if not 1 <= count <= most:
+        raise ValueError(f"count = {count} is not from 1 to {most}, which {drive.name} reads in one request")
+    if start + count > _ADDRESSES:
+        raise ValueError(f"start + count = {start + count}: the last address is {_ADDRESSES - 1}")
+    return Message(drive.address, function, start, count)

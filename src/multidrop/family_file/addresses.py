@@ -70,7 +70,8 @@ class Counting:
         return self.address(text, table, default)
 
     def _number(self, number: int, table: str) -> int:
-        if is_ambiguous(number, table):
+        digit = _DIGIT_OF_TABLE[table]
+        if digit != "0" and str(number).startswith(digit) and _NUMBERED.fullmatch(str(number)):
             raise ValueError(_ambiguous(str(number), number))
         return self._sent(number, number)
 
@@ -83,10 +84,10 @@ class Counting:
         return number - first
 
 
-def is_ambiguous(number: int, table: str) -> bool:
-    """Return True for a number of TOML that may be the manual's 40001 too: TOML has no hex to tell it by."""
-    digit = _DIGIT_OF_TABLE[table]
-    return digit != "0" and str(number).startswith(digit) and _NUMBERED.fullmatch(str(number)) is not None
+def sent_as(address: int, table: str) -> str:
+    """Return the TOML of an address that is sent as it is, where `counts_from` is 0."""
+    is_plain = not _NUMBERED.fullmatch(str(address)) or _TABLE_OF_DIGIT[str(address)[0]] != table
+    return f"0x{address:04X}" if is_plain else f'"{address:X}H"'
 
 
 def _ambiguous(text: str, number: int) -> str:
@@ -95,7 +96,7 @@ def _ambiguous(text: str, number: int) -> str:
     numbered = int(text[1:])
     return (
         f"{text} may be the number {text}, or register {numbered} of table {table}; write {right}, "
-        f'or "{text}" for that of the table, both in quotes (in a CSV file without counts_from)'
+        f'or "{text}" in quotes in the TOML file (in a CSV file without counts_from) for that of the table'
     )
 
 

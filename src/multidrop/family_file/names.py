@@ -12,7 +12,7 @@ LONGEST_NAME = 60
 MOST_VALUES = 500
 MOST_BITS = 64
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "name", "value"})
+OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "name", "value"})
 
 
 def unusable(name: str) -> str:
@@ -58,7 +58,7 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
     for name, number in given.items():
         if why := unusable(name):
             yield f"{key}: {name!r} is no name: {why}"
-        elif name in _OF_ENUMERATIONS:
+        elif name in OF_ENUMERATIONS:
             yield f"{key}: {name!r} is a name that all enumerations have; write {name}_"
         elif name.lower() in spelt:
             yield f"{key}: {name} and {spelt[name.lower()]} differ in capitals alone; call one otherwise"

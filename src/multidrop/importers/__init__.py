@@ -9,14 +9,18 @@ from typing import Any
 
 from multidrop.importers.csv_tables import read_table
 from multidrop.importers.device import ImportedDevice
+from multidrop.importers.esphome import is_esphome, read_esphome
 from multidrop.importers.family_text import family_text, plant_text
 from multidrop.importers.home_assistant import read_home_assistant
+from multidrop.importers.settling import settle
 from multidrop.importers.sunspec import is_sunspec, read_sunspec
 from multidrop.importers.telegraf import read_telegraf
-from multidrop.importers.wb import read_wb
+from multidrop.importers.wb import json_without_comments, read_wb
+from multidrop.importers.yaml_text import parse_yaml
+from multidrop.printable import printable
 from multidrop.toml_check import parse_document
 
-__all__ = ["ImportedDevice", "family_text", "plant_text", "read_devices"]
+__all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
 
@@ -24,26 +28,40 @@ MOST_BYTES = 5_000_000
 def read_devices(path: Path) -> list[ImportedDevice]:
     """Return the devices of a file, which its suffix and its contents tell apart.
 
-    Raises ValueError for what is no such file, ImportError for YAML without PyYAML.
+    Each has what a family can hold: its family file loads. Raises ValueError for what is no such file, or has
+    nothing that can be imported, ImportError for YAML without PyYAML.
     """
-    data = path.read_bytes()
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"{path} has more than {MOST_BYTES} bytes")
+    devices = all_devices(path)
+    found = [device for device in devices if device.registers or device.texts]
+    if not found:
+        lost = [printable(str(lost))[:200] for device in devices for lost in device.lost]
+        reasons = "; ".join(lost[:3])
+        raise ValueError(f"{path} has no register that can be imported{reasons and f': {reasons}'}")
+    return found
+
+
+def all_devices(path: Path) -> list[ImportedDevice]:
+    """Return the same with devices of which nothing can be imported. Raises as `read_devices` does."""
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is none of {', '.join(_READERS)}")
     try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as failure:
+        raise ValueError(f"{path} cannot be read: {failure.strerror}") from failure
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"{path} has more than {MOST_BYTES} bytes")
+    try:
         devices = read(data, path)
-    except (KeyError, AttributeError, TypeError, RecursionError) as failure:
-        raise ValueError(f"{path} is not laid out as its kind of file is: {failure!r}") from failure
+        for device in devices:
+            settle(device)
+    except (KeyError, AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
+        kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
+        raise ValueError(f"{path} is not laid out as its kind of file is: {kind}") from failure
     except ValueError as mistake:
-        raise ValueError(f"{path}: {mistake}") from mistake
-    found = [device for device in devices if device.registers or device.texts]
-    if not found:
-        lost = [sentence for device in devices for sentence in device.lost]
-        why = f": {lost[0]}" if lost else ""
-        raise ValueError(f"{path} has no register that can be imported{why}")
-    return found
+        raise ValueError(f"{path}: {printable(str(mistake))[:1000]}") from mistake
+    return devices
 
 
 def _table(data: bytes, path: Path) -> list[ImportedDevice]:
@@ -51,18 +69,16 @@ def _table(data: bytes, path: Path) -> list[ImportedDevice]:
 
 
 def _yaml(data: bytes, path: Path) -> list[ImportedDevice]:
-    return read_home_assistant(_text(data))
+    document = parse_yaml(_text(data))
+    return read_esphome(document) if is_esphome(document) else read_home_assistant(document)
 
 
 def _toml(data: bytes, path: Path) -> list[ImportedDevice]:
-    document = parse_document(data)
-    if "family" in document:
-        raise ValueError("is a family's file already: see `multidrop check`")
-    return read_telegraf(document)
+    return read_telegraf(parse_document(data))
 
 
 def _json(data: bytes, path: Path) -> list[ImportedDevice]:
-    document: Any = json.loads(_text(data))
+    document: Any = json.loads(json_without_comments(_text(data)))
     return read_sunspec(document) if is_sunspec(document) else read_wb(document)
 
 
@@ -82,3 +98,4 @@ _READERS: Mapping[str, Callable[[bytes, Path], list[ImportedDevice]]] = {
     ".conf": _toml,
     ".json": _json,
 }
+SUFFIXES = tuple(_READERS)

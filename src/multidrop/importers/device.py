@@ -3,96 +3,139 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from multidrop.drive.family import TAKEN_NAMES
-from multidrop.family_file.names import unusable
+from multidrop.family_file.names import OF_ENUMERATIONS, unusable
 
-_SIGNED = {"16": "I16", "32": "I32", "64": "I64"}
-_UNSIGNED = {"16": "U16", "32": "U32", "64": "U64"}
-_FLOATS = {"": "F32", "32": "F32", "64": "F64"}
-_KINDS: Mapping[str, Mapping[str, str]] = {
-    **dict.fromkeys(("int", "s", "i", "acc_s"), _SIGNED),
-    **dict.fromkeys(("uint", "u", "acc", "enum", "bitfield"), _UNSIGNED),
-    "float": _FLOATS,
-}
-_NAMED = {"word": "U16", "dword": "U32", "double": "F64", "float": "F32", "s8": "I8", "int8": "I8"}
-_NAMED |= {"sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
-TABLES = ("holding", "input", "coil", "discrete")
-
-
-def number_format(kind: str) -> str | None:
-    """Return the number format of a type such as uint16, s32 or float; None where it is not known."""
-    kind = kind.strip().lower()
-    if kind in _NAMED:
-        return _NAMED[kind]
-    match = re.fullmatch(r"([a-z_]+?)(\d*)", kind)
-    return _KINDS.get(match[1], {}).get(match[2]) if match else None
-
-
-def words_of(number: str) -> int:
-    return {"32": 2, "64": 4}.get(number[-2:], 1)
+WRITTEN = "it is written there; what a write does is not known here"
+ONLY_WRITTEN = "is only written: a command is never imported"
+MOST_ENTRIES = 20_000  # of one file
+_LONGEST_NAME = 50
+_TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
 
 
 @dataclass
 class ImportedRegister:
-    """One register; its address is the one that is sent. `gaps` are sentences about what is not known."""
+    """One register; its address is the one that is sent. `gaps` are sentences about what is not known.
+
+    `lacks` is what its value needs and a register cannot say: only the raw count is carried over. A family
+    file gets readings alone; what is written elsewhere is noted for whoever asks how much a register holds.
+    """
 
     name: str
     address: int
     table: str = "holding"
     details: dict[str, Any] = field(default_factory=dict)  # by the keys of a family file, in this order
     gaps: list[str] = field(default_factory=list)
+    lacks: str = ""
+    is_read: bool = True
+    is_written: bool = False
+    of_writes: dict[str, Any] = field(default_factory=dict)  # details that a written register has besides
+
+    def note_write(self, *, is_written: bool = True) -> None:
+        """Note that the other program writes it too: a gap, because nothing is known of what that does."""
+        self.is_written = is_written
+        if is_written:
+            self.gaps.append(WRITTEN)
+
+
+@dataclass(frozen=True)
+class Lost:
+    """An entry that could not be carried over, or with `is_entry` false another fact; and why."""
+
+    name: str
+    reason: str
+    is_entry: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}" if self.name else self.reason
 
 
 @dataclass
 class ImportedDevice:
-    """A device: what is read of it, and sentences about what could not be carried over."""
+    """A device: what is read of it, what is only written, and what could not be carried over."""
 
     title: str = ""
     address: int | None = None
     registers: list[ImportedRegister] = field(default_factory=list)
     texts: list[ImportedRegister] = field(default_factory=list)
-    lost: list[str] = field(default_factory=list)
+    commands: list[ImportedRegister] = field(default_factory=list)
+    lost: list[Lost] = field(default_factory=list)
+    readable: range = range(0)  # holding registers, of which any may be read across
+    names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
-        """Add a register under a name that no other has. Raises ValueError for an address that is none."""
-        if isinstance(found.address, bool) or not 0 <= found.address <= 0xFFFF:
-            self.lost.append(f"{found.name}: its address {found.address} is none from 0 to 65535")
+        """Add a register under a name that no other has; what cannot be one is lost."""
+        if isinstance(found.address, bool) or not isinstance(found.address, int):
+            self.lose(found.name, f"its address {str(found.address)[:40]!r} is no whole number")
             return
-        spelt, found.name = found.name, self._name(found.name)
-        if spelt != found.name and "note" not in found.details:
+        if not 0 <= found.address <= 0xFFFF:
+            self.lose(found.name, "its address is none from 0 to 65535")
+            return
+        spelt, found.name = found.name, self.names.free(found.name)
+        if not found.is_read:
+            self.lose(spelt, ONLY_WRITTEN)
+            self.commands.append(found)
+            return
+        if spelt != found.name and "note" not in found.details and not is_text:
             found.details["note"] = spelt
         (self.texts if is_text else self.registers).append(found)
 
-    def _name(self, spelt: str) -> str:
-        name = re.sub(r"[^A-Za-z0-9]+", "_", spelt).strip("_").lower()[:50] or "register"
-        if unusable(name) or name in _TAKEN:
+    def lose(self, name: str, reason: str, *, is_entry: bool = True) -> None:
+        """Note what could not be carried over, and why."""
+        self.lost.append(Lost(name, reason, is_entry))
+
+    @contextmanager
+    def entry(self, name: str) -> Iterator[None]:
+        """Lose the entry where reading it fails, not its file. Raises ValueError for too many entries."""
+        if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
+            raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
+        try:
+            yield
+        except (KeyError, AttributeError, TypeError, ValueError, OverflowError, IndexError) as failure:
+            self.lose(name, f"it cannot be read: {type(failure).__name__} {str(failure)[:100]}")
+
+
+class UniqueNames:
+    """Names for Python that are as near as can be to what was spelt, each given once."""
+
+    def __init__(self, taken: Collection[str] = _TAKEN) -> None:
+        self._taken = taken
+        self._given = Counter[str]()
+
+    def free(self, spelt: str) -> str:
+        name = re.sub(r"[^A-Za-z0-9]+", "_", spelt[:200]).strip("_").lower()[:_LONGEST_NAME] or "register"
+        if unusable(name) or name in self._taken:
             name = f"r_{name}"
-        taken = {each.name for each in (*self.registers, *self.texts)}
-        free = (name if number == 1 else f"{name}_{number}" for number in range(1, 10_000))
-        return next(each for each in free if each not in taken)
+        free = name
+        while free in self._given:
+            self._given[name] += 1
+            free = f"{name}_{self._given[name]}"
+        self._given[free] = 1
+        return free
 
 
-_TAKEN = TAKEN_NAMES | {"declared_verbs", "is_jogged"}
+def unit_address(given: Any) -> int | None:
+    """Return a device's address on the line; None where it is none."""
+    if isinstance(given, str) and given.strip().isdecimal():
+        given = int(given.strip()[:6])
+    is_one = isinstance(given, int) and not isinstance(given, bool) and 1 <= given <= 247
+    return given if is_one else None
 
 
-def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Add step and offset where they say something. A step may be "unknown": counts are shown then."""
-    if step == "unknown":
-        details["step"] = step
-        return
-    if number(step, 1) != 1:
-        details["step"] = number(step, 1)
-    if number(offset, 0) != 0:
-        details["offset"] = number(offset, 0)
+def names_of(pairs: Mapping[str, Any]) -> dict[str, int]:
+    """Return the numbers of named values, or of bits, under names that an enumeration can have.
 
-
-def number(given: Any, default: float) -> float:
-    """Return a number that may be text; `default` where there is none. Raises ValueError for other text."""
-    if given in (None, ""):
-        return default
-    found = float(given)
-    return int(found) if found == int(found) else found
+    Two of one number are one: the first name stands.
+    """
+    names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
+    for spelt, number in pairs.items():
+        if isinstance(number, bool) or not isinstance(number, int) or number in found.values():
+            continue
+        found[names.free(str(spelt))] = number
+    return found

@@ -6,9 +6,14 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from multidrop.family_file.addresses import is_ambiguous
+from multidrop.family_file.addresses import sent_as
+from multidrop.family_file.csv_table import MOST_BYTES
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.printable import printable
+
+MOST_LOST = 500  # that the file tells
+_LONGEST = 200  # characters of a text
+_MOST_POINTS = 20  # of a text; TOML's reader takes a line of very many for a key
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -17,7 +22,10 @@ _ORDER = (
 
 
 def family_text(device: ImportedDevice, source: str) -> str:
-    """Return the text of a family file. It declares readings and texts alone: nothing in it writes."""
+    """Return the text of a family file. It declares readings and texts alone: nothing in it writes.
+
+    Raises ValueError where it would be longer than a family file may be.
+    """
     lines = [
         f"# Imported from {_comment(source)}: compare each line with the manual, and mend each `gap:`.",
         "# What could be written there is a reading here: make it a [setting] or a [command] once the manual",
@@ -28,21 +36,40 @@ def family_text(device: ImportedDevice, source: str) -> str:
         "counts_from = 0  # the addresses below are those that are sent",
         "# gap: baudrates, formats, together: what the manual says of the line",
     ]
+    if device.readable:
+        first, last = (sent_as(at, "holding") for at in (device.readable[0], device.readable[-1]))
+        lines.append(f"gaps = {{ holding = [{first}, {last}] }}")
     for section, registers in (("reading", device.registers), ("text", device.texts)):
         if registers:
             lines += ["", f"[{section}]"]
         for register in registers:
-            lines += [
-                *(f"# gap: {register.name}: {_comment(gap)}" for gap in register.gaps),
-                _entry(register),
+            gaps = [
+                *register.gaps,
+                *([f"only its count is read: {register.lacks}"] if register.lacks else ()),
             ]
+            lines += [*(f"# gap: {register.name}: {_comment(gap)}" for gap in gaps), entry_line(register)]
     if device.lost:
-        lines += ["", "# Not carried over:", *(f"# - {_comment(sentence)}" for sentence in device.lost)]
-    return "\n".join([*lines, ""])
+        left = len(device.lost) - MOST_LOST
+        lines += ["", "# Not carried over:"]
+        lines += [f"# - {_comment(str(lost))}" for lost in device.lost[:MOST_LOST]]
+        lines += [f"# - and {left} more"] if left > 0 else []
+    text = "\n".join([*lines, ""])
+    if len(text.encode()) > MOST_BYTES:
+        raise ValueError(
+            f"the family file of {_comment(device.title)!r} would have more than {MOST_BYTES} bytes"
+        )
+    return text
 
 
 def plant_text(device: ImportedDevice, family_file: str) -> str:
-    """Return the text of a plant file with this device. Raises ValueError where its address is not known."""
+    """Return the text of a plant file with this device.
+
+    Raises ValueError where its address is not known, or where it has nothing that is polled.
+    """
+    if not device.registers:
+        raise ValueError(
+            "the device has texts alone, which are never polled: no plant file can be made of it"
+        )
     if device.address is None:
         raise ValueError("the file does not say the device's address: no plant file can be made of it")
     return "\n".join(
@@ -60,9 +87,9 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
     )
 
 
-def _entry(register: ImportedRegister) -> str:
-    in_hex = f"0x{register.address:04X}"
-    parts = [f'at = "{in_hex}"' if is_ambiguous(register.address, register.table) else f"at = {in_hex}"]
+def entry_line(register: ImportedRegister) -> str:
+    """Return the register's line in its section."""
+    parts = [f"at = {sent_as(register.address, register.table)}"]
     if register.table != "holding":
         parts.append(f"table = {_value(register.table)}")
     parts += [f"{key} = {_value(register.details[key])}" for key in _ORDER if key in register.details]
@@ -76,7 +103,7 @@ def _value(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, str):
-        text = "".join(character if character.isprintable() else " " for character in value[:500])
+        text = "".join(character if character.isprintable() else " " for character in _short(value))
         return json.dumps(text, ensure_ascii=False)
     return repr(value)
 
@@ -87,4 +114,8 @@ def _pairs(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _comment(text: str) -> str:
-    return printable(text.replace("\n", " "))[:500]
+    return printable(_short(text).replace("\n", " "))
+
+
+def _short(text: str) -> str:
+    return text[:_LONGEST].replace(".", " ") if text[:_LONGEST].count(".") > _MOST_POINTS else text[:_LONGEST]

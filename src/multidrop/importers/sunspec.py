@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, number_format
+from multidrop.importers.device import ImportedDevice, ImportedRegister, names_of
+from multidrop.importers.numbers import number_format, put_number
 
+FIRST = 40000  # assumed: a model's place is not in its file
 # Counts that mean "not implemented" (SunSpec information model specification, data types).
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
+    # As signed numbers: those of 64 bits do not fit into TOML otherwise.
+    **{"int64": -(1 << 63), "uint64": -1, "acc64": 0, "bitfield64": -1},
     **{"float32": math.nan, "float64": math.nan, "sunssf": 0x8000},
 }
 
@@ -29,64 +33,75 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     group = document["group"]
     title = f"SunSpec model {document.get('id', '')} {group.get('label', group.get('name', ''))}".strip()
     device = ImportedDevice(title)
-    device.lost.append(
-        "the model's place in the device is not in its file: 40000 is assumed, so mend every `at`"
-    )
-    address = 40000
+    reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
+    device.lose("the model", reason, is_entry=False)
+    names: dict[str, str] = {}  # of scale registers, by their points
+    address = FIRST
     for point in group["points"]:
-        _add(device, point, address, _names(group))
+        with device.entry(str(point["name"])):
+            _add(device, point, address, names)
         address += int(point["size"])
+    if FIRST < address <= 0x10000:
+        device.readable = range(FIRST, address)  # a model is one block without holes
+    for register in device.registers:
+        _tie(register, names)
     for repeated in group.get("groups", []):
-        device.lost.append(
-            f"the group {repeated.get('name')} repeats as often as the device says, and was left out"
-        )
+        _lose_group(device, repeated)
     return [device]
 
 
-def _names(group: Mapping[str, Any]) -> set[str]:
-    return {point["name"] for point in group["points"] if point["type"] == "sunssf"}
+def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
+    """Lose a group's points, and those of the groups in it."""
+    for point in group.get("points", []):
+        with device.entry(str(group.get("name"))):
+            device.lose(
+                f"{group.get('name')}.{point['name']}", "its group repeats as often as the device says"
+            )
+    for inner in group.get("groups", []):
+        _lose_group(device, inner)
 
 
-def _add(device: ImportedDevice, point: Mapping[str, Any], address: int, scales: set[str]) -> None:
+def _add(device: ImportedDevice, point: Mapping[str, Any], address: int, names: dict[str, str]) -> None:
     kind, name = str(point["type"]), str(point["name"])
-    register = ImportedRegister(name.lower(), address)
-    if label := point.get("label"):
-        register.details["note"] = str(label)
+    register = ImportedRegister(name, address)
     if kind == "string":
         register.details["length"] = int(point["size"])
-        register.details.pop("note", None)
         device.add(register, is_text=True)
         return
-    found = number_format(kind)
-    if found is None or kind == "pad":
-        if kind != "pad":
-            device.lost.append(f"{name}: its type {kind} has no number format")
+    if kind == "pad":
         return
-    if found != "U16":
-        register.details["number_format"] = found
+    found = number_format(kind)
+    if found is None:
+        device.lose(name, f"its type {kind} has no number format")
+        return
+    if label := point.get("label"):
+        register.details["note"] = str(label)
+    put_number(register.details, found)
     if kind in _INVALID:
         invalid = _INVALID[kind]
         register.details["invalid"] = "NaN" if invalid != invalid else invalid
     if "units" in point:
         register.details["unit"] = str(point["units"])
-    _scale(register, point.get("sf"), scales)
-    if symbols := point.get("symbols"):
-        register.details["bits" if kind.startswith("bitfield") else "values"] = dict(_symbols(symbols))
+    if point.get("sf"):
+        register.details["scale_register"] = point["sf"]
+    symbols = {str(symbol["name"]): symbol["value"] for symbol in point.get("symbols") or ()}
+    if named := names_of(symbols):
+        register.details["bits" if kind.startswith("bitfield") else "values"] = named
         register.details.pop("unit", None)
-    if point.get("access") == "RW":
-        register.gaps.append("it is written there; what a write does is not known here")
+    register.note_write(is_written=point.get("access") == "RW")
     device.add(register)
+    if kind == "sunssf":
+        names[name] = register.name
+        for key in ("unit", "invalid"):
+            register.details.pop(key, None)
 
 
-def _scale(register: ImportedRegister, scale: Any, scales: set[str]) -> None:
+def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
+    """Make the point's scale a step, or the name of the register that holds it."""
+    scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
-        register.details["step"] = 10**scale if scale >= 0 else float(f"1e{scale}")
-    elif scale in scales:
-        register.details["scale_register"] = str(scale).lower()
+        register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")
+    elif scale in names:
+        register.details["scale_register"] = names[scale]
     elif scale:
-        register.gaps.append(f"its scale register {scale} is not in this model")
-
-
-def _symbols(symbols: list[Mapping[str, Any]]) -> Iterator[tuple[str, int]]:
-    for symbol in symbols:
-        yield str(symbol["name"]).lower(), int(symbol["value"])
+        register.lacks = f"its scale register {scale} is not in this model"

@@ -5,14 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from multidrop.importers.device import (
-    TABLES,
-    ImportedDevice,
-    ImportedRegister,
-    number_format,
-    scaled,
-    words_of,
-)
+from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
+from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, words_of
 
 _STYLE = {
     "holding_registers": "holding",
@@ -20,21 +14,27 @@ _STYLE = {
     "coils": "coil",
     "discrete_inputs": "discrete",
 }
-_ORDERS = {"ABCD": "", "AB": "", "ABCDEFGH": "", "BA": "BA", "CDAB": "CDAB", "BADC": "BADC", "DCBA": "DCBA"}
-_WORD_WISE = {"GHEFCDAB": "CDAB", "BADCFEHG": "BADC", "HGFEDCBA": "DCBA"}
+_ORDERS = {  # for any width: the plugin takes ABCD's four for 16 and 64 bits as well
+    **dict.fromkeys(("ABCD", "AB", "ABCDEFGH", "MSW", "MSW-BE"), ""),
+    **dict.fromkeys(("BADC", "BADCFEHG", "MSW-LE"), "BADC"),
+    **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
+    **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
+}
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
     """Return a device for each slave id."""
-    found: dict[int, ImportedDevice] = {}
+    found: dict[int | None, ImportedDevice] = {}
     for plugin in document.get("inputs", {}).get("modbus", []):
         for slave, table, order, field in _fields(plugin):
-            device = found.setdefault(slave, ImportedDevice(str(plugin.get("name", "")), slave))
-            _add(device, table, order, field)
+            address = unit_address(slave)
+            device = found.setdefault(address, ImportedDevice(str(plugin.get("name", "")), address))
+            with device.entry(str(field.get("name", "register"))):
+                _add(device, table, order, field)
     return list(found.values())
 
 
-def _fields(plugin: Mapping[str, Any]) -> Iterator[tuple[int, str, str, Mapping[str, Any]]]:
+def _fields(plugin: Mapping[str, Any]) -> Iterator[tuple[Any, str, str, Mapping[str, Any]]]:
     slave = plugin.get("slave_id", 0)
     for key, table in _STYLE.items():
         for field in plugin.get(key, []):
@@ -42,7 +42,8 @@ def _fields(plugin: Mapping[str, Any]) -> Iterator[tuple[int, str, str, Mapping[
     for request in [*plugin.get("request", []), *plugin.get("metric", [])]:
         for field in request.get("fields", []):
             table = field.get("register", request.get("register", "holding"))
-            yield request.get("slave_id", slave), table, request.get("byte_order", ""), field
+            order = request.get("byte_order") or "ABCD"  # the plugin's default in these styles
+            yield request.get("slave_id", slave), table, order, field
 
 
 def _add(device: ImportedDevice, table: str, order: str, field: Mapping[str, Any]) -> None:
@@ -50,45 +51,55 @@ def _add(device: ImportedDevice, table: str, order: str, field: Mapping[str, Any
     given = field.get("address", 0)
     addresses = given if isinstance(given, list) else [given]
     if table not in TABLES:
-        device.lost.append(f"{name}: its table {table!r} is not known")
+        device.lose(name, f"its table {str(table)[:40]!r} is not known")
         return
     register = ImportedRegister(name, addresses[0], table)
     if field.get("omit"):
-        device.lost.append(f"{name}: it is marked omit, and was left out")
+        device.lose(name, "it is marked omit, and was left out", is_entry=False)
         return
-    if table in ("holding", "input"):
-        if not _number(device, register, order, field, len(addresses)):
-            return
-        if "measurement" in field or "output" in field:
-            register.gaps.append("measurement and output were not carried over")
-    device.add(register)
+    if "measurement" in field or "output" in field:
+        register.gaps.append("measurement and output were not carried over")
+    if table in ("coil", "discrete"):
+        device.add(register)
+    elif str(field.get("data_type", field.get("type"))).upper() == "STRING":
+        register.details["length"] = int(field.get("length", len(addresses)))
+        if _ORDERS.get(str(order).upper()) in ("BADC", "DCBA"):
+            register.details["order"] = "BA"
+        device.add(register, is_text=True)
+    elif _number(device, register, str(order).upper(), field, addresses):
+        device.add(register)
 
 
 def _number(
-    device: ImportedDevice, register: ImportedRegister, order: str, field: Mapping[str, Any], count: int
+    device: ImportedDevice,
+    register: ImportedRegister,
+    order: str,
+    field: Mapping[str, Any],
+    addresses: list[Any],
 ) -> bool:
     kind = str(field.get("data_type", field.get("type", "UINT16"))).upper().removesuffix("-IEEE")
     if kind in ("FIXED", "UFIXED"):  # of as many registers as there are addresses
-        kind = f"{'INT' if kind == 'FIXED' else 'UINT'}{16 * count}"
-    if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):
-        register.details["part"] = "0-7" if kind.endswith("L") else "8-15"
-        kind = "INT16" if kind.startswith("INT") else "UINT16"
-    elif kind == "BIT":
-        register.details["part"] = str(field.get("bit", 0))
-        kind = "UINT16"
+        kind = f"{'INT' if kind == 'FIXED' else 'UINT'}{16 * len(addresses)}"
+    part, kind = _part(kind, field)
     found = number_format(kind)
     if found is None:
-        device.lost.append(f"{register.name}: its type {kind} has no number format")
+        device.lose(register.name, f"its type {kind[:40]} has no number format")
         return False
-    if found != "U16":
-        register.details["number_format"] = found
-    order = order.upper()
-    mended = _ORDERS.get(order, _WORD_WISE.get(order))
-    if mended:
-        register.details["order"] = mended
-    elif mended is None and order:
-        register.gaps.append(f"its byte order {order} was not carried over")
+    if part:
+        register.details["part"] = part
+    if order and order not in _ORDERS:
+        register.lacks = f"its order of bytes {order[:40]}"
     elif not order and words_of(found) > 1:
         register.gaps.append("the order of its words is not stated")
+    put_number(register.details, found, _ORDERS.get(order, ""))
     scaled(register.details, field.get("scale", 1))
     return True
+
+
+def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the bits of a word that a type of less than 16 bits is, and the number's type."""
+    if kind == "BIT":
+        return str(int(field.get("bit", 0))), "UINT16"
+    if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):
+        return ("0-7" if kind.endswith("L") else "8-15"), f"{kind[:-2]}16"
+    return "", kind

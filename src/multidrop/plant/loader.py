@@ -77,7 +77,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     name, port = given.get("name", ""), given.get("port", "")
     if name:
         place.once("line", name, sentence="another line has this name too; every line needs its own")
-    if port:
+    if port and not speaks_tcp(port):  # each line of one gateway is a connection with a request under way
         place.once("port", port, sentence=f"port {port} is that of {{first}} already; make them one line")
     settings: dict[str, Any] = {
         "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
@@ -110,7 +110,8 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
         place.once("drive", given["name"], sentence="{first} has this name too; every drive needs its own")
     if "address" in given:
         sentence = f"address {given['address']} is that of {{first}} already; give every drive its own"
-        place.once("address", place.labels[0], given["address"], sentence=sentence)
+        wire = line["port"] if speaks_tcp(line["port"]) else place.labels[0]
+        place.once("address", wire, given["address"], sentence=sentence)
     every = duration_of(given, "every", place)
     if model is None:
         return None

@@ -34,6 +34,29 @@ class Row(NamedTuple):
     status: str  # "ok", or the reason
 
 
+class BatchColumns(NamedTuple):
+    """Columns of a batch as they lie in memory: read-only one-dimensional memoryviews, without a copy.
+
+    All have a number for each row (shape `(len(batch),)`), but for `valid`. A view, and what is made of it
+    without a copy, such as `numpy.asarray(view)`, stays as it is for as long as it is held, also when the
+    batch is gone and the poller closed: only then is its memory used again. The names are tuples; a code is
+    the place of its name in them. A name's code stays the same for all batches of one poller, in which later
+    batches may know more names.
+    """
+
+    time: memoryview  # int64 (format "q"): UTC in ns; the request was sent
+    monotonic_ns: memoryview  # int64
+    uncertainty_ns: memoryview  # int64; without meaning for a miss
+    drive: memoryview  # uint16 ("H"): a code in `drives`
+    register: memoryview  # uint16: a code in `registers`
+    value: memoryview  # float64 ("d"), in the register's unit; without meaning for a miss
+    status: memoryview  # uint16: a code in `statuses`; 0 is "ok", any other a miss
+    valid: memoryview  # uint8 ("B"), a bit for each row, the least significant first: 1 where status is 0
+    drives: tuple[str, ...]
+    registers: tuple[str, ...]
+    statuses: tuple[str, ...]
+
+
 class Rows(ArrowTable):
     """Rows, wherever they are kept: their number, each one, Arrow's capsules, and tables of them."""
 
@@ -98,9 +121,20 @@ class Batch(Rows):
             sample = (uncertainty, value) if status == 0 else (None, None)
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
 
+    def columns(self) -> BatchColumns:
+        """Return the columns as they lie in memory, and the names that their codes stand for.
+
+        Nothing is copied. For programs that go through many rows: one costs a fraction of what a Row costs.
+        """
+        time, sent, uncertainty, drive, register, value, status, valid = (
+            self._columns.array(name).toreadonly()
+            for name in ("time", "sent", "uncertainty", "drive", "reg", "value", "status", "valid")
+        )
+        names = (self._drives.listed, self._registers.listed, _STATUSES.listed)
+        return BatchColumns(time, sent, uncertainty, drive, register, value, status, valid, *names)
+
     def _may_have(self) -> Collection[str]:
-        registers = [self._registers[number] for number in range(len(self._registers))]
-        drives = [self._drives[number] for number in range(len(self._drives))]
+        registers, drives = self._registers.listed, self._drives.listed
         return [f"{drive}.{register}" for drive in drives for register in registers]
 
     def __repr__(self) -> str:

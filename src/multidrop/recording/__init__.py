@@ -25,6 +25,11 @@ In .csv a text that a spreadsheet would evaluate as a formula, because it begins
 a tab or the end of a line, has an apostrophe in front; so has one that begins with apostrophes and then
 one of these. The reader removes one apostrophe.
 
+In the file, .arrows has `drive`, `register` and `status` as dictionaries of utf8 with unsigned codes of 16,
+16 and 8 bits, and `uncertainty_ns` as a float32 that is rounded up: exact up to 2^24 ns, above that at most
+1.2e-7 more. A row takes 33 bytes. The reader here gives all of them in the types above, also from files of
+before, which held them so.
+
 The metadata is one JSON object: under the key `multidrop` of the schema's metadata (.arrows, .parquet) or
 in the file NAME.csv.json. `multidrop poll` writes `plant`, the plant file; `planned`, the prediction for
 each line by name (multidrop.planning.prediction); and `drives`: by name each drive's line, model, address,

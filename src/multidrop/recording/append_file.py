@@ -40,10 +40,12 @@ class AppendFile:
         if self._is_truncated:
             self._cut()
         self._is_truncated = True
-        left = memoryview(piece)
+        written = 0
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            while written < len(piece):
+                # Released at once: a view that an exception's traceback keeps forbids its buffer to grow.
+                with memoryview(piece)[written:] as left:
+                    written += self._file.write(left)
         except BaseException:
             with suppress(OSError, ValueError):
                 self._cut()

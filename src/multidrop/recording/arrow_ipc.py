@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 PREFIX = struct.Struct("<4si")  # the continuation marker, and the length of the metadata
 CONTINUATION = b"\xff\xff\xff\xff"
-SCHEMA, RECORD_BATCH = 1, 3  # IpcMessage.header_type
+SCHEMA, DICTIONARY_BATCH, RECORD_BATCH = 1, 2, 3  # IpcMessage.header_type
 
 
 class FlatTable:

@@ -9,58 +9,35 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from io import BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
-from multidrop.polling.batch import Rows, assemble, schema
-from multidrop.recording.arrow_ipc import RECORD_BATCH, SCHEMA, FlatTable, IpcMessage, messages
+from multidrop.polling.batch import Rows
+from multidrop.recording.arrow_decoder import Decoder
+from multidrop.recording.arrow_encoder import Encoder
+from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, SCHEMA, FlatTable, IpcMessage, messages
+from multidrop.recording.arrow_schema import COLUMNS, COLUMNS_BEFORE, FileColumn
 from multidrop.recording.format import METADATA_KEY, AppendingWriter, Metadata, RecordingReader, dump_metadata
-from multidrop.recording.rows import RecordedRows
-
-INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
-COLUMNS = [  # name, type, and the first field of the type: bits, precision (double) or unit (ns)
-    (b"time", TIMESTAMP, 3),
-    (b"monotonic_ns", INT, 64),
-    (b"uncertainty_ns", INT, 64),
-    (b"drive", UTF8, 0),
-    (b"register", UTF8, 0),
-    (b"value", FLOAT, 2),
-    (b"status", UTF8, 0),
-]
-BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # that a column has in a batch
 
 
 class ArrowsWriter(AppendingWriter):
-    """Write each batch as one message."""
+    """Write each batch as one message, behind the dictionaries that it needs and the file does not have."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
-        from nanoarrow.c_array_stream import CArrayStream
-        from nanoarrow.ipc import StreamWriter
-
-        described = schema().modify(metadata={METADATA_KEY: dump_metadata(metadata)})
-        self._message = BytesIO()
-        self._encoder = StreamWriter.from_writable(self._message)
+        head = Encoder.head({METADATA_KEY.encode(): dump_metadata(metadata).encode()})
+        self._encoder = Encoder()
         super().__init__(path)
         try:
-            self._append_message(CArrayStream.from_c_arrays([], described))
+            self._append(head)
         except OSError:
             self.discard()
             raise
 
     def write(self, batch: Rows) -> None:
-        self._append_message(batch.arrow())
+        piece, after = self._encoder.piece(batch)
+        self._append(piece)
+        self._encoder.is_written(after)
         self.rows += len(batch)
-
-    def _append_message(self, source: Any) -> None:
-        self._message.seek(0)
-        self._encoder.write_stream(source)
-        self._append(self._message.getbuffer()[: self._message.tell()])
-
-    def close(self) -> None:
-        self._encoder.release()
-        super().close()
 
 
 class ArrowsReader(RecordingReader):
@@ -74,6 +51,8 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
+                elif message.kind == DICTIONARY_BATCH:  # other libraries miss the batch that it is for
+                    continue
                 self._whole = message.end
         if not self._whole:
             raise self._not_a_recording("it does not begin like an Arrow stream")
@@ -81,6 +60,7 @@ class ArrowsReader(RecordingReader):
 
     def __iter__(self) -> Iterator[Rows]:
         rows = 0
+        decoder = Decoder(self._columns)
         with self.path.open("rb") as file:
             for message in islice(messages(file, self._whole), 1, None):
                 if not message.header:
@@ -88,55 +68,48 @@ class ArrowsReader(RecordingReader):
                 file.seek(message.body)
                 body = memoryview(file.read(message.end - message.body))
                 try:
-                    batch = _decode(message, message.header, body)
+                    batch = decoder.decode(message, message.header, body)
                 except (struct.error, RuntimeError, ValueError) as error:
                     raise self._damaged(rows, error) from error
-                yield batch
-                rows += len(batch)
+                if batch is not None:
+                    yield batch
+                    rows += len(batch)
 
     def _read_schema(self, message: IpcMessage) -> Metadata:
         try:
             head = message.header if message.kind == SCHEMA else None
-            if not head or [_column(field) for field in head.tables(1)] != COLUMNS:
+            fields = head.tables(1) if head else []
+            known = _described(*map(_column, fields))
+            if not head or not known:
                 raise self._not_a_recording("it is an Arrow stream with other columns")
+            self._columns = list(zip(known, map(_dictionary, fields), strict=True))
             entries = {entry.text(0): entry.text(1) for entry in head.tables(2)}
         except struct.error as error:
             raise self._not_a_recording("it does not begin like an Arrow stream") from error
         return self._parse_metadata(entries.get(METADATA_KEY.encode(), b"{}"))
 
 
-def _column(field: FlatTable) -> tuple[bytes, int, int]:
-    detail = field.table(3)
-    return field.text(0), field.number(2, "<B"), detail.number(0, "<h") if detail else 0
+def _column(field: FlatTable) -> FileColumn:
+    """Return a column as the file describes it: with -1 bits where its codes are none of ours."""
+    detail, coded = field.table(3), field.table(4)
+    index = coded.table(1) if coded else None
+    is_unsigned = index is not None and not index.number(1, "<?")
+    bits = index.number(0, "<i") if index and is_unsigned else -1 if coded else 0
+    return FileColumn(field.text(0), field.number(2, "<B"), detail.number(0, "<h") if detail else 0, bits)
 
 
-def _check_text(offsets: memoryview, text: memoryview) -> None:
-    """Raise ValueError unless each row's text is UTF-8: libraries that take the batch rely on it."""
-    if str(text, "utf-8").isascii():
-        return
-    for at in offsets[: len(offsets) // 4 * 4].cast("i"):
-        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # within a character
-            raise ValueError("its text is not UTF-8")
+def _dictionary(field: FlatTable) -> int | None:
+    """Return the id of a column's dictionary."""
+    coded = field.table(4)
+    return coded.number(0, "<q") if coded else None
 
 
-def _decode(message: IpcMessage, batch: FlatTable, body: memoryview) -> RecordedRows:
-    if message.kind != RECORD_BATCH:
-        raise ValueError("there is a message that is not a batch of rows")
-    if batch.table(3):
-        raise ValueError("its batches are compressed, which only pyarrow and polars read")
-    rows, places = batch.number(0, "<q"), batch.pairs(2)
-    if not 0 <= rows <= len(body):  # sums with it must not wrap around
-        raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
-    if len(places) != sum(BUFFERS[kind] for _, kind, _ in COLUMNS):
-        raise ValueError(f"there is a batch of {len(places)} buffers")
-    buffers = iter([body[at : at + length] for at, length in places])
-    columns: list[tuple[memoryview | None, ...]] = []
-    for _, kind, _ in COLUMNS:
-        valid, *data = islice(buffers, BUFFERS[kind])
-        if kind == UTF8:
-            _check_text(*data)
-        columns.append((valid or None, *data))
-    return RecordedRows(assemble(rows, *columns))
+def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
+    """Return the columns of a recording, of now or before, that are described so."""
+    for known in (COLUMNS, COLUMNS_BEFORE):
+        if found == tuple(column._replace(nullable=False) for column in known):
+            return known
+    return None
 
 
 writer, reader = ArrowsWriter, ArrowsReader

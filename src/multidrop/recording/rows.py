@@ -33,7 +33,7 @@ class RecordedRows(Rows):
 def _values(column: Any) -> Iterable[Any]:
     """Return each row's value of a column, None where it has none."""
     if column.n_buffers == 3:
-        return _texts(column)
+        return texts_of(column)
     numbers = memoryview(column.buffer(1))[: column.length]
     if not column.null_count:
         return numbers
@@ -41,7 +41,8 @@ def _values(column: Any) -> Iterable[Any]:
     return (number if there else None for number, there in zip(numbers, valid, strict=False))
 
 
-def _texts(column: Any) -> Iterator[str]:
+def texts_of(column: Any) -> Iterator[str]:
+    """Yield each row's text of a column."""
     ends, text = memoryview(column.buffer(1)), bytes(column.buffer(2))
     return (text[ends[at] : ends[at + 1]].decode(errors="replace") for at in range(column.length))
 

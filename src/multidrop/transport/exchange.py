@@ -17,11 +17,13 @@ from multidrop.core import (
     Peer,
     Permit,
     TransactionIds,
+    build_request,
 )
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
+from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, NoReply, NotAttached, NoValue
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached, NoValue
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
@@ -272,13 +274,30 @@ class Exchanges:
         insisting = make_read(other, block, self.peer(drive), insists=True)
         return _with_values(drive, dict(read.decode(self._ask(drive, insisting, 1))))[register.name]
 
+    def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
+        """Return the data of the reply to any read, sent once, and begun within so many seconds."""
+        request = any_read(drive, function, start, count)
+        expires_ns = clock.now_ns() + round(expiry * 1e9)
+        asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
+        completion = self._carry_out(asked, expires_ns)
+        is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.now_ns() >= expires_ns
+        if is_late or completion.result == Failure.EXPIRED:
+            raise Expired(drive.name, f"a read of {count} from {start} by function {function:02X}H", expiry)
+        self._note_answer(drive, completion)
+        if completion.raw == build_request(drive.framing, request) and not self.line.has_echo:
+            raise BadReply(drive.name, "the reply is a copy of the request, as an echo is", completion.raw)
+        return self.reply(drive, completion).data
+
+    def _note_answer(self, drive: Drive, completion: Completion) -> None:
+        if completion.result > 0:  # an exception also says that the drive is there
+            self._answered_on[drive] = self.line.queue
+
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
         """Return the reply to a read, which is sent again where it is lost."""
         while True:
             attempts -= 1
             completion = self._carry_out(exchange)
-            if completion.result > 0:  # an exception also says that the drive is there
-                self._answered_on[drive] = self.line.queue
+            self._note_answer(drive, completion)
             try:
                 return self.reply(drive, completion)
             except (NoReply, BadReply):
@@ -316,12 +335,16 @@ class Exchanges:
         return completion
 
     def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
-        """Wait once until no late answer comes in any order; the core then asks for the proof of it."""
+        """Wait once until no late answer comes in any order; the core then asks for the proof of it.
+
+        Where that is after `expires_ns`, so long is enough.
+        """
         late_until_ns = made.peer.late_until_ns
         completion = self.line.carry_out(made, expires_ns=expires_ns)
         if completion.result != Failure.LATE_ANSWER_DUE:
             return completion
-        clock.sleep(max(0, late_until_ns - clock.now_ns()) / 1e9)
+        until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
+        clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
 
     @staticmethod

@@ -1,0 +1,136 @@
+"""Find the entries of an imported device that a family holds, as the library itself decides."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.drive import Drive
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import Access, Register
+from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister
+from multidrop.importers.settling import declare
+
+DETAILS = {  # of an entry, in the words of the table that is printed
+    "offset": "offset",
+    "invalid": "invalid counts",
+    "part": "bits of a word",
+    "64 bit": "numbers of 64 bit",
+    "order": "order of bytes or words",
+    "bcd": "BCD",
+    "s8": "signed 8 bit",
+    "negative step": "negative step",
+    "scale_register": "scale register",
+    "names": "named values or bits",
+    "text": "text",
+    "one character": "text of one character a register",
+    "by 16": "written by 16 alone",
+    "float written": "float that is written",
+    "elsewhere": "written at another address",
+}
+
+
+@dataclass(frozen=True)
+class Holding:
+    """The answer for one entry: it is held, only for reading, or not at all and why."""
+
+    entry: ImportedRegister | None  # None: it was lost before it was a register
+    is_held: bool
+    is_written: bool = True  # where the other program writes it
+    lacks: str = ""
+    is_text: bool = False
+
+    @property
+    def is_whole(self) -> bool:
+        return self.is_held and self.is_written
+
+    @property
+    def details(self) -> Iterator[str]:
+        """Yield the keys of DETAILS that it needs beyond 16 and 32 bits with a step."""
+        if self.entry is None:
+            return
+        details, number = self.entry.details, str(self.entry.details.get("number_format", "U16"))
+        needed = {
+            **{key: key in details for key in ("offset", "invalid", "part", "scale_register")},
+            "64 bit": number.endswith("64"),
+            "order": "order" in details and not self.is_text,
+            "bcd": number.startswith("BCD"),
+            "s8": number == "I8",
+            "negative step": details.get("step", 1) < 0,
+            "names": "values" in details or "bits" in details,
+            "text": self.is_text,
+            "one character": self.is_text and details.get("order") == "B",
+            "by 16": "write" in self.entry.of_writes and self.entry.is_written,
+            "float written": number in ("F32", "F64") and self.entry.is_written,
+            "elsewhere": "ram_address" in self.entry.of_writes,
+        }
+        yield from (key for key, is_needed in needed.items() if is_needed)
+
+
+def holdings(device: ImportedDevice) -> list[Holding]:
+    """Return the answers for all entries of a device, written as its program writes them."""
+    found = [_held(entry) for entry in device.registers]
+    found += [Holding(entry, is_held=True, is_text=True) for entry in device.texts]
+    found += [_commanded(entry) for entry in device.commands]
+    lost = [each for each in device.lost if each.is_entry and each.reason != ONLY_WRITTEN]
+    return found + [Holding(None, is_held=False, lacks=each.reason) for each in lost]
+
+
+def family_of(entries: list[Holding]) -> str:
+    """Declare all of these in one class, as they are written; return why that is refused, or nothing."""
+    members = {
+        f"entry_{number}": _declared(each.entry)
+        for number, each in enumerate(entries)
+        if each.entry is not None and not each.is_text
+    }
+    for name, register in members.items():
+        object.__setattr__(register, "name", name)
+        object.__setattr__(register, "scale_register", "")  # of another name here; checked by the importer
+    return _refusal(members)
+
+
+def _held(entry: ImportedRegister) -> Holding:
+    if entry.lacks:
+        return Holding(entry, is_held=False, lacks=_kind_of(entry.lacks))
+    reason = _why_not(entry)
+    return Holding(entry, is_held=True, is_written=not reason, lacks=reason)
+
+
+def _kind_of(lacks: str) -> str:
+    """Return what lacks without what is quoted in it, so that equal reasons are counted together."""
+    return re.sub(r"'[^']*'", "'...'", lacks)
+
+
+def _commanded(entry: ImportedRegister) -> Holding:
+    reason = entry.lacks or _why_not(entry)
+    return Holding(entry, is_held=not reason, lacks=reason)
+
+
+def _why_not(entry: ImportedRegister) -> str:
+    """Return why it cannot be declared as its program uses it; nothing where it can."""
+    try:
+        register = _declared(entry)
+    except ValueError as refusal:
+        return str(refusal)
+    if entry.details.get("scale_register"):
+        return (
+            ""
+            if not entry.is_written
+            else "a number whose power of ten is in another register is never written"
+        )
+    return _refusal({register.name: register})
+
+
+def _declared(entry: ImportedRegister) -> Register[Any]:
+    access = Access.SETTING if entry.is_written else Access.READING
+    return declare(entry, access if entry.is_read else Access.COMMAND)
+
+
+def _refusal(members: Mapping[str, Register[Any]]) -> str:
+    try:
+        type("Device", (Drive,), {"__doc__": "Of a template.", **members})
+    except DeclarationError as refusal:
+        return str(refusal.mistakes[0]).partition(": ")[2]
+    return ""

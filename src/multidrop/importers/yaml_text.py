@@ -1,0 +1,58 @@
+"""Read YAML of unknown origin: safe types alone, within bounds of size, time and memory. Needs PyYAML."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+MOST_CHARACTERS = 1_000_000
+MOST_NODES = 50_000  # where each alias counts as all that it stands for
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the document; tags such as !secret stand for nothing.
+
+    Raises ImportError without PyYAML, ValueError for what is no YAML, too long, or blown up by aliases.
+    """
+    try:
+        yaml: Any = import_module("yaml")
+    except ImportError as failure:
+        raise ImportError("YAML is read with PyYAML: pip install 'multidrop[yaml]'") from failure
+    if len(text) > MOST_CHARACTERS:
+        raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        """Counts nodes, and takes tags for nothing."""
+
+        left = MOST_NODES
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            is_alias = self.check_event(yaml.AliasEvent)
+            node = super().compose_node(parent, index)
+            self.left -= 1
+            if is_alias:
+                self.count_again(node)
+            if self.left < 0:
+                raise ValueError(
+                    f"has more than {MOST_NODES} entries, aliases counted as what they stand for"
+                )
+            return node
+
+        def count_again(self, node: Any) -> None:
+            """Count what an alias stands for, as far as there is anything left."""
+            pending = [node]
+            while pending and self.left >= 0:
+                self.left -= 1
+                value = pending.pop().value
+                if isinstance(value, list):
+                    pending += [
+                        each for pair in value for each in (pair if isinstance(pair, tuple) else (pair,))
+                    ]
+
+    Loader.add_multi_constructor("!", lambda loader, suffix, node: None)
+    try:
+        return yaml.load(text, Loader)
+    except yaml.YAMLError as failure:
+        raise ValueError(f"is not YAML: {' '.join(str(failure).split())[:300]}") from failure
+    except RecursionError as failure:
+        raise ValueError("is YAML that is nested too deeply") from failure

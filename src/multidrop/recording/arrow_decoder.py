@@ -1,0 +1,106 @@
+"""Decode the batches of an Arrow IPC stream into rows with their names spelled out.
+
+No number in them is trusted: a damaged batch ends in an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice, pairwise
+from typing import Any
+
+from multidrop.core import Names, spell
+from multidrop.core.narrow import wide_codes, widen
+from multidrop.polling.batch import assemble
+from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, RECORD_BATCH, FlatTable, IpcMessage
+from multidrop.recording.arrow_schema import SINGLE, UTF8, FileColumn
+from multidrop.recording.rows import RecordedRows
+
+MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch: a few may make a small file a huge table
+Buffers = tuple[Any, ...]
+
+
+class Decoder:
+    """Decodes one file's batches in their order, by the dictionaries that came before each.
+
+    `columns` have each its dictionary's id, or None.
+    """
+
+    def __init__(self, columns: Sequence[tuple[FileColumn, int | None]]) -> None:
+        self._columns = columns
+        self._ids = {identity for _, identity in columns if identity is not None}
+        self._names: dict[int, Names] = {}
+
+    def decode(self, message: IpcMessage, header: FlatTable, body: memoryview) -> RecordedRows | None:
+        """Return the rows of a batch, None for a dictionary.
+
+        Raises ValueError, RuntimeError or struct.error where it is damaged.
+        """
+        if message.kind == DICTIONARY_BATCH:
+            self._learn(header, body)
+            return None
+        if message.kind != RECORD_BATCH:
+            raise ValueError("there is a message that is not a batch of rows")
+        rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
+        left = iter(buffers)
+        columns = [
+            self._decoded(column, identity, rows, *islice(left, column.buffers))
+            for column, identity in self._columns
+        ]
+        return RecordedRows(assemble(rows, *columns))
+
+    def _decoded(
+        self, column: FileColumn, identity: int | None, rows: int, bits: memoryview, *data: Any
+    ) -> Buffers:
+        valid = bits if len(bits) else None
+        if identity is not None:
+            names = self._names.get(identity)
+            if names is None:
+                raise ValueError("there are rows before the names of their codes")
+            if rows * names.spelling.longest > MOST_SPELLED:
+                raise ValueError(f"there is a batch of {rows} rows with names too long for so many")
+            return valid, *spell(wide_codes(data[0], rows, column.code_bits // 8), names)
+        if column.kind == UTF8:
+            _check_text(*data)
+        if column.detail == SINGLE:
+            return valid, widen(data[0], valid, rows)
+        return valid, *data
+
+    def _learn(self, header: FlatTable, body: memoryview) -> None:
+        """Take a dictionary: in the place of the one before, or behind it."""
+        number, table = header.number(0, "<q"), header.table(1)
+        if table is None or number not in self._ids:
+            raise ValueError("there are names of no column")
+        count, (_, ends, text) = _parts(table, body, 3)
+        _check_text(ends, text)
+        if count and len(ends) < 4 * (count + 1):
+            raise ValueError("its lengths do not fit together")
+        places = ends[: 4 * (count + 1)].cast("i") if count else [0]
+        names = []
+        for begin, end in pairwise(places):
+            if not 0 <= begin <= end <= len(text):
+                raise ValueError("its lengths do not fit together")
+            names.append(str(text[begin:end], "utf-8"))
+        before = self._names.get(number) if header.number(2, "<?") else None
+        self._names[number] = Names([*(before.listed if before else ()), *names])
+
+
+def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[memoryview]]:
+    """Return the number of rows and the buffers of a batch that has so many of these."""
+    if batch.table(3):
+        raise ValueError("its batches are compressed, which only pyarrow and polars read")
+    rows, places = batch.number(0, "<q"), batch.pairs(2)
+    if not 0 <= rows <= len(body):  # sums with it must not wrap around
+        raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
+    if len(places) != count:
+        raise ValueError(f"there is a batch of {len(places)} buffers")
+    return rows, [body[at : at + length] for at, length in places]
+
+
+def _check_text(offsets: memoryview, text: memoryview) -> None:
+    """Raise ValueError unless each row's text is UTF-8: libraries that take the batch rely on it."""
+    if str(text, "utf-8").isascii():
+        return
+    for at in offsets[: len(offsets) // 4 * 4].cast("i"):
+        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # within a character
+            raise ValueError("its text is not UTF-8")

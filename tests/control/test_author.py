@@ -1,0 +1,134 @@
+"""The audit log says who asked for a write, and in which way."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from simulated_bus import SimulatedBus, one
+
+from multidrop.control.audit_log import read_audit
+from multidrop.control.author import written_by
+from multidrop.control.ramp import start_staggered
+from multidrop.drives import InvtCHE
+from multidrop.drives.invt_che import CHEControl
+from multidrop.errors import BusError, Unconfirmed
+
+Noted = list[tuple[str, str | None, str | None]]
+
+
+class Audited:
+    """A bus with one CHE, and what its log says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+        self.path = path
+        self.hall: SimulatedBus
+        self.hall, self.drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+        self.bus = self.hall.bus
+
+    def noted(self) -> Noted:
+        return [(entry["write"], entry.get("by"), entry.get("way")) for entry in read_audit(self.path)]
+
+
+@pytest.fixture
+def audited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Audited]:
+    made = Audited(monkeypatch, tmp_path / "audit.jsonl")
+    with made.bus:
+        yield made
+
+
+def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
+    bus, drive = audited.bus, audited.drive
+    with written_by("anna", "web, 10.0.0.7"):
+        drive.set_frequency(20)
+        drive.start()
+        drive.stop()
+        bus.raw(drive, 6, 0x1000, b"\0\5")
+        bus.broadcast(drive.control, CHEControl.STOP)
+        bus.stop_all()
+    with written_by("boris"):
+        drive.set_frequency(30)
+    drive.set_frequency(10)
+    *annas, boris, nobody = audited.noted()
+    assert {write.partition(" = ")[0] for write, _, _ in annas} >= {"setpoint", "control"}
+    assert len(annas) >= 6
+    assert {(by, way) for _, by, way in annas} == {("anna", "web, 10.0.0.7")}
+    assert (boris, nobody) == (
+        ("setpoint = 60.00 %", "boris", None),
+        ("setpoint = 20.00 %", None, None),
+    )
+
+
+def test_a_write_in_doubt_has_its_author(audited: Audited) -> None:
+    audited.hall.loses = lambda request: request.function == 6
+    with written_by("anna"), suppress(Unconfirmed):
+        audited.drive.set_frequency(20)
+    assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
+
+
+def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> None:
+    """`start_staggered` stops its drives on threads of their own."""
+    drive = audited.drive
+    drive.set_frequency(20)
+    audited.hall.loses = lambda request: request.data == b"\0\1"
+    with written_by("anna"), pytest.raises(BusError):
+        start_staggered([drive], gap=1.0)
+    assert [by for _, by, _ in audited.noted()][1:] == ["anna"] * (len(audited.noted()) - 1)
+    assert audited.noted()[-1] == ("control = STOP", "anna", None)
+
+
+def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
+    drive, turn = audited.drive, asyncio.Lock()  # the simulated bus bears one caller at a time
+
+    async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
+        with written_by(name, "asyncio"):
+            mine.set()
+            await other.wait()
+            async with turn:
+                await asyncio.to_thread(drive.set_frequency, hz)
+
+    async def both() -> None:
+        first, second = asyncio.Event(), asyncio.Event()
+        await asyncio.gather(write("anna", 20, first, second), write("boris", 30, second, first))
+
+    asyncio.run(both())
+    with written_by("carla"):
+        thread = threading.Thread(target=drive.set_frequency, args=[10])
+        thread.start()
+        thread.join()
+    assert sorted(audited.noted()[:2]) == [
+        ("setpoint = 40.00 %", "anna", "asyncio"),
+        ("setpoint = 60.00 %", "boris", "asyncio"),
+    ]
+    assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
+
+
+def test_the_innermost_block_counts_and_ends(audited: Audited) -> None:
+    with written_by("anna", "web"):
+        with written_by("boris"), suppress(ZeroDivisionError):
+            audited.drive.set_frequency(20)
+            _ = 1 / 0
+        audited.drive.set_frequency(30)
+    assert [(by, way) for _, by, way in audited.noted()] == [("boris", None), ("anna", "web")]
+
+
+@pytest.mark.parametrize("who", ["", "  ", "a\nb", "\x1b[2J", "x" * 201])
+def test_a_name_that_would_spoil_the_log_is_refused(audited: Audited, who: str) -> None:
+    with pytest.raises(ValueError, match="is not 1 to 200 printable characters"), written_by(who):
+        audited.drive.set_frequency(20)
+    way: Any = 7
+    with pytest.raises(TypeError, match="way = 7 is no text"), written_by("anna", way):
+        audited.drive.set_frequency(20)
+    assert audited.hall.written == []
+
+
+def test_a_log_from_before_is_read(audited: Audited) -> None:
+    audited.path.write_text('{"time": "2026-01-01T00:00:00.000000000Z", "write": "old", "outcome": "done"}\n')
+    with written_by("anna"):
+        audited.drive.set_frequency(20)
+    assert audited.noted() == [("old", None, None), ("setpoint = 40.00 %", "anna", None)]

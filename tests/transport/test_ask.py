@@ -1,0 +1,147 @@
+"""`Bus.ask`: a read past the register table, which is no write."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import checksums
+import pytest
+from lines import line, plant, polled, proofs, rows_of, until
+from simulated_bus import SimulatedBus, one
+from toy import Toy
+
+from multidrop.control.audit_log import read_audit
+from multidrop.drives import DelixiModbus, DelixiNative, InnovertIBD
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
+from multidrop.poller import Poller
+from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, proof
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[SimulatedBus]:
+    toy = SimulatedDrive(Toy(7))
+    toy["output_frequency"], toy["output_current"] = 12.3, 1.5
+    bus = SimulatedBus(monkeypatch, toy, audit=tmp_path / "audit.jsonl")
+    bus.attach(toy.drive)
+    with bus.bus:
+        yield bus
+
+
+def test_the_frame_and_the_words_are_modbus(simulated: SimulatedBus) -> None:
+    """Application protocol V1.1b3, 6.3: 7BH = 123 tenths, 96H = 150 hundredths; CRC by any calculator."""
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    assert bus.ask(toy, 3, 1, 2) == bytes.fromhex("007B 0096")
+    assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
+
+
+def test_it_is_no_write(simulated: SimulatedBus, tmp_path: Path) -> None:
+    """Neither audited nor retried nor in doubt, and no identity check goes before it."""
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    simulated.loses = lambda request: True
+    with pytest.raises(NoReply):
+        bus.ask(toy, 3, 1, 2)
+    assert len(simulated.frames) == 1
+    assert list(read_audit(tmp_path / "audit.jsonl")) == []
+
+
+def test_an_exception_is_the_drives_refusal(simulated: SimulatedBus) -> None:
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    with pytest.raises(DriveRefused) as refusal:
+        bus.ask(toy, 3, 0x4000, 1)
+    assert refusal.value.code == 2
+
+
+def test_it_must_begin_in_time(simulated: SimulatedBus) -> None:
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    simulated.queue_time = 0.3
+    with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
+        bus.ask(toy, 3, 1, 2, expiry=0.2)
+    assert simulated.frames == []
+    assert bus.ask(toy, 3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
+
+
+def test_a_copy_of_the_request_is_no_reply(simulated: SimulatedBus) -> None:
+    """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    echo = checksums.rtu(bytes.fromhex("07 01 03 20 00 11"))
+    simulated.answers = lambda request: echo
+    with pytest.raises(BadReply, match="copy of the request"):
+        bus.ask(toy, 1, 0x320, 17)
+    assert simulated.frames[0][1] == echo.hex(" ").upper()
+    simulated.has_echo = True  # the line has told the two apart
+    assert bus.ask(toy, 1, 0x320, 17) == bytes.fromhex("20 00 11")
+
+
+WRONG = {
+    (6, 1, 1): "function = 6 is none of those that read: 1, 2, 3 and 4",
+    (0, 1, 1): "function = 0 is none",
+    (3, -1, 1): "start = -1 is no address from 0 to 65535",
+    (3, 65536, 1): "start = 65536 is no address",
+    (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",
+    (3, 1, 0): "count = 0 is not from 1 to 10, which toy@7 reads in one request",
+    (3, 1, 11): "count = 11 is not from 1 to 10",  # the family's own limit
+    (4, 1, 126): "count = 126 is not from 1 to 125",
+    (1, 1, 2001): "count = 2001 is not from 1 to 2000",
+}
+
+
+@pytest.mark.parametrize("asked", WRONG)
+def test_what_cannot_be_asked_is_told_and_nothing_is_sent(
+    simulated: SimulatedBus, asked: tuple[int, int, int]
+) -> None:
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    with pytest.raises(ValueError, match=WRONG[asked]):
+        bus.ask(toy, *asked)
+    assert simulated.frames == []
+
+
+@pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
+def test_what_is_no_number_is_told(simulated: SimulatedBus, asked: tuple[int, int, int]) -> None:
+    bus, (toy,) = simulated.bus, simulated.bus.drives
+    with pytest.raises(TypeError, match="is no whole number"):
+        bus.ask(toy, *asked)
+    for expiry in (0, -1, float("nan"), float("inf"), True):
+        with pytest.raises(ValueError, match="is not a number of seconds above 0"):
+            bus.ask(toy, 3, 1, 1, expiry=expiry)
+    assert simulated.frames == []
+
+
+def test_limits_of_families(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, native, _ = one(monkeypatch, DelixiNative(1))
+    with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
+        bus.bus.ask(native, 3, 1, 1)
+    bus, modbus, _ = one(monkeypatch, DelixiModbus(1))
+    with pytest.raises(ValueError, match="count = 2 is not from 1 to 1"):
+        bus.bus.ask(modbus, 3, 1, 2)
+    bus, _, _ = one(monkeypatch, InnovertIBD(1))
+    with pytest.raises(NotAttached):
+        bus.bus.ask(modbus, 3, 1, 1)
+    assert bus.frames == []
+
+
+def test_a_line_that_is_polled_is_asked_between_the_polls() -> None:
+    """However busy the machine is: a reply that it delays is another's neither here nor there."""
+    drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
+    expected = proofs(drive)
+    status = int(proof(drive.drive, Toy.status)).to_bytes(2)
+    answers = Counter[bytes]()
+    with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as sim:
+        with Poller(plant(line(sim.wires[0].path, drive))) as poller:
+            bus = poller.bus("line")
+
+            def asked() -> bool:
+                with suppress(NoReply, BadReply):
+                    answers[bus.ask(drive.drive, 3, Toy.status.address, 1, expiry=60.0)] += 1
+                return answers.total() >= 20
+
+            until(asked)
+            polls = poller.summary()["samples"]
+            until(lambda: poller.summary()["samples"] > polls + 20)
+        rows = rows_of(poller)
+    assert set(answers) == {status}
+    good = [row for row in rows if row.status == "ok"]
+    assert {row.register: row.value for row in good} == {name: value for (_, name), value in expected.items()}
+    assert all(row.value == expected[row.drive, row.register] for row in good)
