@@ -10,8 +10,8 @@ from multidrop.drive import NotDone, Refused
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until
 from multidrop.drive.state import Condition, Direction
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, Role
 
 READY_TIME = 1.0  # s, for each step up to "switched on"
 
@@ -70,6 +70,7 @@ class CiA402(Profile):
     coast_word: ClassVar[int | None] = DISABLE_VOLTAGE
     reset_word: ClassVar[int] = RESET
     roles = {
+        **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=CiA402Control,
@@ -78,12 +79,6 @@ class CiA402(Profile):
             extra=("reverse",),
         ),
         "status": Role((Access.READING,), values=CiA402Status),
-        "reference": REFERENCE,
-        "output_frequency": READING,
-        "fault": OPTIONAL,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     def _impossible(self, status: int) -> str:

@@ -8,8 +8,8 @@ from typing import ClassVar
 from multidrop.drive import Refused
 from multidrop.drive.register import Access
 from multidrop.drive.state import Direction
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, Role
 
 
 class DanfossControl(IntFlag):
@@ -64,6 +64,7 @@ class DanfossFC(Profile):
     coast_word: ClassVar[int | None] = COAST
     reset_word: ClassVar[int] = RESET
     roles = {
+        **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=DanfossControl,
@@ -71,12 +72,6 @@ class DanfossFC(Profile):
             never_together=(DanfossControl.RESET | DanfossControl.START,),
         ),
         "status": Role((Access.READING,), values=DanfossStatus),
-        "reference": REFERENCE,
-        "output_frequency": READING,
-        "fault": OPTIONAL,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     def _impossible(self, status: int) -> str:

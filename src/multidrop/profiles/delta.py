@@ -9,8 +9,8 @@ from multidrop.drive.register import Access
 from multidrop.drive.script import Script, read, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, READING, Role
 
 STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # bits 1 and 0 of the status
 FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # bits 4 and 3
@@ -74,15 +74,11 @@ class Delta(Profile):
     reset_word: ClassVar[int] = DeltaReset.RESET
     reset_role: ClassVar[str] = "reset"
     roles = {
+        **COMMON,
         "control": Role((Access.COMMAND,), values=DeltaControl, harmless=(0, DeltaControl.STOP)),
         "reset": Role((Access.COMMAND,), values=DeltaReset, harmless=()),
         "status": Role((Access.READING,), values=DeltaStatus),
-        "reference": REFERENCE,
-        "output_frequency": READING,
         "fault": READING,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     def _impossible(self, status: int) -> str:

@@ -11,8 +11,8 @@ from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import verb
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, Role
 
 
 class InvtControl(IntEnum):
@@ -57,18 +57,13 @@ class Invt(Profile):
     coast_word: ClassVar[int | None] = InvtControl.COAST
     reset_word: ClassVar[int] = InvtControl.RESET_FAULT
     roles = {
+        **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=InvtControl,
             harmless=(InvtControl.STOP, InvtControl.COAST, InvtControl.STOP_JOG),
         ),
         "status": Role((Access.READING,), values=InvtStatus),
-        "reference": REFERENCE,
-        "output_frequency": READING,
-        "fault": OPTIONAL,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     _jogged = False  # by this object, since it was last seen to stand

@@ -9,8 +9,8 @@ from multidrop.drive import Refused
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, Role
 
 
 class OptidriveControl(IntFlag):
@@ -62,6 +62,7 @@ class Optidrive(Profile):
     coast_word: ClassVar[int | None] = COAST
     reset_word: ClassVar[int] = RESET
     roles = {
+        **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=OptidriveControl,
@@ -69,12 +70,6 @@ class Optidrive(Profile):
             never_together=(OptidriveControl.RESET | OptidriveControl.RUN,),
         ),
         "status": Role((Access.READING,), values=OptidriveStatus),
-        "reference": REFERENCE,
-        "output_frequency": READING,
-        "fault": OPTIONAL,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     def _impossible(self, status: int) -> str:

@@ -9,8 +9,8 @@ from multidrop.drive import NotDone, Refused
 from multidrop.drive.register import Access
 from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
-from multidrop.profiles.profile import OPTIONAL, READING, REFERENCE, REFERENCE_IN_FORCE, Profile
-from multidrop.profiles.role import Role
+from multidrop.profiles.profile import Profile
+from multidrop.profiles.role import COMMON, Role
 
 READY_TIME = 1.0  # s, in which it must be ready to be switched on
 BETWEEN = 0.1  # s, at least, between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
@@ -74,6 +74,7 @@ class Profidrive(Profile):
     coast_word: ClassVar[int | None] = COAST
     reset_word: ClassVar[int] = RESET
     roles = {
+        **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=ProfidriveControl,
@@ -81,12 +82,6 @@ class Profidrive(Profile):
             never_together=(ProfidriveControl.RESET | ProfidriveControl.ON,),
         ),
         "status": Role((Access.READING,), values=ProfidriveStatus),
-        "reference": REFERENCE,
-        "output_frequency": READING,
-        "fault": OPTIONAL,
-        "reference_in_force": REFERENCE_IN_FORCE,
-        "station": OPTIONAL,
-        "signature": OPTIONAL,
     }
 
     def _impossible(self, status: int) -> str:

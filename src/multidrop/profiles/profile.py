@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from itertools import chain
 from typing import Any, ClassVar
 
 from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import Access, Register
+from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, until, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Option, verb
-from multidrop.profiles.role import Role, completed, role_errors
+from multidrop.profiles.role import PROOFS, Role, completed, errors_together, own_errors
 
 STOP_TIME = 60.0  # s; the deceleration ramp is a role of no profile
 RESET_TIME = 2.0  # s, after which a fault that was reset must be gone
-
-READING = Role((Access.READING,))
-OPTIONAL = Role((Access.READING,), needed=False)
-REFERENCE = Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%"))
-PROOFS = ("station", "signature")  # roles that only tell the family
-REFERENCE_IN_FORCE = Role((Access.READING,), units=("Hz", "%"), needed=False)
 
 
 class Profile(Drive):
@@ -78,34 +73,10 @@ class Profile(Drive):
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
         """Return a sentence for each mistake in a family's own registers, and in them together with ours."""
-        wrong = [sentence for name, one in own.items() for sentence in cls._errors_of(name, one)]
+        taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
         found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
-        return wrong + list(cls._errors_together(found))
-
-    @classmethod
-    def _errors_of(cls, name: str, register: Register[Any]) -> Iterator[str]:
-        if name in cls.roles:
-            yield from role_errors(name, cls.roles[name], register)
-        elif name in {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}:
-            yield f"{name}: this is a name that every profile has for something else; call it otherwise"
-        elif register.harmless:
-            yield f"{name}: harmless counts are those of its control, which the profile says; leave it out"
-        if name == "reference" and register.span is not None and register.span[0] < 0:
-            yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
-        if name == "reference" and ((register.step or 0) < 0 or getattr(register, "offset", None)):
-            yield f"{name}: a greater count is more of it: its step is above 0, and it has no offset"
-
-    @classmethod
-    def _errors_together(cls, found: Mapping[str, Any]) -> Iterator[str]:
-        for name, role in cls.roles.items():
-            if role.needed and not isinstance(found[name], Register):
-                yield f"{name}: this profile needs a register of this name, which is not declared"
-        reference, shown = found.get("reference"), found.get("reference_in_force")
-        if reference is not None and shown is not None and reference.unit != shown.unit:
-            yield f"reference_in_force: its unit is not that of reference, {reference.unit!r}"
-        signature = found.get("signature")
-        if signature is not None and signature.values is None:
-            yield "signature: it needs names for the values that tell the family"
+        singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
+        return [*chain.from_iterable(singly), *errors_together(cls.roles, found)]
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:

@@ -6,7 +6,7 @@ counts are harmless.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 from typing import Any, cast
@@ -37,6 +37,49 @@ class Role:
     def is_word(self) -> bool:
         """True where the state machine looks at bits or words rather than at a quantity."""
         return self.values is not None
+
+
+READING = Role((Access.READING,))
+OPTIONAL = Role((Access.READING,), needed=False)
+PROOFS = ("station", "signature")  # roles that only tell the family
+COMMON: Mapping[str, Role] = {  # of all profiles, besides `control` and `status`
+    "reference": Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%")),
+    "output_frequency": READING,
+    "fault": OPTIONAL,
+    "reference_in_force": Role((Access.READING,), units=("Hz", "%"), needed=False),
+    **dict.fromkeys(PROOFS, OPTIONAL),
+}
+
+
+def own_errors(
+    name: str, register: Register[Any], roles: Mapping[str, Role], taken: Collection[str]
+) -> Iterator[str]:
+    """Find what is wrong with a family's register; `taken` are names that a profile has already."""
+    if name in roles:
+        yield from role_errors(name, roles[name], register)
+    elif name in taken:
+        yield f"{name}: this is a name that every profile has for something else; call it otherwise"
+    elif register.harmless:
+        yield f"{name}: harmless counts are those of its control, which the profile says; leave it out"
+    if name == "reference" and register.span is not None and register.span[0] < 0:
+        yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
+    if name == "reference" and ((register.step or 0) < 0 or register.offset):
+        yield f"{name}: a greater count is more of it: its step is above 0, and it has no offset"
+    if name == "output_frequency" and (register.part or register.offset or register.scale_register):
+        yield f"{name}: it is 0 where the motor stands alone: it has no part, offset and scale_register"
+
+
+def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iterator[str]:
+    """Find roles that are missing, and those that do not fit each other."""
+    for name, role in roles.items():
+        if role.needed and not isinstance(found[name], Register):
+            yield f"{name}: this profile needs a register of this name, which is not declared"
+    reference, shown = found.get("reference"), found.get("reference_in_force")
+    if reference is not None and shown is not None and reference.unit != shown.unit:
+        yield f"reference_in_force: its unit is not that of reference, {reference.unit!r}"
+    signature = found.get("signature")
+    if signature is not None and signature.values is None:
+        yield "signature: it needs names for the values that tell the family"
 
 
 def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
