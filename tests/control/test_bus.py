@@ -24,7 +24,8 @@ from multidrop.errors import BadReply, BusError, DriveRefused, LineError, NoRepl
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import exchange as exchanges
-from multidrop.transport.exchange import READ_ATTEMPTS, make_exchange
+from multidrop.transport.exchange import READ_ATTEMPTS
+from multidrop.transport.prepared import make_exchange
 
 
 class Rig(Drive):

@@ -23,7 +23,7 @@ from multidrop.planning.prediction import predict
 from multidrop.planning.schedule import Job, Schedule
 from multidrop.sim import Faults
 from multidrop.transport import clock
-from multidrop.transport.exchange import NO_ROWS, make_exchange
+from multidrop.transport.prepared import NO_ROWS, make_exchange
 
 INTERVAL = 0.1
 SLACK = 1e-6

@@ -19,8 +19,8 @@ from multidrop.errors import LineError
 from multidrop.sim import Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
 from multidrop.sim.faults import RATES
 from multidrop.toml_check import parse_duration
-from multidrop.transport.exchange import make_exchange
 from multidrop.transport.line import Line
+from multidrop.transport.prepared import make_exchange
 
 READ = checksums.rtu("01 03 00 02 00 01")
 REPLY = checksums.rtu("01 03 02 00 00")

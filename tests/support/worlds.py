@@ -35,7 +35,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
 from multidrop.transport import clock
-from multidrop.transport.exchange import NO_ROWS, make_exchange
+from multidrop.transport.prepared import NO_ROWS, make_exchange
 
 S = 1_000_000_000
 BEGIN_NS = 1000 * S

@@ -13,7 +13,7 @@ from multidrop.bus import Bus
 from multidrop.drive.timing import Settings
 from multidrop.planning.bus_time import silence
 from multidrop.sim import SimulatedDrive, Simulator, Wire
-from multidrop.transport import exchange as exchanges
+from multidrop.transport import prepared as prepared_reads
 
 WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
@@ -23,7 +23,7 @@ class Counted:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
-        blocks, make_read = exchanges.blocks, exchanges.make_read
+        blocks, make_read = prepared_reads.blocks, prepared_reads.make_read
 
         def choose(*given: Any) -> Any:
             self.plans += 1
@@ -33,8 +33,8 @@ class Counted:
             self.made += 1
             return make_read(*given)
 
-        monkeypatch.setattr(exchanges, "blocks", choose)
-        monkeypatch.setattr(exchanges, "make_read", make)
+        monkeypatch.setattr(prepared_reads, "blocks", choose)
+        monkeypatch.setattr(prepared_reads, "make_read", make)
 
     def since(self) -> tuple[int, int]:
         """Since it was asked last."""
@@ -108,7 +108,7 @@ def test_what_a_drive_is_told_meanwhile_is_heeded(bus: Bus, name: str, value: ob
 
 
 def test_no_more_is_kept_than_there_is_room_for(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exchanges, "MOST_PREPARED", 3)
+    monkeypatch.setattr(prepared_reads, "MOST_PREPARED", 3)
     drive = bus.attach(PatientToy, 1)
     for wanted in permutations(WANTED):
         assert set(bus.read_many(drive, wanted)) == {register.name for register in WANTED}

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.models import INDENT, facts, sheet
+from multidrop.cli.models import facts
 from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.family_sheet import INDENT, sheet
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL

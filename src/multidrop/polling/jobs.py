@@ -15,7 +15,7 @@ from multidrop.planning.bus_time import kind, sending, silence
 from multidrop.planning.schedule import Job
 from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive
-from multidrop.transport.exchange import make_read
+from multidrop.transport.prepared import make_read
 
 
 class RowNames:

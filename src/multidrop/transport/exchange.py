@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import Any
 
-from multidrop import core
 from multidrop.core import (
     STATUSES,
     Completion,
@@ -27,82 +25,16 @@ from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttach
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
-from multidrop.planning.splitting import halves, least, may_be_too_long
+from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import mixed_up, silence_hint
+from multidrop.transport.prepared import NO_ROWS, PreparedRead, PreparedReads, make_exchange, make_read
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
 WRITE_TIMEOUT = 1.0  # s: a write that is wrongly reported as unconfirmed costs more than the wait
 ILLEGAL_FUNCTION = 1  # a shorter request has the same one
-MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
-NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
-
-
-def make_exchange(
-    drive: Drive, request: Message, peer: Peer, rows: core.RowLayout | None = None, **details: Any
-) -> Exchange:
-    """Return the exchange that carries this request to this drive; `details` are Exchange's own."""
-    settings = drive.settings
-    return Exchange(
-        drive.framing,
-        request,
-        peer,
-        baudrate=settings.baudrate,
-        format=settings.format,
-        character=settings.character,
-        silence=silence(drive),
-        turnaround=drive.turnaround_delay,
-        block=rows,
-        **details,
-    )
-
-
-def make_read(
-    drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
-) -> Exchange:
-    """Return the exchange that reads a block, with the probe for an adapter's echo where it needs one."""
-    probe, register = None, drive.echo_probe
-    if register and register not in block.registers:
-        probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
-    return make_exchange(drive, block.request, peer, rows, echo_probe=probe, **details)
-
-
-class PreparedRead:
-    """A block of one drive's registers, the exchange that reads it, and where each lies in the reply."""
-
-    def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
-        self.block = block
-        self.exchange = make_read(drive, block, peer)
-        self.may_be_too_long = may_be_too_long(drive, block)
-        self._places = [(register, block.offset(register)) for register in block.registers]
-
-    def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
-        """Yield the name and the value of each register; None where the drive gave none."""
-        data = reply.data
-        for register, at in self._places:
-            yield register.name, register.value_in(data, at)
-
-
-class PreparedReads:
-    """Reads of one drive, made once and kept while all that they depend on stays as it was."""
-
-    def __init__(self, drive: Drive, peer: Peer, made_for: tuple[object, ...]) -> None:
-        self.made_for = made_for
-
-        @lru_cache(MOST_PREPARED)
-        def prepare(block: Block) -> PreparedRead:
-            return PreparedRead(drive, block, peer)
-
-        @lru_cache(MOST_PREPARED)
-        def of(registers: tuple[Register[Any], ...]) -> tuple[PreparedRead, ...]:
-            return tuple(prepare(block) for block in blocks(drive, registers))
-
-        self.of = of
-        self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks that the drive does not answer as a whole
-        self.answered: set[Block] = set()  # blocks that may have been too long, and are not
 
 
 class Exchanges:
