@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from simulated_bus import SimulatedBus
 
+from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
 from multidrop.drive.register import Kept, command, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import Refused
+from multidrop.errors import Refused, Unconfirmed
 from multidrop.plant.loader import load_plant
 from multidrop.sim import simulated
 
@@ -180,6 +181,20 @@ def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.
     assert "confirmed" in Pump.options
     hall = SimulatedBus(monkeypatch, simulated(Known(1)))
     hall.attach(Known(1)).start()
+    assert written(hall) == [RUN]
+
+
+def test_what_is_still_under_way_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exception 05: the server has accepted the request and is processing it (V1.1b3, section 7)."""
+    hall = SimulatedBus(monkeypatch, simulated(Known(1)))
+    drive = hall.attach(Known(1))
+
+    def acknowledged(request: Message) -> bytes | None:
+        return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
+
+    hall.answers = acknowledged
+    with pytest.raises(Unconfirmed, match="its reply is code 05H, acknowledged, still working"):
+        drive.start()
     assert written(hall) == [RUN]
 
 

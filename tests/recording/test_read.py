@@ -12,6 +12,8 @@ from recordings import ABOUT, SCHEMA, record, recorded, row, rows_of
 from toy import Toy
 
 import multidrop
+from multidrop.drive.script import Read
+from multidrop.drive.text import text
 from multidrop.polling.batch import Row
 from multidrop.recording import FORMATS, open_writer
 
@@ -99,6 +101,12 @@ def test_a_damaged_recording_is_told_as_its_reader_does(tmp_path: Path) -> None:
             continue
         with pytest.raises(ValueError, match=r"run\.csv, line 2: not a row of a recording"):
             getattr(multidrop.read(path), take)()
+
+
+def test_a_text_is_a_script_s_step_as_a_register_is() -> None:
+    serial = text(0xFC00, 8)
+    assert next(multidrop.read(serial)) == Read(serial)
+    assert next(multidrop.read(Toy.output_current)) == Read(Toy.output_current)
 
 
 def test_what_is_no_recording_is_told(tmp_path: Path) -> None:

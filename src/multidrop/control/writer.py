@@ -33,6 +33,8 @@ from multidrop.errors import (
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges
 
+ACKNOWLEDGED = 5  # the exception code of what is accepted and takes longer
+
 
 class Writer:
     """Sends everything that is written to the drives on a line."""
@@ -171,7 +173,9 @@ class Writer:
         try:
             self._exchanges.reply(drive, completion)
         except DriveRefused as failure:
-            return Outcome(drive.name, register, asked, Effect.REFUSED, failure=failure)
+            if call is None or not _is_under_way(failure):
+                return Outcome(drive.name, register, asked, Effect.REFUSED, failure=failure)
+            lost = failure
         except (NoReply, BadReply) as failure:
             lost = failure
         if lost is None or call is not None:  # a stop whose reply is lost is sent again at once
@@ -222,5 +226,12 @@ def _in_words(register: Register[Any], value: Any) -> str:
     return f"{register.name} = {register.format(value)}"
 
 
+def _is_under_way(failure: DriveRefused) -> bool:
+    """Return True for exception 05: it was accepted, and takes longer (application protocol V1.1b3, 7)."""
+    return failure.code == ACKNOWLEDGED and failure.meaning == Drive.exceptions[ACKNOWLEDGED]
+
+
 def _reason(failure: BusError) -> str:
+    if isinstance(failure, DriveRefused):
+        return f"its reply is code {failure.code:02X}H, {failure.meaning}"
     return failure.reason if isinstance(failure, BadReply) else "no reply"
