@@ -20,7 +20,7 @@ MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch: a few may make
 Buffers = tuple[Any, ...]
 
 
-class Decoder:
+class BatchDecoder:
     """Decodes one file's batches in their order, by the dictionaries that came before each.
 
     `columns` have each its dictionary's id, or None.

@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 
 from multidrop.polling.batch import Rows
-from multidrop.recording.arrow_decoder import Decoder
+from multidrop.recording.arrow_decoder import BatchDecoder
 from multidrop.recording.arrow_encoder import Encoder
 from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, SCHEMA, FlatTable, IpcMessage, messages
 from multidrop.recording.arrow_schema import COLUMNS, COLUMNS_BEFORE, FileColumn
@@ -60,7 +60,7 @@ class ArrowsReader(RecordingReader):
 
     def __iter__(self) -> Iterator[Rows]:
         rows = 0
-        decoder = Decoder(self._columns)
+        decoder = BatchDecoder(self._columns)
         with self.path.open("rb") as file:
             for message in islice(messages(file, self._whole), 1, None):
                 if not message.header:
