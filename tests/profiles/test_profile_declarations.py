@@ -61,9 +61,9 @@ def test_a_family_may_add_the_bit_for_reverse_where_makes_differ() -> None:
 
 
 def test_the_output_frequency_is_0_for_a_motor_that_stands_alone() -> None:
-    for details in ({"part": (0, 3)}, {"offset": -50}):
+    for frequency in (reading(0x60, "Hz", part=(0, 3)), reading(0x60, "Hz", offset=-50)):
         with pytest.raises(DeclarationError, match="output_frequency: it is 0 where the motor stands alone"):
-            type("Half", (Atv320,), {"output_frequency": reading(0x60, "Hz", **details)})  # type: ignore[arg-type]
+            type("Half", (Atv320,), {"output_frequency": frequency})
 
 
 def test_nothing_beside_the_roles_is_harmless() -> None:

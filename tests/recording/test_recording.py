@@ -319,7 +319,7 @@ def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> N
     tracemalloc = pytest.importorskip("tracemalloc")
     with open_writer(tmp_path / "a.arrows", {}) as writer:
         batch = counting(16384)
-        for _ in range(40):
+        for _ in range(70):
             writer.write(batch)
     size = (tmp_path / "a.arrows").stat().st_size
     tracemalloc.start()
