@@ -40,10 +40,10 @@ class CodeTable:
         return memoryview(ffi.buffer(out, rows))
 
 
-def _copy(kind: str, column: memoryview[Any], size: int) -> Any:
+def _copy(kind: str, column: bytes | memoryview[Any], size: int) -> Any:
     """Return a column as an array, which a place in a file need not be aligned for."""
-    made = ffi.new(kind, max(column.nbytes // size, 1))
-    ffi.memmove(made, column, column.nbytes)
+    made = ffi.new(kind, max(memoryview(column).nbytes // size, 1))
+    ffi.memmove(made, column, memoryview(column).nbytes)
     return made
 
 
@@ -55,9 +55,11 @@ def narrow_up(numbers: memoryview[Any]) -> memoryview[Any]:
     return memoryview(ffi.buffer(out, 4 * rows))
 
 
-def widen(numbers: memoryview[Any], valid: memoryview[Any] | None, rows: int) -> memoryview[Any]:
+def widen(
+    numbers: bytes | memoryview[Any], valid: bytes | memoryview[Any] | None, rows: int
+) -> memoryview[Any]:
     """Return float32 numbers as int64, 0 where there is none; ValueError for one that is beyond them."""
-    if numbers.nbytes < 4 * rows or (valid is not None and valid.nbytes < (rows + 7) // 8):
+    if len(numbers) < 4 * rows or (valid is not None and len(valid) < (rows + 7) // 8):
         raise ValueError("its lengths do not fit together")
     out = ffi.new("int64_t[]", max(rows, 1))
     bits = ffi.NULL if valid is None else ffi.from_buffer("uint8_t[]", valid)
@@ -66,9 +68,9 @@ def widen(numbers: memoryview[Any], valid: memoryview[Any] | None, rows: int) ->
     return memoryview(ffi.buffer(out, 8 * rows))
 
 
-def wide_codes(codes: memoryview[Any], rows: int, size: int) -> memoryview[Any]:
+def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryview[Any]:
     """Return codes of so many bytes as uint16."""
-    if codes.nbytes < rows * size:
+    if len(codes) < rows * size:
         raise ValueError("its lengths do not fit together")
     if size == 2:
         out = _copy("uint16_t[]", codes[: 2 * rows], 2)

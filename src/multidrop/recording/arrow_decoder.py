@@ -50,7 +50,7 @@ class BatchDecoder:
         return RecordedRows(assemble(rows, *columns))
 
     def _decoded(
-        self, column: FileColumn, identity: int | None, rows: int, bits: memoryview, *data: Any
+        self, column: FileColumn, identity: int | None, rows: int, bits: bytes, *data: Any
     ) -> Buffers:
         valid = bits if len(bits) else None
         if identity is not None:
@@ -75,7 +75,7 @@ class BatchDecoder:
         _check_text(ends, text)
         if count and len(ends) < 4 * (count + 1):
             raise ValueError("its lengths do not fit together")
-        places = ends[: 4 * (count + 1)].cast("i") if count else [0]
+        places = memoryview(ends)[: 4 * (count + 1)].cast("i") if count else [0]
         names = []
         for begin, end in pairwise(places):
             if not 0 <= begin <= end <= len(text):
@@ -85,8 +85,12 @@ class BatchDecoder:
         self._names[number] = Names([*(before.listed if before else ()), *names])
 
 
-def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[memoryview]]:
-    """Return the number of rows and the buffers of a batch that has so many of these."""
+def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
+    """Return the number of rows and the buffers of a batch that has so many of these.
+
+    The core takes them, so they are no views: a view that it holds, in the traceback of a damaged batch,
+    ends the interpreter when that is collected.
+    """
     if batch.table(3):
         raise ValueError("its batches are compressed, which only pyarrow and polars read")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
@@ -94,13 +98,13 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[me
         raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
     if len(places) != count:
         raise ValueError(f"there is a batch of {len(places)} buffers")
-    return rows, [body[at : at + length] for at, length in places]
+    return rows, [bytes(body[at : at + length]) for at, length in places]
 
 
-def _check_text(offsets: memoryview, text: memoryview) -> None:
+def _check_text(offsets: bytes, text: bytes) -> None:
     """Raise ValueError unless each row's text is UTF-8: libraries that take the batch rely on it."""
     if str(text, "utf-8").isascii():
         return
-    for at in offsets[: len(offsets) // 4 * 4].cast("i"):
+    for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):
         if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # within a character
             raise ValueError("its text is not UTF-8")
