@@ -180,6 +180,25 @@ def test_a_name_that_ends_within_a_character_is_damage(tmp_path: Path, is_before
         list(open_reader(path))
 
 
+@pytest.mark.parametrize("name", ["monotonic_ns", "drive", "status"])
+@pytest.mark.parametrize("suffix", [".arrows", ".parquet"])
+def test_a_row_without_what_every_row_has_is_damage(tmp_path: Path, suffix: str, name: str) -> None:
+    whole, path = record(tmp_path / f"whole{suffix}"), tmp_path / f"a{suffix}"
+    is_parquet = suffix == ".parquet"
+    with whole.open("rb") as file:
+        table = pa.parquet.ParquetFile(file).read() if is_parquet else pa.ipc.open_stream(file).read_all()
+    at = table.schema.names.index(name)
+    lacking = pa.array([None, *table[name].to_pylist()[1:]], table.schema.field(at).type)
+    table = table.set_column(at, table.schema.field(at).with_nullable(True), lacking)
+    if is_parquet:
+        pa.parquet.write_table(table, path)
+    else:
+        with pa.ipc.new_stream(path, table.schema) as stream:
+            stream.write_table(table)
+    with pytest.raises(ValueError, match=f"is damaged after row 0: there is a row without a {name}"):
+        list(open_reader(path))
+
+
 def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path) -> None:
     batch, times = counting(1024), GROUP_ROWS // 1024 + 1
     with open_writer(tmp_path / "a.parquet", METADATA) as writer:

@@ -53,6 +53,9 @@ class BatchDecoder:
         self, column: FileColumn, identity: int | None, rows: int, bits: bytes, *data: Any
     ) -> Buffers:
         valid = bits if len(bits) else None
+        if valid and not column.nullable:
+            _check_filled(column, valid, rows)
+            valid = None
         if identity is not None:
             names = self._names.get(identity)
             if names is None:
@@ -99,6 +102,13 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[by
     if len(places) != count:
         raise ValueError(f"there is a batch of {len(places)} buffers")
     return rows, [bytes(body[at : at + length]) for at, length in places]
+
+
+def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:
+    """Raise ValueError unless a column that every row has, has a value in each."""
+    filled = (1 << rows) - 1
+    if int.from_bytes(bits, "little") & filled != filled:
+        raise ValueError(f"there is a row without a {column.name.decode()}")
 
 
 def _check_text(offsets: bytes, text: bytes) -> None:

@@ -127,6 +127,9 @@ class ParquetReader(RecordingReader):
             table.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
             raise self._damaged(rows, "what follows cannot be unpacked") from failure
+        for field in self._arrow.schema(schema()):
+            if not field.nullable and table[field.name].null_count:
+                raise self._damaged(rows, f"there is a row without a {field.name}")
         return table.replace_schema_metadata().to_batches()
 
 
