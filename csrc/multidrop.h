@@ -342,6 +342,8 @@ void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Begin nothing more of what is queued or repeated, but still urgent exchanges. Return 1 while one of the
  * former is under way. */
 int md_port_end(struct md_port *port);
+/* Return 1 while an exchange with this drive is queued, repeated, urgent or under way. */
+int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
 /* md_late_inherit() while the engine looks at neither drive. */
 void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
 /* Carry out nothing more, and give the descriptor back. What is under way after md_port_end() becomes

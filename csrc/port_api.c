@@ -74,6 +74,14 @@ int md_port_end(struct md_port *port)
     return is_under_way;
 }
 
+int md_port_is_asking(struct md_port *port, const struct md_drive *drive)
+{
+    md_engine_enter(port->engine);
+    int is_asking = md_turn_is_asking(&port->turn, drive);
+    md_engine_leave(port->engine);
+    return is_asking;
+}
+
 void md_port_tap(struct md_port *port, struct md_tap *tap)
 {
     md_engine_enter(port->engine);

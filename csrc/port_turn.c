@@ -90,6 +90,23 @@ int md_turn_end(struct md_turn *turn)
     return turn->whose != MD_NOBODYS && turn->whose != MD_URGENT;
 }
 
+int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive)
+{
+    if (turn->whose != MD_NOBODYS && turn->line.exchange->drive == drive)
+        return 1;
+    uint32_t submitted = get(&turn->progress.submitted);
+    for (uint32_t at = turn->progress.done; at != submitted; at++)
+        if (turn->slots[at & (turn->room - 1)].exchange->drive == drive)
+            return 1;
+    for (uint32_t at = 0; at < turn->round_len; at++)
+        if (turn->round[at]->drive == drive)
+            return 1;
+    for (const struct md_urgent *urgent = turn->urgent; urgent; urgent = urgent->next)
+        if (urgent->exchange->drive == drive)
+            return 1;
+    return 0;
+}
+
 /* ---- what goes before an exchange ---- */
 
 static uint64_t replies(const struct md_drive *drive)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -34,6 +34,8 @@ from multidrop.transport.statistics import LineMeter, LineStatistics
 
 D = TypeVar("D", bound=Drive)
 T = TypeVar("T", bound=float)
+
+EXPIRY = 1.0  # s
 
 _log = logging.getLogger("multidrop.bus")
 
@@ -71,14 +73,35 @@ class Bus:
         transaction: str = "match",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
-        expiry: float = 1.0,
+        expiry: float = EXPIRY,
     ) -> None:
         _checked_expiry(expiry, "a write")
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
+        self._begin(Line(port, Echo(echo), TransactionIds(transaction)), ledger, audit, expiry)
+
+    @classmethod
+    def awaiting(
+        cls,
+        port: str,
+        *,
+        echo: str = "auto",
+        transaction: str = "match",
+        ledger: Ledger | Path | str | None = None,
+        audit: Path | str | None = None,
+    ) -> Bus:
+        """Return a bus whose port is not there yet: the poller that has it opens it, and so do stops."""
+        bus = cls.__new__(cls)
+        bus.baudrate = bus.format = bus.silence = None
+        bus._begin(Line.awaited(port, Echo(echo), TransactionIds(transaction)), ledger, audit, EXPIRY)
+        return bus
+
+    def _begin(
+        self, line: Line, ledger: Ledger | Path | str | None, audit: Path | str | None, expiry: float
+    ) -> None:
         self.drives: list[Drive] = []
-        self.line = Line(port, Echo(echo), TransactionIds(transaction))
+        self.line = line
         try:
             log = AuditLog(audit) if audit else None
         except OSError:
@@ -212,6 +235,13 @@ class Bus:
             self._exchanges.remove(drive)
             self._writer.identity_check.forget(drive)
             self._free([drive])
+
+    def remember(self, before: Bus) -> None:
+        """Take over what another bus, which is closed, learnt of the drives on the same serial line.
+
+        Their answers to what they were asked there may still come.
+        """
+        self._exchanges.remember(before._exchanges)
 
     def _free(self, drives: Iterable[Drive]) -> None:
         """Let these drives be attached to another bus."""
@@ -351,8 +381,22 @@ class Bus:
         if self._last_act is None:
             self._last_act = exit_hook().add(self._latches.shut, self._stop_at_last)
 
+    @property
+    def stops_on_exit(self) -> bool:
+        """True once `stop_on_exit` was called."""
+        return self._last_act is not None
+
+    def stop_leaving(self, drives: Sequence[Drive]) -> None:
+        """Stop these if `stop_on_exit` was called: once they are detached, nobody would."""
+        if drives and self.stops_on_exit:
+            self._tell(self._stopper.stop_all(drives, lambda: False, None))
+
     def _stop_at_last(self) -> None:
-        for stopped in self.stop_all().values():
+        self._tell(self.stop_all())
+
+    @staticmethod
+    def _tell(found: Mapping[str, Stopped]) -> None:
+        for stopped in found.values():
             if stopped.seen is not Seen.STOPPED:
                 _log.warning("%s", stopped)
 

@@ -6,22 +6,25 @@ Rows gather in the core, in chunks of bounded number, and are taken from there, 
 
 from __future__ import annotations
 
-import difflib
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
+from multidrop.control.exit_hook import exit_hook
 from multidrop.core import RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.plant.model import Plant, PolledDrive
+from multidrop.errors import LineError
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
+from multidrop.polling.adoption import GONE, Adoption
 from multidrop.polling.batch import Batch
 from multidrop.polling.batch_caller import BatchCaller
-from multidrop.polling.jobs import RowNames
+from multidrop.polling.line_set import NOBODY, LineSet
 from multidrop.polling.polled_line import PolledLine
 from multidrop.toml_check import check_period
 from multidrop.transport import clock
@@ -31,7 +34,6 @@ from multidrop.transport.wakeup import WakeUp
 LOOK_S = 0.05  # between looks at the lines, while one of them or a reader of `fileno` needs them
 REST_S = 0.5  # the same, where neither does
 FILLING_NS = 10_000_000  # for which new rows gather before they are taken from a chunk that is not full
-ENDING_NS = 1_000_000_000  # for which the end of the polling waits for exchanges under way
 
 
 class Poller:
@@ -54,28 +56,21 @@ class Poller:
     ) -> None:
         if not isinstance(plant, Plant):
             raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
-        self._names = RowNames()
         self._row_queue = RowQueue()
+        self._lines = LineSet(self._row_queue, ledger, audit)
+        self._path = plant.path
         self._wakeup = WakeUp()
         self._is_watched = False  # somebody waits for `fileno`
         self._taken_ns = 0  # the newest rows
-        self._lines: list[PolledLine] = []
+        self._stops_on_exit = False
         self._closing = False
         self._over = threading.Event()  # all lines are closed, and no row comes any more
         self._caller: BatchCaller | None = None
-        self._changing = threading.Lock()  # one drive comes or goes at a time
+        self._changing = threading.Lock()  # one drive or line comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         register_at_fork(self)
         try:
-            for number, declared in enumerate(plant.lines):
-                bus = Bus(
-                    declared.port,
-                    echo=declared.echo,
-                    transaction=declared.ids,
-                    ledger=ledger,
-                    audit=audit,
-                )
-                self._lines.append(PolledLine(declared, number, bus, self._row_queue, self._names))
+            self._lines.fill(plant.lines)
         except BaseException:
             self.close()
             raise
@@ -94,9 +89,10 @@ class Poller:
         return f"<Poller {state}; {lines or 'no lines'}>"
 
     def __enter__(self) -> Poller:
-        for line in self._lines:
-            line.start()
-        self._thread.start()
+        with self._changing:
+            for line in self._lines:
+                line.start()
+            self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -121,18 +117,11 @@ class Poller:
         self._closing = True
         for line in self._lines:
             line.bus.leave()  # all of them at once
-        if self._thread.is_alive():
-            self._call_thread()
-            self._thread.join()
-        for line in self._lines:
-            line.bus.tended(False)
-        for line in self._lines:
-            line.bus.part()  # before the port is closed, on which it stops motors
-        given_up_ns = clock.now_ns() + ENDING_NS
-        while sum(line.end() for line in self._lines) and clock.now_ns() < given_up_ns:
-            clock.sleep(0.001)
-        for line in self._lines:
-            line.close()
+        with self._changing:  # an adoption that is under way is waited for
+            if self._thread.is_alive():
+                self._call_thread()
+                self._thread.join()
+            self._lines.end(self._lines, "it is closed")
         self._wakeup.close()
         self._over.set()
         if self._caller:
@@ -148,15 +137,78 @@ class Poller:
             now = clock.now_ns()
             restless = [line for line in self._lines if not line.is_steady(now)]
             seconds = LOOK_S if restless or self._is_watched else REST_S
-            numbers = self._row_queue.await_calls(seconds)
-            lines = [self._lines[number] for number in numbers if number < len(self._lines)]
+            lines = self._lines.called(self._row_queue.await_calls(seconds))
             called = dict.fromkeys([*restless, *lines])
 
     def _call_thread(self) -> None:
-        """Wake the thread by a number that no line has."""
-        self._row_queue.call(len(self._lines))
+        self._row_queue.call(NOBODY)
 
     # ---- lines and drives ----
+
+    @property
+    def plant(self) -> Plant:
+        """The plant as it is polled now; its drives are those that are on the buses."""
+        lines = tuple(replace(line.declared, drives=line.polled) for line in self._lines)
+        return Plant(lines, self._path)
+
+    def adopt(self, plant: Plant) -> dict[str, LineError]:
+        """Poll another plant from now on; return the lines whose port is not there, by name, and why.
+
+        Every mistake in it raises ValueError (PlantError with all of them, NoSuchPort for a name that no port
+        can have, OSError for an audit log that cannot be opened), and all stays as it was.
+
+        A line whose description is the same goes on as if nothing had happened, and so does each drive of
+        which nothing changes: it stays the same object, which `plant` has and `buses`, and what is known of
+        its identity and its late replies is kept. Changed registers, rates and drives of a line with the same
+        port take effect on the open port; a line with a new name keeps its port too. All else is let go of
+        and opened anew. A port that is not there is tried again and again, as a lost one is, and its values
+        are missed. What `add` and `set_rate` changed is as in the plant.
+
+        What leaves: requests under way are ended, and their rows come; other calls that use the line fail
+        with LineError, those of a drive with NotAttached, and what would move its motor with Overtaken. Stops
+        under way are waited for. Motors go on as they are, unless `stop_on_exit` was called: then they are
+        stopped before they leave, for nobody would later. One whose address is another family's now is not:
+        the old family's stop may mean something else there.
+
+        Names in batches keep their codes. Returns when all is done; other lines are polled meanwhile. Any
+        thread may call this, one at a time.
+        """
+        if not isinstance(plant, Plant):
+            raise TypeError(f"adopt takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
+        with self._changing:
+            self._check_polling()
+            adoption = Adoption(self._lines, plant, stops_on_exit=self._stops_on_exit)
+            self._path = plant.path
+            return adoption.carry_out(start=self._thread.is_alive())
+
+    def add_line(self, line: PlantLine) -> None:
+        """Open one more line and poll it, from now on.
+
+        Raises LineError when its port is not there, and ValueError where the plant with it would be wrong;
+        then nothing has changed.
+        """
+        with self._changing:
+            self._check_polling()
+            plant = self.plant
+            wanted = replace(plant, lines=(*plant.lines, line))
+            adoption = Adoption(self._lines, wanted, stops_on_exit=self._stops_on_exit)
+            failures = adoption.carry_out(start=False)
+            added = self._lines.find(line.name)
+            if failures:
+                self._lines.let_go([added], GONE)
+                raise failures[line.name]
+            if self._thread.is_alive():
+                added.start()
+
+    def remove_line(self, name: str) -> None:
+        """Poll a line no more, and close its port, as `adopt` does. Raises ValueError when there is none."""
+        with self._changing:
+            self._check_polling()
+            self._lines.let_go([self._lines.find(name)], GONE)
+
+    def _check_polling(self) -> None:
+        if self._closing:
+            raise ValueError("polling has ended: no line comes or goes any more")
 
     def add(self, line: str, polled: PolledDrive) -> None:
         """Poll one more drive on this line, from now on.
@@ -167,7 +219,7 @@ class Poller:
             names = {drive.name for bus in self.buses.values() for drive in bus.drives}
             if polled.drive.name in names:
                 raise ValueError(f"another drive is called {polled.drive.name}; give every one its own name")
-            self._line(line).add(polled)
+            self._lines.find(line).add(polled)
 
     def remove(self, line: str, drive: str) -> None:
         """Poll the drive of this name no more; its motor goes on as it is.
@@ -176,7 +228,7 @@ class Poller:
         when the same PolledDrive is added again. Raises ValueError when there is none.
         """
         with self._changing:
-            polled = self._line(line)
+            polled = self._lines.find(line)
             for attached in polled.bus.drives:
                 if attached.name == drive:
                     return polled.remove(attached)
@@ -195,27 +247,8 @@ class Poller:
         with self._changing:
             if self._closing:
                 raise ValueError("polling has ended: no rate can be set")
-            line, known = self._polled(drive)
+            line, known = self._lines.find_drive(drive)
             line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
-
-    def _polled(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
-        """Return a drive that is polled, by itself or by its name, and its line."""
-        drives = {known.name: (line, known) for line in self._lines for known in line.bus.drives}
-        name = drive if isinstance(drive, str) else drive.name
-        line, known = drives.get(name, (None, None))
-        if line is None or known is None or drive not in (name, known):
-            near = difflib.get_close_matches(name, drives, n=2)
-            hint = (
-                f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(drives) or 'none'}"
-            )
-            raise ValueError(f"{name} is not polled here; {hint}")
-        return line, known
-
-    def _line(self, name: str) -> PolledLine:
-        for line in self._lines:
-            if line.name == name:
-                return line
-        raise ValueError(f"there is no line {name!r}; there are {', '.join(self.buses)}")
 
     @property
     def buses(self) -> dict[str, Bus]:
@@ -224,10 +257,15 @@ class Poller:
 
     def bus(self, line: str) -> Bus:
         """Return the bus of the line with this name."""
-        return self._line(line).bus
+        return self._lines.find(line).bus
 
     def stop_on_exit(self) -> None:
-        """Stop the drives of all lines, at once, when polling ends or the process does; see Bus."""
+        """Stop the drives of all lines, at once, when polling ends or the process does; see Bus.
+
+        Also those of lines that come later, and of lines and drives that leave by `adopt` or `remove_line`.
+        """
+        exit_hook().take_signals()
+        self._stops_on_exit = True
         for line in self._lines:
             line.bus.stop_on_exit()
 
@@ -249,7 +287,7 @@ class Poller:
                 return None
             self._taken_ns = now
         columns = self._row_queue.take()
-        return Batch(columns, self._names.drives, self._names.registers) if columns else None
+        return Batch(columns, self._lines.names.drives, self._lines.names.registers) if columns else None
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.

@@ -28,6 +28,7 @@ from multidrop.core import RowQueue, Status
 from multidrop.errors import LineError, Unconfirmed
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
+from multidrop.polling import line_set
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
@@ -509,7 +510,7 @@ def test_what_is_under_way_at_the_end_is_waited_for(
             os.write(master, answers.pop())
         time.sleep(seconds)
 
-    monkeypatch.setattr(poller_module, "ENDING_NS", round(PATIENCE * 1e9))
+    monkeypatch.setattr(line_set, "ENDING_NS", round(PATIENCE * 1e9))
     with Polling(line(path, patient(every))) as polling:
         assert os.read(master, 1024) == checksums.rtu("01 03 00 04 00 01")
         monkeypatch.setattr(clock, "sleep", answer)  # when it waits for what is under way
@@ -521,7 +522,7 @@ def test_what_is_not_answered_by_the_end_has_a_row(
     far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
-    monkeypatch.setattr(poller_module, "ENDING_NS", 10_000_000)
+    monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = far_end
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
     waiting = polled(Patient(3, name="pump-3"), [Patient.fault], 60.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from random import Random
-from typing import Any, cast
+from typing import Any
 
 from stories import Story
-from worlds import BEGIN_NS, NEVER, World, WorldPort, WorldWire, transactions_of
+from worlds import BEGIN_NS, NEVER, WorldPort, WorldWire, transactions_of
 
 from multidrop.core import Completion, Exchange
 from multidrop.drive.network import speaks_tcp
@@ -92,7 +92,7 @@ class PathLine:
         self.wire = wire
         self.has_echo = self.is_lost = False
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
-        self.queue = WorldPort(cast(World, self), transactions_of(self))
+        self.queue = WorldPort(self, transactions_of(self))
 
     def require(self, settings: tuple[int, str]) -> None:
         pass

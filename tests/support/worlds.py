@@ -8,10 +8,11 @@ in which time passes only while the test lets it, and never because the machine 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 from lines import PATIENCE, line, plant, rows_of
@@ -22,6 +23,7 @@ from multidrop.core import (
     Completion,
     Exchange,
     Message,
+    Peer,
     RowQueue,
     TransactionIds,
     Transactions,
@@ -30,7 +32,7 @@ from multidrop.core import (
 from multidrop.drive import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.errors import LineError
-from multidrop.plant.model import PolledDrive
+from multidrop.plant.model import Plant, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
@@ -82,13 +84,22 @@ class WorldRowQueue(RowQueue):
         return called
 
 
+class PortWorld(Protocol):
+    """The time and the wire of a port."""
+
+    @property
+    def now(self) -> int: ...
+
+    def send(self, request: bytes, baudrate: int) -> None: ...
+
+
 class WorldPort:
     """A port (core.Port) on which the core takes its turns, with the world's time and wire for its I/O."""
 
     room = 256
     switching = 0.0
 
-    def __init__(self, world: World, transactions: Transactions = Transactions.NONE) -> None:
+    def __init__(self, world: PortWorld, transactions: Transactions = Transactions.NONE) -> None:
         self._world = world
         self._slots = ffi.new("struct md_slot[]", self.room)
         self._turn = ffi.new("struct md_turn *")
@@ -96,6 +107,8 @@ class WorldPort:
         self._urgent: Any = None
         self._kept: list[object] = []  # the core may still look at it
         self._heard = b""
+        self._guard = threading.RLock()  # as the engine's mutex
+        self._is_closed = False
         lib.md_turn_init(self._turn, self._slots, self.room, world.now)
         self._turn.line.transactions = transactions
         if transactions:
@@ -119,6 +132,10 @@ class WorldPort:
     def has_echo(self) -> bool:
         return int(self._turn.progress.echo) == int(lib.MD_ECHO)
 
+    def is_asking(self, peer: Peer) -> bool:
+        with self._guard:
+            return bool(lib.md_turn_is_asking(self._turn, peer.c))
+
     def report_to(self, row_queue: RowQueue, number: int) -> None:
         self._kept.append(row_queue)
         self._turn.row_queue, self._turn.number = row_queue.c, number
@@ -129,7 +146,8 @@ class WorldPort:
         )
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        return int(lib.md_turn_repeat(self._turn, self._pointers(exchanges), len(exchanges)))
+        with self._guard:
+            return int(lib.md_turn_repeat(self._turn, self._pointers(exchanges), len(exchanges)))
 
     def _pointers(self, exchanges: Sequence[Exchange]) -> Any:
         pointers = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
@@ -148,10 +166,13 @@ class WorldPort:
         return completion(self._urgent.completion) if self._urgent and self._urgent.is_done else None
 
     def end(self) -> bool:
-        return bool(lib.md_turn_end(self._turn))
+        with self._guard:
+            return bool(lib.md_turn_end(self._turn))
 
     def stop(self) -> None:
-        lib.md_turn_close(self._turn)
+        with self._guard:
+            lib.md_turn_close(self._turn)
+            self._is_closed = True
 
     # ---- in place of the engine's thread ----
 
@@ -161,6 +182,10 @@ class WorldPort:
 
     def advance(self, heard: bytes) -> int:
         """Carry on until there is nothing to do but wait; return until when."""
+        with self._guard:
+            return NEVER if self._is_closed else self._advance(heard)
+
+    def _advance(self, heard: bytes) -> int:
         self._heard += heard
         for _ in range(10_000):
             want = lib.md_turn_want(self._turn, self._wake, self._world.now)
@@ -194,55 +219,110 @@ class WorldPort:
 class WorldLine:
     """A line as the bus sees it (line.Line)."""
 
+    only_settings = None  # a drive may have any
+    why_closed = ""
+
     def __init__(self, world: World, port: str, ids: TransactionIds) -> None:
         self.port = port
         self.is_tcp = speaks_tcp(port)
         self.ids = ids
         self._world = world
         self.queue: WorldPort | None = None
-        self.reopen()
+
+    @property
+    def now(self) -> int:
+        return self._world.now
+
+    def send(self, request: bytes, baudrate: int) -> None:
+        self._world.send(self.port, request, baudrate)
 
     def require(self, settings: tuple[int, str]) -> None:
         pass
+
+    def inherit(self, peer: Peer, before: Peer) -> None:
+        peer.inherit(before)
 
     def overruns(self) -> None:
         pass
 
     def drop(self) -> None:
-        self.queue = self._world.port = None
+        if self.queue:
+            self.queue = self._world.ports[self.port] = None
 
     close = drop
 
     def reopen(self) -> None:
         self.close()
-        if self._world.wire.port is None:
+        wire = self._world.wires.get(self.port)
+        if wire is None or wire.port is None:
             raise LineError(self.port, "it is not there")
-        self.queue = self._world.port = WorldPort(self._world, transactions_of(self))
+        self.queue = self._world.ports[self.port] = WorldPort(self, transactions_of(self))
+        self._world.opened.append(self.port)
 
     regain = reopen  # it is lost: the poller has dropped it
     is_lost = False  # nobody stops a motor here
 
 
+class WorldLines:
+    """What opens lines of a world, in place of the class Line."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def __call__(self, port: str, echo: object, ids: TransactionIds) -> WorldLine:
+        line = self.awaited(port, echo, ids)
+        line.reopen()
+        return line
+
+    def awaited(self, port: str, echo: object, ids: TransactionIds) -> WorldLine:
+        return WorldLine(self._world, port, ids)
+
+
 class World:
-    """A wire, and a poller of drives on it: `run` lets time pass, and returns the rows that come of it."""
+    """Wires, and a poller of a plant on them: `run` lets time pass, and returns the rows that come of it."""
 
     def __init__(self, wire: WorldWire, drives: Sequence[PolledDrive]) -> None:
+        wire.open()
+        name = wire.where if speaks_tcp(wire.where) else "world"
+        declared = line(name, *drives)
+        self._begin({name: wire}, plant(replace(declared, ids=wire.ids)))
+
+    @classmethod
+    def of_lines(cls, wires: Mapping[str, WorldWire], polled: Plant) -> World:
+        """Return a world of several wires, by the names of their ports."""
+        world = cls.__new__(cls)
+        for wire in wires.values():
+            wire.open()
+        world._begin(wires, polled)
+        return world
+
+    def _begin(self, wires: Mapping[str, WorldWire], polled: Plant) -> None:
         self.now = self._limit = BEGIN_NS
-        self.wire = wire
-        self.port: WorldPort | None = None
+        self.wires = dict(wires)
+        self.ports: dict[str, WorldPort | None] = {}
+        self.opened: list[str] = []  # ports, each time that one is
         self._queue: WorldRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
-        self._threads = {*threading.enumerate()}
+        self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", lambda port, echo, ids: WorldLine(self, port, ids))
+        patch.setattr(bus, "Line", WorldLines(self))
         patch.setattr(clock, "now_ns", lambda: self.now)
-        patch.setattr(clock, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
+        patch.setattr(clock, "sleep", self._sleep)
         patch.setattr(poller, "RowQueue", self._row_queue)
-        wire.open()
-        declared = line(wire.where if speaks_tcp(wire.where) else "world", *drives)
-        self.poller = Poller(plant(replace(declared, ids=wire.ids)))
+        self.poller = Poller(polled)
+
+    @property
+    def wire(self) -> WorldWire:
+        """The only wire."""
+        (wire,) = self.wires.values()
+        return wire
+
+    @property
+    def port(self) -> WorldPort | None:
+        """The only port, while it is open."""
+        return next(iter(self.ports.values()), None)
 
     def __enter__(self) -> World:
         self.poller.__enter__()
@@ -269,6 +349,20 @@ class World:
             raise self._failure
         return rows_of(self.poller)
 
+    def beside(self, do: Callable[[], object]) -> threading.Thread:
+        """Do something on a thread of its own, for which time passes while `run` lets it."""
+        thread = threading.Thread(target=do, daemon=True)
+        self._beside.add(thread)
+        thread.start()
+        return thread
+
+    def _sleep(self, seconds: float) -> None:
+        end_ns = self.now + round(seconds * S)
+        if threading.current_thread() not in self._beside:
+            self._pass_until(end_ns)
+        while self.now < end_ns:
+            time.sleep(0.0002)
+
     def command(self, drive: Drive, request: Message) -> None:
         """Have a request carried out ahead of the polling, if the port is there."""
         ours = self.poller.bus("line")
@@ -289,8 +383,9 @@ class World:
         return self._queue
 
     def _pass_time(self, seconds: float) -> None:
-        for thread in {*threading.enumerate()} - self._threads - {threading.current_thread()}:
-            thread.join()  # opens the port again: in the world that takes no time
+        for thread in threading.enumerate():
+            if thread.name == "multidrop reopening":  # in the world that takes no time
+                thread.join()
         try:
             with self._turn:
                 self._is_waiting = True
@@ -322,17 +417,20 @@ class World:
 
     def _settle(self) -> int:
         """All that happens now; when something happens next."""
-        heard = self.wire.advance(self.now / S)
-        if self.port and not self.port.lost and self.wire.port is None:
-            self.port.hang_up()
         wake = NEVER
-        if self.port and not self.port.lost:
-            wake = self.port.advance(heard)
-        at = self.wire.wake
-        return wake if at is None else min(wake, -int(-at * S // 1))
+        for name, wire in self.wires.items():
+            heard, port = wire.advance(self.now / S), self.ports.get(name)
+            if port and not port.lost and wire.port is None:
+                port.hang_up()
+            if port and not port.lost:
+                wake = min(wake, port.advance(heard))
+            if wire.wake is not None:
+                wake = min(wake, -int(-wire.wake * S // 1))
+        return wake
 
-    def send(self, request: bytes, baudrate: int) -> None:
+    def send(self, name: str, request: bytes, baudrate: int) -> None:
         """Hand what the client sends to the drives; the port may be gone by then."""
-        self.wire.receive(request, self.now / S, baudrate)
-        if self.wire.port is None and self.port:
-            self.port.hang_up()
+        wire, port = self.wires[name], self.ports.get(name)
+        wire.receive(request, self.now / S, baudrate)
+        if wire.port is None and port:
+            port.hang_up()

@@ -13,6 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from queue import SimpleQueue
 from types import FrameType
 from typing import Any
@@ -77,7 +78,7 @@ class ExitHook:
     """
 
     def __init__(self) -> None:
-        self._acts: list[LastAct] = []
+        self._acts: list[LastAct] = []  # changed in one step: lines come and go on any thread
         self._before: dict[signal.Signals, Any] = {}
         self._held: int | None = None  # the first signal that came
         self._came: list[float] = []  # when it and others did
@@ -95,24 +96,31 @@ class ExitHook:
     def add(self, begin: Callable[[], object], work: Callable[[], object]) -> LastAct:
         """Do `work` before the process ends, and call `begin` as its end begins, also in a signal handler.
 
-        Raises ValueError outside the main thread, the only one that may take signals.
+        Raises ValueError outside the main thread, unless the signals are taken already.
         """
+        self.take_signals()
+        act = LastAct(begin, work, self._one_is_over)
+        self._acts.append(act)
+        if self._held is not None:  # the end has begun without it
+            act.begin()
+        return act
+
+    def take_signals(self) -> None:
+        """Take SIGINT and SIGTERM. Raises ValueError outside the main thread, the only one that may."""
         if not self._before:
             for number in _SIGNALS:
                 self._before[number] = signal.signal(number, self._on_signal)
-        act = LastAct(begin, work, self._one_is_over)
-        self._acts = [*self._acts, act]
-        return act
 
     def finish(self, act: LastAct) -> None:
         """Do it now, and forget it."""
         act.finish()
-        self._acts = [other for other in self._acts if other is not act]
+        with suppress(ValueError):  # another thread has finished it too
+            self._acts.remove(act)
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
 
     def _at_exit(self) -> None:
-        acts = self._acts
+        acts = [*self._acts]
         for act in acts:
             act.begin()
         for act in acts:
@@ -124,13 +132,14 @@ class ExitHook:
         self._came = [*(at for at in self._came if now - at < 1.0), now]
         if self._held is None:
             self._held, self._has_passed = number, False
-        for act in self._acts:
+        acts = [*self._acts]
+        for act in acts:
             act.begin()
-        if all(act.is_over for act in self._acts):
+        if all(act.is_over for act in acts):
             self._pass_on(number)
         elif len(self._came) >= IMPATIENT:
             os.write(2, CUT_SHORT)
-            for act in self._acts:
+            for act in acts:
                 act.is_cut_short = True
             self._pass_on(number)
 
@@ -140,7 +149,7 @@ class ExitHook:
             held, ident = self._held, threading.main_thread().ident
             if self._has_passed or held is None or ident is None:
                 return
-            if not all(act.is_over for act in self._acts):
+            if not all(act.is_over for act in [*self._acts]):
                 return
             self._has_passed = True
         signal.pthread_kill(ident, held)

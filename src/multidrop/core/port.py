@@ -116,6 +116,10 @@ class Port:
         """Say whether its adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
 
+    def is_asking(self, peer: Peer) -> bool:
+        """Return True while an exchange with this peer is queued, repeated, urgent or under way."""
+        return bool(lib.md_port_is_asking(self.c, peer.c))
+
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Have a peer take the place of another, which may be on the line."""
         self._kept.update((peer, before))

@@ -17,6 +17,8 @@ from multidrop.planning.splitting import may_be_too_long
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.prepared import make_read
 
+MOST_NAMES = 1 << 16  # that a column of a batch can number
+
 
 class RowNames:
     """Names of drives and registers, of which rows hold the numbers."""
@@ -24,6 +26,18 @@ class RowNames:
     def __init__(self) -> None:
         self.drives = Names()
         self.registers = Names()
+
+    def check_room(self, drives: Iterable[PolledDrive]) -> None:
+        """Raise ValueError where there are no numbers left for the names of these drives or registers."""
+        wanted = list(drives)
+        of_drives = {*self.drives.listed, *(polled.drive.name for polled in wanted)}
+        of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.polls)}
+        for names, of in ((of_drives, "drives"), (of_registers, "registers")):
+            if len(names) > MOST_NAMES:
+                raise ValueError(
+                    f"{len(names)} names of {of} since polling began are too many for one poller, which "
+                    f"has numbers for {MOST_NAMES}: begin another"
+                )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:
         """Return the rows that a reply with this block becomes."""
@@ -101,6 +115,12 @@ class JobMaker:
             if job.period_ns is not None and self._made.get(key) is job:
                 del self._made[key]
                 self._skipped += job.skipped
+
+    def forget_drive(self, drive: Drive) -> None:
+        """Keep nothing of a drive that left and does not come back."""
+        for key in [key for key in self._made if key[0] is drive]:
+            self._skipped += self._made.pop(key).skipped
+        self._rows = {key: rows for key, rows in self._rows.items() if key[0] is not drive}
 
     def make(
         self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None

@@ -27,6 +27,7 @@ from multidrop.transport import clock
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
 MARGIN = 0.05  # of a response delay, by which it may be outside those that a plan suits
+GONE_S = 0.001  # between looks whether a drive that left is asked yet
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 
 
@@ -39,20 +40,22 @@ class PolledLine:
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.name = declared.name
+        self.declared = declared  # but for its drives, which come and go
         self.bus = bus
         self.switching = declared.switching  # s that a change of settings takes; in the end as measured
         self.started_ns = clock.now_ns()
+        self.number = number
+        self._is_left = False  # nobody tends it any more
         self._ended_ns: int | None = None  # nothing is due any more
         self._over_ns: int | None = None  # nor under way
-        self._number = number
         self._row_queue = row_queue
         self._schedule: Schedule[PolledJob] = Schedule()
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that left
+        self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that were removed
         self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
+        self._gone: dict[int, Peer] = {}  # of drives that left, by address: it may be asked yet
         self._polled: list[tuple[Drive, Peer]] = []
         self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
         self._is_started = False
@@ -72,10 +75,23 @@ class PolledLine:
         """Make a new lock in the child, where nobody tends the line."""
         self._lock = threading.Lock()
 
+    @property
+    def name(self) -> str:
+        return self.declared.name
+
     # ---- its drives ----
 
+    @property
+    def polled(self) -> tuple[PolledDrive, ...]:
+        """Drives that are here, with what is polled of each now."""
+        return tuple(self._present.values())
+
     def add(self, polled: PolledDrive) -> None:
-        """Poll one more drive; one that comes back has the jobs that it had."""
+        """Poll one more drive; one that comes back has the jobs that it had.
+
+        Another that left its address is waited for until it is asked no more: what it owes then is known.
+        """
+        self._await_gone(polled.drive.address)
         settings = polled.drive.settings  # here, as the polling must not wait for a port that is being opened
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
@@ -92,7 +108,12 @@ class PolledLine:
                 self._polled.append((drive, self.bus.peer(drive)))
             if self._is_started:
                 self._add_jobs(drive, jobs, clock.now_ns())
-        self._row_queue.call(self._number)
+        self._row_queue.call(self.number)
+
+    def _await_gone(self, address: int) -> None:
+        peer = self._gone.pop(address, None)
+        while peer and not self._is_left and (port := self.bus.line.queue) and port.is_asking(peer):
+            clock.sleep(GONE_S)
 
     def _add_jobs(self, drive: Drive, jobs: list[PolledJob], due_ns: int) -> None:
         for job in jobs:
@@ -113,8 +134,15 @@ class PolledLine:
             self._refusals.forget(drive)
             self._present.pop(drive, None)
             self._polled = [(other, peer) for other, peer in self._polled if other is not drive]
+            self._gone[drive.address] = self.bus.peer(drive)
         self.bus.detach(drive)
-        self._row_queue.call(self._number)
+        self._row_queue.call(self.number)
+
+    def forget(self, drive: Drive) -> None:
+        """Keep nothing of a drive that was removed and does not come back, but what its answers taught."""
+        with self._lock:
+            self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
+            self._maker.forget_drive(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
         """Read a register of a drive, or all that is polled of it, every so many seconds from now on.
@@ -123,18 +151,26 @@ class PolledLine:
         ValueError for a register that is not polled.
         """
         with self._lock:
+            after = self._present[drive].at_rate(register, every)
+        self.set_polls(after)
+
+    def set_polls(self, after: PolledDrive) -> None:
+        """Poll other registers of a drive that is here, or at other rates; what stays keeps its slots."""
+        drive = after.drive
+        with self._lock:
             before = self._present[drive]
-            after = before.at_rate(register, every)
             if after == before:
                 return
             peer = self.bus.peer(drive)
             planned = self._maker.plan(after, peer.response_delay or drive.response_delay)
             if self._is_started:
                 self._change_jobs(drive, planned.jobs, clock.now_ns())
-            self._planned[after] = planned
+            others = [(other, known) for other, known in self._polled if other is not drive]
+            self._polled = [*others, (drive, peer)] if planned.jobs else others
             self._planned.pop(before)
+            self._planned[after] = planned
             self._present[drive] = after
-        self._row_queue.call(self._number)
+        self._row_queue.call(self.number)
 
     def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
         """Put these jobs in the place of those that a drive has; what is queued of it is still asked.
@@ -152,6 +188,11 @@ class PolledLine:
                 dues.get(period_ns, now_ns) if period_ns else now_ns,
             )
         self._maker.forget(old)
+        back_off = self._schedule.back_off
+        if not wanted:
+            back_off.forget(drive.address)
+        elif not present and not self.bus.peer(drive).has_answered:
+            back_off.meet(drive.address)
 
     # ---- polling ----
 
@@ -171,14 +212,18 @@ class PolledLine:
 
     def tend(self, now_ns: int) -> None:
         """Note the results of what was queued, and queue what comes next."""
+        if self._is_left:  # its lock may be held until the port is closed
+            return
         with self._lock:
             port = self.bus.line.queue
+            if self._is_left or not self._is_started:
+                return
             if port is None:
                 self._regain(now_ns)
                 return
             if port is not self._queue.port:
                 self._queue.move_to(port)
-                port.report_to(self._row_queue, self._number)
+                port.report_to(self._row_queue, self.number)
             self._queue.conclude(port)
             if port.lost:
                 self._lose(port, now_ns)
@@ -260,12 +305,18 @@ class PolledLine:
             return
         self._miss(self._schedule.pass_all(now_ns), Status.LINE_LOST)
         self._reopen_ns = now_ns + REOPEN_NS
-        self._reopening = threading.Thread(target=self._reopen, daemon=True)
+        self._reopening = threading.Thread(target=self._reopen, name="multidrop reopening", daemon=True)
         self._reopening.start()
 
     def _reopen(self) -> None:
         with suppress(LineError):
             self.bus.line.regain()
+
+    def leave(self) -> None:
+        """Tend the line no more: what stops its motors opens a lost port again by itself."""
+        with self._lock:
+            self._is_left = True
+        self.bus.tended(False)
 
     def end(self) -> bool:
         """Begin nothing more, and open no port again; True while an exchange is still under way."""
@@ -278,8 +329,9 @@ class PolledLine:
         self.switching = port.switching
         return port.end()
 
-    def close(self) -> None:
-        """Close the bus; every slot that is over by now has a row."""
+    def close(self, why: str) -> None:
+        """Close the bus; every slot that is over by now has a row. Who uses the port later is told `why`."""
+        self.bus.line.why_closed = why
         with self._lock:
             ended_ns = self._ended_ns or clock.now_ns()
             self._miss_unasked(ended_ns)

@@ -74,6 +74,10 @@ class Exchanges:
             if other[0] == drive.address and known is not peer:
                 self.line.inherit(peer, known)
 
+    def remember(self, before: Exchanges) -> None:
+        """Know all drives that others knew on the same line."""
+        self._known.update(before._known)
+
     def remove(self, drive: Drive) -> None:
         """Exchange nothing more with this drive."""
         del self._peers[drive]

@@ -60,6 +60,17 @@ class Line:
     """
 
     def __init__(self, port: str, echo: Echo = Echo.AUTO, ids: TransactionIds = TransactionIds.MATCH) -> None:
+        self._prepare(port, echo, ids)
+        self._open()
+
+    @classmethod
+    def awaited(cls, port: str, echo: Echo, ids: TransactionIds) -> Line:
+        """Return a line whose port is not there yet: `regain` opens it."""
+        line = cls.__new__(cls)
+        line._prepare(port, echo, ids)
+        return line
+
+    def _prepare(self, port: str, echo: Echo, ids: TransactionIds) -> None:
         self.port = port
         self.is_tcp = isinstance(port, str) and speaks_tcp(port)
         self.ids = ids
@@ -71,9 +82,10 @@ class Line:
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
         self._is_loss_logged = False
+        self._is_over = False
+        self.why_closed = "it is closed"
         self._make_locks()
         register_at_fork(self)
-        self._open()
 
     def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one thread opens or closes at a time
@@ -83,7 +95,7 @@ class Line:
         """Close it in the child at once: a descriptor left open there would keep the port in use."""
         self._make_locks()
         self._is_over = True
-        self._why_closed = "it was opened before this process was forked; open it again here"
+        self.why_closed = "it was opened before this process was forked; open it again here"
         self._core = None
         if self._bridge:
             self._bridge.forget()
@@ -97,7 +109,7 @@ class Line:
     # ---- opening and closing ----
 
     def _open(self) -> None:
-        self._why_closed = "it is closed"
+        self.why_closed = "it is closed"
         self._is_over = False
         try:
             port = self._serial = unopened(self.port)
@@ -194,7 +206,7 @@ class Line:
         """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
         with self._lock:
             if self._is_over:
-                raise LineError(self.port, self._why_closed)
+                raise LineError(self.port, self.why_closed)
             if not self.is_lost:
                 return
             try:
@@ -217,7 +229,10 @@ class Line:
         Raises LineError when it has others already, or does not take these.
         """
         with self._lock:
-            if self._serial is None or self._bridge is None or self._settings == settings:
+            if self._serial is None or self._bridge is None:  # it may be one, when it is there
+                self._settings = self._settings or settings
+                return
+            if self._settings == settings:
                 return
             if self._settings:
                 raise LineError(self.port, "this kind of port cannot change its settings from drive to drive")
@@ -226,6 +241,11 @@ class Line:
             except PORT_FAILURES as failure:
                 raise LineError(self.port, reason_of(failure)) from failure
             self._settings = settings
+
+    @property
+    def only_settings(self) -> tuple[int, str] | None:
+        """Settings that a bridged port has, and keeps while it is open; None for other ports."""
+        return self._settings if self._bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
@@ -289,7 +309,7 @@ class Line:
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self.port, why)
 
     def _closed(self) -> LineError:
-        return (LineError if self._is_over else PortLost)(self.port, self._why_closed)
+        return (LineError if self._is_over else PortLost)(self.port, self.why_closed)
 
     def overruns(self) -> int | None:
         """Return how many characters came too fast for the port, since its driver was loaded.

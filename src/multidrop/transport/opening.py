@@ -14,6 +14,7 @@ from multidrop.drive.network import MODBUS_PORT
 from multidrop.errors import NoSuchPort
 from multidrop.transport import port_identity
 from multidrop.transport.rfc2217 import RFC2217Port
+from multidrop.transport.socket_port import SocketPort
 
 _REASONS = {
     errno.ENOENT: "there is no such port",
@@ -69,8 +70,11 @@ def unopened(port: str) -> serial.Serial:
             found = RFC2217Port()
             found.port = port
             return cast(serial.Serial, found)  # as pyserial types all of its kinds of ports
-        name = _socket_url(url) if url.scheme == "tcp" else port
-        return serial.serial_for_url(name, do_not_open=True)
+        if url.scheme in ("socket", "tcp"):
+            connection = SocketPort()
+            connection.port = _socket_url(url) if url.scheme == "tcp" else port
+            return cast(serial.Serial, connection)
+        return serial.serial_for_url(port, do_not_open=True)
     except ValueError as mistake:
         raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {_URLS}") from mistake
 

@@ -1,0 +1,182 @@
+"""Adoption: how the lines of a poller become those of another plant, while they are polled.
+
+All that can be known to be wrong is found before anything changes. Then what goes leaves, ports are opened,
+and what is new comes. A line that stays is not touched where nothing of it changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from multidrop.bus import Bus
+from multidrop.control.exit_hook import exit_hook
+from multidrop.drive.family import Drive
+from multidrop.drive.network import speaks_tcp
+from multidrop.errors import LineError
+from multidrop.plant.model import Plant, PlantLine
+from multidrop.polling.changes import DriveChanges, check_plant, drive_changes, has_same_port
+from multidrop.polling.line_set import MOST_LINES, LineSet
+from multidrop.polling.polled_line import PolledLine
+from multidrop.transport.opening import unopened
+
+GONE = "its line is polled no more"
+
+
+@dataclass(frozen=True)
+class Staying:
+    """A line whose port stays open, and what it is to be."""
+
+    line: PolledLine
+    wanted: PlantLine
+    drives: DriveChanges
+
+    def part_with(self) -> None:
+        """Let the drives go that are not wanted any more.
+
+        Those whose address nobody takes are stopped first, where the bus has `stop_on_exit`. At an address
+        that is declared as another drive now, the old family's stop may mean something else.
+        """
+        taken = {polled.drive.address for polled in self.drives.joining}
+        leaving = [polled.drive for polled in self.drives.leaving]
+        self.line.bus.stop_leaving([drive for drive in leaving if drive.address not in taken])
+        for drive in leaving:
+            self.line.remove(drive)
+            self.line.forget(drive)
+
+    def take_in(self) -> None:
+        """Poll what is new. Raises LineError where the port cannot have a drive's settings."""
+        self.line.declared, self.line.switching = self.wanted, self.wanted.switching
+        for polled in self.drives.repolled:
+            self.line.set_polls(polled)
+        for polled in self.drives.joining:
+            self.line.add(polled)
+
+
+@dataclass(frozen=True)
+class Coming:
+    """A line that is to be opened, and the one that has its port now, if any."""
+
+    wanted: PlantLine
+    before: PolledLine | None
+
+
+class Adoption:
+    """A plant that a poller's lines are to become. Raises ValueError where that cannot be."""
+
+    def __init__(self, lines: LineSet, plant: Plant, *, stops_on_exit: bool) -> None:
+        self._lines = lines
+        self._plant = plant
+        self._stops_on_exit = stops_on_exit
+        buses = {line.bus for line in lines}
+        check_plant(plant, is_free=lambda drive: _is_free(drive, buses))
+        self._pair()
+        self._check()
+
+    def _pair(self) -> None:
+        """Find the line of each that is wanted: by its name, or else by its port, which has a new name."""
+        named = {line.name: line for line in self._lines}
+        found = {
+            wanted.name: line
+            for wanted in self._plant.lines
+            if (line := named.get(wanted.name)) and _can_become(line, wanted)
+        }
+        taken = set(found.values())
+        ported: dict[str, list[PolledLine]] = {}
+        for line in self._lines:
+            if line not in taken:
+                ported.setdefault(line.declared.port, []).append(line)
+        coming: list[Coming] = []
+        for wanted in self._plant.lines:
+            others = ported.get(wanted.port, [])
+            same = next((line for line in others if _can_become(line, wanted)), None)
+            if wanted.name in found:
+                continue
+            if same is not None:
+                others.remove(same)
+                found[wanted.name] = same
+            else:
+                coming.append(Coming(wanted, others[0] if others and not speaks_tcp(wanted.port) else None))
+        self._staying = [
+            Staying(line, wanted, drive_changes(line.polled, wanted.drives))
+            for wanted in self._plant.lines
+            if (line := found.get(wanted.name))
+        ]
+        self._coming = coming
+        staying = set(found.values())
+        self._going = [line for line in self._lines if line not in staying]
+
+    def _check(self) -> None:
+        if len(self._plant.lines) > MOST_LINES:
+            raise ValueError(
+                f"{len(self._plant.lines)} lines are too many for one poller: {MOST_LINES} at most"
+            )
+        self._lines.names.check_room(polled for line in self._plant.lines for polled in line.drives)
+        for coming in self._coming:
+            unopened(coming.wanted.port)
+        if self._coming:
+            self._lines.check_audit()
+        if self._coming and self._stops_on_exit:
+            exit_hook().take_signals()
+
+    # ---- carrying it out ----
+
+    def carry_out(self, *, start: bool) -> dict[str, LineError]:
+        """Change the lines; by name, those whose port is not there, and why."""
+        self._let_go()
+        for staying in self._staying:
+            staying.part_with()
+        failures = self._open(start)
+        for staying in self._staying:
+            try:
+                staying.take_in()
+            except LineError as failure:
+                failures[staying.wanted.name] = failure
+        self._lines.put_in_order([line.name for line in self._plant.lines])
+        return failures
+
+    def _let_go(self) -> None:
+        wanted = {coming.before: coming.wanted for coming in self._coming if coming.before}
+        for line in self._going:
+            for drive in line.bus.drives:
+                if line in wanted and _is_another(drive, wanted[line]):
+                    line.remove(drive)
+        self._lines.let_go(self._going, GONE)
+
+    def _open(self, start: bool) -> dict[str, LineError]:
+        """Open the lines that are new; those whose port is not there wait for it, as lost ones do."""
+        failures: dict[str, LineError] = {}
+        opened = self._lines.open([coming.wanted for coming in self._coming])
+        for coming, bus in zip(self._coming, opened, strict=True):
+            if isinstance(bus, LineError):
+                failures[coming.wanted.name] = bus
+                bus = self._lines.await_port(coming.wanted)
+            if coming.before:
+                bus.remember(coming.before.bus)
+            if self._stops_on_exit:
+                bus.stop_on_exit()
+            line = self._lines.add(replace(coming.wanted, drives=()), bus)
+            try:
+                for polled in coming.wanted.drives:
+                    line.add(polled)
+            except LineError as failure:
+                failures[coming.wanted.name] = failure
+            if start:
+                line.start()
+        return failures
+
+
+def _is_free(drive: Drive, buses: set[Bus]) -> bool:
+    return drive.bus is None or drive.bus in buses or not drive.bus.is_open
+
+
+def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
+    """Return True where a line can be what is wanted without its port being opened anew."""
+    settings = line.bus.line.only_settings
+    wanted_settings = {(at.baudrate, at.format) for at in (polled.drive.settings for polled in wanted.drives)}
+    return has_same_port(line.declared, wanted) and (settings is None or wanted_settings <= {settings})
+
+
+def _is_another(drive: Drive, wanted: PlantLine) -> bool:
+    """Return True where the drive's address is declared as another family's now."""
+    others = [polled.drive for polled in wanted.drives if polled.drive.address == drive.address]
+    return any(type(other) is not type(drive) for other in others)

@@ -1,0 +1,164 @@
+"""LineSet: the lines of a poller, which come and go while it polls."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+from multidrop.bus import Bus
+from multidrop.control.audit_log import AuditLog
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.core import RowQueue
+from multidrop.drive.family import Drive
+from multidrop.errors import LineError
+from multidrop.plant.model import PlantLine
+from multidrop.polling.jobs import RowNames
+from multidrop.polling.polled_line import PolledLine
+from multidrop.transport import clock
+
+OPENING = 32  # ports at a time: one that takes its time holds up no other
+ENDING_NS = 1_000_000_000  # for which exchanges under way are waited for
+NOBODY = 0  # the number that no line has
+MOST_LINES = (1 << 16) - 1  # numbers that a row queue calls
+
+
+class LineSet:
+    """Lines, each with a number by which the core calls for it; one thread at a time changes them."""
+
+    def __init__(
+        self, row_queue: RowQueue, ledger: Ledger | Path | str | None, audit: Path | str | None
+    ) -> None:
+        self.names = RowNames()
+        self._row_queue = row_queue
+        self._ledger = ledger
+        self._audit = audit
+        self._lines: tuple[PolledLine, ...] = ()  # another one when they change: others go through them
+        self._numbered: dict[int, PolledLine] = {}
+        self._free: list[int] = []  # numbers that lines had
+
+    def __iter__(self) -> Iterator[PolledLine]:
+        return iter(self._lines)
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def called(self, numbers: Iterable[int]) -> list[PolledLine]:
+        """Return the lines of these numbers; one that has gone may be called yet."""
+        return [line for number in numbers if (line := self._numbered.get(number))]
+
+    def find(self, name: str) -> PolledLine:
+        """Return the line of this name. Raises ValueError where there is none."""
+        for line in self._lines:
+            if line.name == name:
+                return line
+        names = ", ".join(line.name for line in self._lines)
+        raise ValueError(f"there is no line {name!r}; there are {names or 'none'}")
+
+    def find_drive(self, drive: Drive | str) -> tuple[PolledLine, Drive]:
+        """Return a drive, by itself or by its name, and its line; ValueError where it is not polled."""
+        drives = {known.name: (line, known) for line in self._lines for known in line.bus.drives}
+        name = drive if isinstance(drive, str) else drive.name
+        line, known = drives.get(name, (None, None))
+        if line is None or known is None or drive not in (name, known):
+            near = difflib.get_close_matches(name, drives, n=2)
+            hint = (
+                f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(drives) or 'none'}"
+            )
+            raise ValueError(f"{name} is not polled here; {hint}")
+        return line, known
+
+    # ---- coming ----
+
+    def fill(self, declared: Sequence[PlantLine]) -> None:
+        """Add all these lines; none is open after LineError for a port, or ValueError."""
+        found = self.open(declared)
+        buses = [bus for bus in found if isinstance(bus, Bus)]
+        with ExitStack() as stack:
+            for bus in buses:
+                stack.callback(bus.close)  # unless all goes well
+            for failure in found:
+                if isinstance(failure, LineError):
+                    raise failure
+            for line, bus in zip(declared, buses, strict=True):
+                self.add(line, bus)
+            stack.pop_all()
+
+    def open(self, declared: Sequence[PlantLine]) -> list[Bus | LineError]:
+        """Open the ports of these lines side by side; return for each the bus, or why there is none."""
+
+        def opened(line: PlantLine) -> Bus | LineError:
+            try:
+                return self._bus(Bus, line)
+            except LineError as failure:
+                return failure
+
+        if len(declared) < 2:
+            return [opened(line) for line in declared]
+        found: list[Bus | LineError] = []
+        with ExitStack() as stack, ThreadPoolExecutor(OPENING, "multidrop opening") as pool:
+            for bus in pool.map(opened, declared):
+                found.append(bus)
+                if isinstance(bus, Bus):
+                    stack.callback(bus.close)  # unless all goes well
+            stack.pop_all()
+        return found
+
+    def await_port(self, line: PlantLine) -> Bus:
+        """Return a bus for a port that is not there yet."""
+        return self._bus(Bus.awaiting, line)
+
+    def _bus(self, make: Callable[..., Bus], line: PlantLine) -> Bus:
+        return make(line.port, echo=line.echo, transaction=line.ids, ledger=self._ledger, audit=self._audit)
+
+    def add(self, declared: PlantLine, bus: Bus) -> PolledLine:
+        """Make a line that is not polled yet. Raises ValueError where a drive cannot be on it."""
+        number = self._free[-1] if self._free else len(self._lines) + 1
+        line = PolledLine(declared, number, bus, self._row_queue, self.names)
+        if self._free:
+            self._free.pop()
+        self._numbered[number] = line
+        self._lines = (*self._lines, line)
+        return line
+
+    def put_in_order(self, names: Sequence[str]) -> None:
+        """Put the lines in the order of their names here."""
+        places = {name: place for place, name in enumerate(names)}
+        self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
+
+    def check_audit(self) -> None:
+        """Raise OSError where the audit log of a line that comes cannot be opened."""
+        if self._audit:
+            AuditLog(self._audit).close()
+
+    # ---- going ----
+
+    def let_go(self, lines: Iterable[PolledLine], why: str) -> None:
+        """End these lines, and have them no more."""
+        going = set(lines)
+        self.end(going, why)
+        self._lines = tuple(line for line in self._lines if line not in going)
+        for line in going:
+            del self._numbered[line.number]
+            self._free.append(line.number)
+
+    def end(self, lines: Iterable[PolledLine], why: str) -> None:
+        """End what is under way on these lines and close their ports.
+
+        Drives whose bus had `stop_on_exit` are stopped first, and stops under way are waited for; exchanges
+        under way for ENDING_NS. What waits for the port then fails with LineError, and says `why`.
+        """
+        going = list(lines)
+        for line in going:
+            line.bus.leave()  # all of them at once
+        for line in going:
+            line.leave()
+        for line in going:
+            line.bus.part()  # before the port is closed, on which it stops motors
+        given_up_ns = clock.now_ns() + ENDING_NS
+        while sum(line.end() for line in going) and clock.now_ns() < given_up_ns:
+            clock.sleep(0.001)
+        for line in going:
+            line.close(why)

@@ -1,0 +1,513 @@
+"""Plants that are adopted while others are polled, on a clock that only the test lets pass."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from lines import line, plant, polled, rows_of
+from toy import Toy
+from worlds import S, World, WorldWire
+
+from multidrop.core import Echo
+from multidrop.drive import Drive
+from multidrop.drives import InnovertIBD, InvtCHE
+from multidrop.errors import LineError, NoSuchPort
+from multidrop.plant.loader import PlantError
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import EncodedDrive, Faults, proof
+
+CURRENT, FREQUENCY, FAULT, STATUS = (
+    Toy.registers[name] for name in ("output_current", "output_frequency", "fault", "status")
+)
+ALL = (CURRENT, FREQUENCY, FAULT, STATUS)
+
+
+def toy(name: str, address: int, every: float | None = 0.1) -> PolledDrive:
+    return polled(Toy(address, name=name), ALL, every)
+
+
+def wire(*drives: Drive) -> WorldWire:
+    return WorldWire([EncodedDrive(drive) for drive in drives], Faults())
+
+
+def toys() -> WorldWire:
+    """A wire with toys at the addresses 1 to 4."""
+    return wire(*(Toy(address) for address in range(1, 5)))
+
+
+def hall(*drives: PolledDrive, name: str = "hall") -> PlantLine:
+    return line(f"port of {name}", *drives, name=name)
+
+
+def yard(*drives: PolledDrive) -> PlantLine:
+    return hall(*drives, name="yard")
+
+
+def pumps(every: float | None = 0.1) -> tuple[PolledDrive, ...]:
+    return tuple(toy(f"pump-{address}", address, every) for address in (1, 2))
+
+
+def fans(every: float | None = 0.1) -> tuple[PolledDrive, ...]:
+    return tuple(toy(f"fan-{address}", address, every) for address in (1, 2))
+
+
+def world(*lines: PlantLine) -> World:
+    """A plant on wires of toys, and a wire to which no line goes yet."""
+    names = {*(each.name for each in lines), "hall", "yard", "roof"}
+    return World.of_lines({f"port of {name}": toys() for name in names}, plant(*lines))
+
+
+def values(rows: Sequence[Row]) -> Counter[tuple[str, str]]:
+    return Counter((row.drive, row.register) for row in rows if row.value is not None)
+
+
+def statuses(rows: Sequence[Row], drive: str) -> set[str]:
+    return {row.status for row in rows if row.drive == drive}
+
+
+def assert_rate(rows: Sequence[Row], drive: str, seconds: float, every: float) -> None:
+    counts = {values(rows)[drive, register.name] for register in ALL}
+    due = round(seconds / every)
+    assert counts <= {due - 1, due, due + 1}, (drive, counts)
+
+
+# ---- lines that stay as they are ----
+
+OTHERS = (
+    (yard(toy("fan-1", 1), toy("fan-3", 3)),),
+    (),
+    (yard(*fans(None)), hall(toy("vent-1", 1, None), name="roof")),
+    (yard(toy("fan-1", 4, 0.3)), hall(toy("vent-1", 2), name="roof")),
+    (replace(yard(*fans()), echo=Echo.ON),),
+)
+
+
+@pytest.mark.parametrize("every", [0.1, 0.08, None], ids=str)
+def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
+    """Its exchanges leave at the very nanoseconds at which they leave without any adoption."""
+
+    def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
+        with world(hall(*pumps(every)), yard(*fans(every))) as made:
+            rows = made.run(5)
+            for others in OTHERS * 2:
+                if adopts:  # of a plant that was loaded anew: its drives are other objects
+                    adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(*pumps(every)), *o)))
+                rows += made.run(1.7)
+                if adopts:
+                    adopting.join(60)
+                    assert not adopting.is_alive()
+            rows += made.run(2)
+        return [(row.monotonic_ns, row.register, row.status) for row in rows if row.drive.startswith("pump")]
+
+    alone, beside = exchanges(adopts=False), exchanges(adopts=True)
+    assert len(alone) > 1000
+    assert {status for _, _, status in alone} == {"ok"}
+    assert beside == alone
+
+
+def test_what_is_the_same_stays_the_same() -> None:
+    with world(hall(*pumps()), yard(*fans())) as made:
+        made.run(2)
+        before = made.poller.plant
+        assert made.poller.adopt(plant(hall(*pumps()), yard(*fans()))) == {}
+        made.run(2)
+        assert made.poller.plant == before
+        assert made.opened == ["port of hall", "port of yard"]
+        pump, _ = made.poller.bus("hall").drives
+        assert pump is before.lines[0].drives[0].drive
+
+
+# ---- changes on an open port ----
+
+
+def test_rates_and_registers_change_on_the_open_port() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(2)
+        first, second = made.poller.bus("hall").drives
+        slow = replace(hall(), drives=(toy("pump-1", 1, 0.5), toy("pump-2", 2)))
+        assert made.poller.adopt(plant(slow)) == {}
+        made.run(1)
+        rows = made.run(10)
+        assert_rate(rows, "pump-1", 10, 0.5)
+        assert_rate(rows, "pump-2", 10, 0.1)
+        few = hall(polled(Toy(1, name="pump-1"), [CURRENT], 0.1), polled(Toy(2, name="pump-2"), [], None))
+        made.poller.adopt(plant(few))
+        made.run(1)
+        assert {key: count in (99, 100, 101) for key, count in values(made.run(10)).items()} == {
+            ("pump-1", "output_current"): True
+        }
+        made.poller.adopt(plant(hall(*pumps())))
+        made.run(1)
+        rows = made.run(10)
+        assert_rate(rows, "pump-1", 10, 0.1)
+        assert_rate(rows, "pump-2", 10, 0.1)
+        assert made.poller.bus("hall").drives == [first, second]
+        assert made.opened == ["port of hall"]
+
+
+def test_drives_come_go_and_move_to_another_address() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(2)
+        stays = made.poller.bus("hall").drives[0]
+        made.poller.adopt(plant(hall(toy("pump-1", 1), toy("pump-3", 3))))
+        made.run(1)
+        rows = made.run(10)
+        assert_rate(rows, "pump-1", 10, 0.1)
+        assert_rate(rows, "pump-3", 10, 0.1)
+        assert statuses(rows, "pump-2") == set()
+        made.poller.adopt(plant(hall(toy("pump-1", 1), toy("pump-3", 4), toy("pump-2", 3))))
+        made.run(1)
+        rows = made.run(10)
+        for name, address in (("pump-1", 1), ("pump-2", 3), ("pump-3", 4)):
+            assert_rate(rows, name, 10, 0.1)
+            found = {row.value for row in rows if row.drive == name and row.register == "output_current"}
+            assert found == {proof(Toy(address), CURRENT)}
+        assert made.poller.bus("hall").drives[0] is stays
+        assert made.opened == ["port of hall"]
+
+
+def test_a_drive_becomes_one_of_another_family() -> None:
+    drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
+    registers = [drive.readings()[:4] for drive in drives]
+    wires = {"port of hall": wire(drives[0], Toy(1))}
+    with World.of_lines(wires, plant(hall(polled(drives[0], registers[0], 0.1), toy("fan", 1)))) as made:
+        rows = made.run(3)
+        assert statuses(rows, "pump") == {"ok"}
+        made.wires["port of hall"] = wire(drives[1], Toy(1))
+        made.wires["port of hall"].open()
+        made.poller.adopt(plant(hall(polled(drives[1], registers[1], 0.1), toy("fan", 1))))
+        made.run(2)
+        rows = made.run(5)
+    assert {
+        row.value == proof(drives[1], drives[1].register(row.register)) for row in rows if row.drive == "pump"
+    } == {True}
+    assert_rate(rows, "fan", 5, 0.1)
+
+
+def test_a_line_with_a_new_name_keeps_its_port() -> None:
+    with world(hall(*pumps()), yard(*fans())) as made:
+        made.run(2)
+        names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
+        assert made.poller.adopt(plant(*names)) == {}
+        rows = made.run(5)
+        assert_rate(rows, "pump-1", 5, 0.1)
+        assert list(made.poller.statistics()) == ["yard", "hall"]
+        assert [drive.name for drive in made.poller.bus("hall").drives] == ["fan-1", "fan-2"]
+        assert made.opened == ["port of hall", "port of yard"]
+
+
+# ---- lines that come and go ----
+
+
+def test_lines_come_and_go() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(2)
+        assert made.poller.adopt(plant(yard(*fans()))) == {}
+        rows = made.run(10)
+        assert statuses(rows, "pump-1") <= {"ok", "poll ended"}
+        assert_rate(rows, "fan-1", 10, 0.1)
+        assert list(made.poller.buses) == ["yard"]
+        assert made.ports["port of hall"] is None
+        assert made.poller.adopt(plant(hall(*pumps()), yard(*fans()))) == {}
+        rows = made.run(10)
+        assert_rate(rows, "pump-1", 10, 0.1)
+        assert_rate(rows, "fan-1", 10, 0.1)
+        assert made.opened == ["port of hall", "port of yard", "port of hall"]
+
+
+def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
+    with world(hall(*pumps()), yard(*fans())) as made:
+        rows = made.run(2.05)
+        made.poller.remove_line("yard")
+        rows += made.run(3)
+    times = [row.monotonic_ns for row in rows if row.drive == "fan-1" and row.register == "output_current"]
+    gaps = [later - at for at, later in pairwise(times)]
+    assert max(gaps) < 0.12 * S
+    assert (made.now - times[-1]) / S > 2.9
+
+
+def test_one_line_is_added_and_removed() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        made.poller.add_line(yard(*fans()))
+        made.run(1)
+        assert_rate(made.run(5), "fan-1", 5, 0.1)
+        made.poller.remove_line("yard")
+        rows_of(made.poller)
+        assert statuses(made.run(2), "fan-1") == set()
+        assert list(made.poller.statistics()) == ["hall"]
+        with pytest.raises(ValueError, match="there is no line 'yard'; there are hall"):
+            made.poller.remove_line("yard")
+        made.poller.add_line(yard(toy("fan-1", 3)))
+        made.run(1)
+        rows = made.run(5)
+        assert {row.value for row in rows if (row.drive, row.register) == ("fan-1", "output_current")} == {
+            proof(Toy(3), CURRENT)
+        }
+
+
+def test_all_lines_may_go_and_others_come() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        assert made.poller.adopt(plant()) == {}
+        rows_of(made.poller)
+        assert made.run(2) == []
+        made.poller.adopt(plant(yard(*fans(None))))
+        assert values(made.run(2))["fan-2", "status"] > 20
+
+
+def test_a_plant_is_adopted_before_the_polling_too() -> None:
+    made = world(hall(*pumps()))
+    made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
+    with made:
+        made.run(1)
+        rows = made.run(10)
+    assert_rate(rows, "pump-1", 10, 0.2)
+    assert_rate(rows, "fan-1", 10, 0.1)
+    assert statuses(rows, "pump-2") == set()
+
+
+def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
+    """A reply that is late may come on the port as it is opened next."""
+    wires = {"port of hall": wire(Toy(1))}
+    with World.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
+        made.run(2)
+        ours = made.poller.bus("hall")
+        peers = [ours.peer(drive) for drive in ours.drives]
+        assert peers[1].late_until_ns > 0
+        made.poller.adopt(plant(replace(hall(toy("pump-1", 1), toy("gone", 5)), echo=Echo.OFF)))
+        now = made.poller.bus("hall")
+        assert now is not ours
+        assert [now.peer(drive) for drive in now.drives] == peers
+        made.run(1)
+        assert_rate(made.run(5), "pump-1", 5, 0.1)
+
+
+def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> None:
+    """What is queued of a drive that leaves is asked before the next one comes, and owed to that one."""
+    wires = {"port of hall": wire(Toy(1))}
+    with World.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
+        made.run(0.2)
+        ours = made.poller.bus("hall")
+        before = ours.peer(ours.drives[1])
+        exchanges = before.exchanges
+        adopting = made.beside(
+            lambda: made.poller.adopt(plant(hall(toy("pump-1", 1), polled(InvtCHE(5, name="new"), [], None))))
+        )
+        made.run(2)
+        adopting.join(60)
+        new = ours.peer(ours.drives[1])
+        assert new is not before
+        assert before.exchanges > exchanges
+        assert new.late_until_ns == before.late_until_ns > 0
+
+
+# ---- ports that are not there ----
+
+
+def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        del made.wires["port of yard"]
+        failures = made.poller.adopt(
+            plant(hall(toy("pump-1", 1)), yard(*fans()), hall(toy("v", 1), name="roof"))
+        )
+        assert list(failures) == ["yard"]
+        assert isinstance(failures["yard"], LineError)
+        assert str(failures["yard"]) == "port of yard: it is not there"
+        rows = made.run(5)
+        assert statuses(rows, "fan-1") == {"port lost"}
+        assert_rate(rows, "pump-1", 5, 0.1)
+        assert_rate(rows, "v", 5, 0.1)
+        made.wires["port of yard"] = toys()
+        made.wires["port of yard"].open()
+        made.run(2)
+        assert_rate(made.run(5), "fan-1", 5, 0.1)
+
+
+def test_one_line_whose_port_is_not_there_is_not_added() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        del made.wires["port of yard"]
+        with pytest.raises(LineError, match="port of yard: it is not there"):
+            made.poller.add_line(yard(*fans()))
+        assert list(made.poller.buses) == ["hall"]
+        rows = made.run(5)
+        assert statuses(rows, "fan-1") == set()
+        assert_rate(rows, "pump-1", 5, 0.1)
+
+
+# ---- what cannot be adopted ----
+
+
+def broken() -> dict[str, tuple[Plant, str]]:
+    pump, other = pumps()
+    alien = polled(InvtCHE(3, name="alien"), [CURRENT])
+    return {
+        "line twice": (
+            plant(hall(pump), replace(yard(), name="hall")),
+            'line "hall": another line has this name too; every line needs its own',
+        ),
+        "port twice": (
+            plant(hall(pump), replace(yard(other), port="port of hall")),
+            'line "yard": port port of hall is that of line "hall" too; make them one line',
+        ),
+        "drive twice": (
+            plant(hall(pump), yard(toy("pump-1", 2))),
+            'line "yard", drive "pump-1": line "hall", drive "pump-1" has this name too',
+        ),
+        "address twice": (
+            plant(hall(pump, toy("pump-3", 1))),
+            'line "hall", drive "pump-3": address 1 is that of line "hall", drive "pump-1" already',
+        ),
+        "another's register": (
+            plant(hall(alien)),
+            'line "hall", drive "alien": this output_current is no register of alien, which is a INVT CHE',
+        ),
+        "no rate": (
+            plant(hall(toy("pump-1", 1, -1.0))),
+            'line "hall", drive "pump-1": every = -1.0 is not a number of seconds',
+        ),
+    }
+
+
+@pytest.mark.parametrize("mistake", broken())
+def test_a_broken_plant_changes_nothing(mistake: str) -> None:
+    wrong, sentence = broken()[mistake]
+    with world(hall(*pumps()), yard(*fans())) as made:
+        made.run(2)
+        before = made.poller.plant
+        with pytest.raises(PlantError) as found:
+            made.poller.adopt(wrong)
+        assert any(told.startswith(sentence) for told in found.value.mistakes), found.value.mistakes
+        assert made.poller.plant == before
+        rows = made.run(10)
+        for name in ("pump-1", "pump-2", "fan-1", "fan-2"):
+            assert_rate(rows, name, 10, 0.1)
+            assert statuses(rows, name) == {"ok"}
+        assert made.opened == ["port of hall", "port of yard"]
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    pump, _ = pumps()
+    with world(hall(*pumps())) as made, pytest.raises(PlantError) as found:
+        made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3, 0.0))))
+    assert len(found.value.mistakes) == 5
+
+
+def test_a_name_that_no_port_can_have_changes_nothing() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        with pytest.raises(NoSuchPort, match="it needs a host and a port number"):
+            made.poller.adopt(plant(line("socket://nowhere", toy("v", 1))))
+        assert list(made.poller.buses) == ["hall"]
+
+
+def test_an_audit_log_that_cannot_be_opened_changes_nothing() -> None:
+    with world(hall(*pumps())) as made:
+        made.poller._lines._audit = "/proc/none/audit"
+        with pytest.raises(OSError, match="No such file"):
+            made.poller.adopt(plant(yard(*fans())))
+        made.run(1)
+        assert_rate(made.run(5), "pump-1", 5, 0.1)
+
+
+def test_another_poller_s_drives_are_left_to_it() -> None:
+    with world(hall(*pumps())) as made:
+        sentence = "it is on another bus: detach it there first, or make another"
+        with world(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
+            made.poller.adopt(other.poller.plant)
+        assert list(made.poller.buses) == ["hall"]
+
+
+def test_more_names_than_a_batch_can_number() -> None:
+    with world(hall(*pumps())) as made:
+        for number in range(65534):
+            made.poller._lines.names.drives.number(f"gone-{number}")
+        assert made.poller.adopt(plant(hall(*pumps()))) == {}
+        with pytest.raises(ValueError, match="65537 names of drives since polling began are too many"):
+            made.poller.adopt(plant(hall(toy("pump-1", 1), toy("one-more", 3))))
+        made.run(1)
+        assert_rate(made.run(5), "pump-2", 5, 0.1)
+
+
+def test_nothing_is_adopted_when_polling_has_ended() -> None:
+    poller = Poller(plant())
+    poller.close()
+    for change in (
+        lambda: poller.adopt(plant()),
+        lambda: poller.add_line(hall()),
+        lambda: poller.remove_line("hall"),
+    ):
+        with pytest.raises(ValueError, match="polling has ended"):
+            change()
+
+
+def test_what_is_no_plant() -> None:
+    poller = Poller(plant())
+    with pytest.raises(
+        TypeError, match=r"adopt takes a Plant, such as load_plant\('plant.toml'\) gives, not 'p'"
+    ):
+        poller.adopt("p")  # type: ignore[arg-type]
+    poller.close()
+
+
+# ---- batches ----
+
+
+def test_a_name_s_code_stays_the_same() -> None:
+    with world(hall(*pumps())) as made:
+        made.run(1)
+        meant: dict[int, str] = {}
+        for others in (*OTHERS, (yard(toy("pump-2", 3)),)):
+            made.poller.adopt(plant(hall(pumps()[0]), *others))
+            with made._turn:
+                made._limit += S
+                made._turn.notify_all()
+                assert made._turn.wait_for(lambda: made._failure or made._rests, 60)
+            while batch := made.poller.take():
+                columns = batch.columns()
+                for code in set(columns.drive):
+                    assert meant.setdefault(code, columns.drives[code]) == columns.drives[code]
+        assert {"pump-1", "fan-1", "vent-1", "pump-2"} <= set(meant.values())
+
+
+# ---- for ever ----
+
+
+def test_memory_is_bounded_over_many_adoptions() -> None:
+    with world(hall(*pumps()), yard(*fans())) as made:
+
+        def kept() -> tuple[int, ...]:
+            lines = made.poller._lines
+            hall = lines.find("hall")
+            return (
+                len(hall._planned),
+                len(hall._maker._made),
+                len(hall._maker._rows),
+                len(lines._numbered),
+                len(lines._free),
+                max(lines._numbered),
+                len(hall.bus._exchanges._known),
+                len(hall._gone),
+            )
+
+        def adopt_some(number: int) -> None:
+            swapped = toy(f"pump-{2 + number % 2}", 2 + number % 2, None if number % 3 else 0.1)
+            others = OTHERS[number % len(OTHERS)]
+            made.poller.adopt(plant(hall(toy("pump-1", 1, 0.1 + number / 1000), swapped), *others))
+            made.run(0.05)
+
+        for number in range(30):
+            adopt_some(number)
+        before = kept()
+        for number in range(30, 150):
+            adopt_some(number)
+        after = kept()
+        assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
