@@ -220,7 +220,7 @@ class WorldLine:
     """A line as the bus sees it (line.Line)."""
 
     only_settings = None  # a drive may have any
-    why_closed = ""
+    why_closing = ""
 
     def __init__(self, world: World, port: str, ids: TransactionIds) -> None:
         self.port = port

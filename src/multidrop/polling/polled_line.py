@@ -205,6 +205,7 @@ class PolledLine:
                 jobs = self._planned[self._present[drive]].jobs
                 self._add_jobs(drive, jobs, self.started_ns)
             self._is_started = True
+        self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
         """Return True while nothing is to be done for the line unless the core calls."""
@@ -331,7 +332,7 @@ class PolledLine:
 
     def close(self, why: str) -> None:
         """Close the bus; every slot that is over by now has a row. Who uses the port later is told `why`."""
-        self.bus.line.why_closed = why
+        self.bus.line.why_closing = why
         with self._lock:
             ended_ns = self._ended_ns or clock.now_ns()
             self._miss_unasked(ended_ns)

@@ -83,7 +83,8 @@ class Line:
         self._tap: Tap | None = None
         self._is_loss_logged = False
         self._is_over = False
-        self.why_closed = "it is closed"
+        self._why_closed = "it is closed"
+        self.why_closing: str | None = None  # why calls on it fail now, though `close` is yet to come
         self._make_locks()
         register_at_fork(self)
 
@@ -95,7 +96,7 @@ class Line:
         """Close it in the child at once: a descriptor left open there would keep the port in use."""
         self._make_locks()
         self._is_over = True
-        self.why_closed = "it was opened before this process was forked; open it again here"
+        self._why_closed = "it was opened before this process was forked; open it again here"
         self._core = None
         if self._bridge:
             self._bridge.forget()
@@ -109,7 +110,7 @@ class Line:
     # ---- opening and closing ----
 
     def _open(self) -> None:
-        self.why_closed = "it is closed"
+        self._why_closed = "it is closed"
         self._is_over = False
         try:
             port = self._serial = unopened(self.port)
@@ -206,7 +207,7 @@ class Line:
         """Open it again if it is lost; PortLost when it is not there, and LineError once it was closed."""
         with self._lock:
             if self._is_over:
-                raise LineError(self.port, self.why_closed)
+                raise self._closed()
             if not self.is_lost:
                 return
             try:
@@ -294,7 +295,7 @@ class Line:
             return LineError(
                 self.port, f"the port does not take the {refused_names(error)} that the drive needs"
             )
-        if self._core is None:
+        if self._core is None or self.why_closing:
             return self._closed()
         why = os.strerror(error) if error else "hung up"
         if error == errno.EPROTO:
@@ -309,7 +310,8 @@ class Line:
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self.port, why)
 
     def _closed(self) -> LineError:
-        return (LineError if self._is_over else PortLost)(self.port, self.why_closed)
+        is_over = self._is_over or self.why_closing
+        return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def overruns(self) -> int | None:
         """Return how many characters came too fast for the port, since its driver was loaded.

@@ -1,0 +1,367 @@
+"""Plants that are adopted while others are polled, on simulated lines: motors, calls, what is left."""
+
+from __future__ import annotations
+
+import gc
+import socket
+import threading
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+from leftovers import descriptors, threads
+from lines import PATIENCE, line, plant, polled, until
+from serial.urlhandler import protocol_socket
+from toy import Toy
+
+from multidrop.bus import Bus
+from multidrop.control.outcome import Seen, Stopped
+from multidrop.errors import LineError, NotAttached, Overtaken
+from multidrop.plant.model import PlantLine, PolledDrive
+from multidrop.poller import Poller
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
+
+
+class Quick(Toy):
+    """Answers soon, if at all."""
+
+    response_timeout = 0.05
+
+
+class Hall:
+    """Two lines with two simulated drives each."""
+
+    def __init__(self, port: str = "pty") -> None:
+        self.pumps, self.fans = (
+            {address: simulated(Quick(address)) for address in (1, 2)} for _ in ("hall", "yard")
+        )
+        self.simulator = Simulator(
+            [Wire([*drives.values()], unpaced=True, port=port) for drives in (self.pumps, self.fans)]
+        )
+
+    def __enter__(self) -> Hall:
+        self.simulator.__enter__()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.simulator.__exit__(None, None, None)
+
+    def hall(self, *addresses: int, every: float | None = 0.02) -> PlantLine:
+        return self._line(0, "hall", "pump", addresses, every)
+
+    def yard(self, *addresses: int, every: float | None = 0.02) -> PlantLine:
+        return self._line(1, "yard", "fan", addresses, every)
+
+    def _line(
+        self, number: int, name: str, drive: str, addresses: tuple[int, ...], every: float | None
+    ) -> PlantLine:
+        drives = [quick(f"{drive}-{address}", address, every) for address in addresses or (1, 2)]
+        return line(self.simulator.wires[number].path, *drives, name=name)
+
+
+def quick(name: str, address: int, every: float | None = 0.02) -> PolledDrive:
+    return polled(Quick(address, name=name), [CURRENT, STATUS], every)
+
+
+@pytest.fixture
+def both() -> Iterator[Hall]:
+    with Hall() as made:
+        yield made
+
+
+def samples(poller: Poller, drive: str) -> int:
+    return sum(
+        figures.samples
+        for each in poller.statistics().values()
+        for name, figures in each.drives.items()
+        if name == drive
+    )
+
+
+def runs(drive: SimulatedDrive) -> bool:
+    return drive["control"] == 1
+
+
+# ---- motors ----
+
+
+def test_motors_go_on_when_their_line_goes(both: Hall) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        poller.bus("yard").drives[0].start()
+        poller.adopt(plant(both.hall()))
+        assert list(poller.buses) == ["hall"]
+    assert runs(both.fans[1])
+
+
+def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: Hall) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        poller.stop_on_exit()
+        for bus in poller.buses.values():
+            for drive in bus.drives:
+                drive.start()
+        poller.adopt(plant(both.hall(1)))
+        assert runs(both.pumps[1])
+        assert not runs(both.pumps[2])
+        assert not runs(both.fans[1])
+        assert not runs(both.fans[2])
+        poller.adopt(plant(both.hall(1), both.yard()))
+        poller.bus("yard").drives[0].start()  # on a line that came since
+    assert not runs(both.pumps[1])
+    assert not runs(both.fans[1])
+
+
+class Other(Quick):
+    """Another family, whose manual has a start where the first one has a stop."""
+
+    model = "other"
+
+
+def test_a_drive_that_is_another_family_s_now_gets_no_stop_of_the_old_one(both: Hall) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        poller.stop_on_exit()
+        for name in ("hall", "yard"):
+            poller.bus(name).drives[0].start()
+        writes: list[int] = []
+        for sim in (both.pumps[1], both.fans[1]):
+            _note_writes(sim, writes)
+        other = polled(Other(1, name="pump-1"), [Other.registers["status"]], 0.02)
+        yard = both.yard()
+        reopened = PlantLine(
+            "yard", yard.port, None, None, (polled(Other(1, name="fan-1"), [], None),), echo="off"
+        )
+        poller.adopt(plant(line(both.hall().port, other, quick("pump-2", 2), name="hall"), reopened))
+        assert writes == []
+        assert runs(both.pumps[1])
+        assert runs(both.fans[1])
+    assert not runs(both.pumps[1])  # the new one's stop, at exit
+    assert not runs(both.fans[1])
+
+
+def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
+    write = sim.write
+
+    def noted(function: int, start: int, values: list[int]) -> None:
+        writes.append(start)
+        write(function, start, values)
+
+    vars(sim)["write"] = noted
+
+
+# ---- calls under way ----
+
+
+def test_a_stop_goes_on_while_its_line_is_to_go(both: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        bus = poller.bus("yard")
+        bus.drives[0].start()
+        begun, go_on = threading.Event(), threading.Event()
+        step = bus._stopper._do
+
+        def slow(*arguments: object) -> object:
+            begun.set()
+            assert go_on.wait(PATIENCE)
+            return step(*arguments)
+
+        monkeypatch.setattr(bus._stopper, "_do", slow)
+        found: dict[str, Stopped] = {}
+        stopping = threading.Thread(target=lambda: found.update(bus.stop_all()))
+        stopping.start()
+        assert begun.wait(PATIENCE)
+        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall())])
+        adopting.start()
+        before = samples(poller, "pump-1")
+        until(lambda: samples(poller, "pump-1") > before + 10)  # the other line is polled meanwhile
+        assert adopting.is_alive()
+        assert "yard" in poller.buses
+        go_on.set()
+        stopping.join(PATIENCE)
+        adopting.join(PATIENCE)
+        assert {name: stopped.seen for name, stopped in found.items()} == {
+            "fan-1": Seen.STOPPED,
+            "fan-2": Seen.STOPPED,
+        }
+        assert not runs(both.fans[1])
+        assert list(poller.buses) == ["hall"]
+
+
+def test_calls_on_what_has_gone_say_so(both: Hall) -> None:
+    with Poller(plant(both.hall(), both.yard())) as poller:
+        bus, (pump_1, pump_2) = poller.bus("hall"), poller.bus("hall").drives
+        gone_bus, (fan, _) = poller.bus("yard"), poller.bus("yard").drives
+        poller.adopt(plant(both.hall(1)))
+        with pytest.raises(LineError, match="its line is polled no more"):
+            gone_bus.read(fan, CURRENT)
+        with pytest.raises(Overtaken):
+            fan.start()
+        with pytest.raises(NotAttached, match="pump-2 is not attached to this bus"):
+            bus.read(pump_2, CURRENT)
+        assert bus.read(pump_1, CURRENT) >= 0
+    assert not runs(both.fans[1])
+
+
+def test_a_read_that_waits_for_a_line_that_goes_fails(both: Hall) -> None:
+    both.fans[1].deaf_until = float("inf")
+    slow = polled(SlowToy(1, name="fan-1"), [], None)
+    with Poller(plant(both.hall(), line(both.yard().port, slow, name="yard"))) as poller:
+        found: list[BaseException] = []
+
+        def read() -> None:
+            try:
+                poller.bus("yard").read(slow.drive, CURRENT)
+            except LineError as failure:
+                found.append(failure)
+
+        reading = threading.Thread(target=read)
+        reading.start()
+        until(lambda: poller.statistics()["yard"].counters.sent or _is_asking(poller, slow))
+        poller.remove_line("yard")
+        reading.join(PATIENCE)
+    assert ["its line is polled no more" in str(failure) for failure in found] == [True]
+
+
+class SlowToy(Toy):
+    """Answers within a minute, or never."""
+
+    response_timeout = 60.0
+    response_delay = 15.0
+
+
+def _is_asking(poller: Poller, of: PolledDrive) -> bool:
+    bus = poller.bus("yard")
+    return bool(bus.line.queue and bus.line.queue.is_asking(bus.peer(of.drive)))
+
+
+def test_closing_waits_for_an_adoption(both: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, *arguments: object, **details: object) -> None:
+        begun.set()
+        assert go_on.wait(PATIENCE)
+        open_bus(bus, *arguments, **details)  # type: ignore[arg-type]
+
+    poller = Poller(plant(both.hall()))
+    poller.__enter__()
+    monkeypatch.setattr(Bus, "__init__", slow)
+    adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(), both.yard())])
+    adopting.start()
+    assert begun.wait(PATIENCE)
+    closing_ = threading.Thread(target=poller.close)
+    closing_.start()
+    until(lambda: poller._closing)
+    go_on.set()
+    adopting.join(PATIENCE)
+    closing_.join(PATIENCE)
+    assert not any(thread.is_alive() for thread in (adopting, closing_))
+    assert not any(bus.is_open for bus in poller.buses.values())
+
+
+# ---- the network ----
+
+
+def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None is made before all are asked for; and none sleeps when it is closed."""
+    with Hall("socket://127.0.0.1:0") as both:
+        lines = both.hall(), both.yard()
+        all_asked = threading.Barrier(2)
+        connect = socket.create_connection
+
+        def connect_together(*arguments: object, **details: object) -> socket.socket:
+            all_asked.wait(PATIENCE)
+            return connect(*arguments, **details)  # type: ignore[arg-type]
+
+        def sleep(seconds: float) -> None:
+            raise AssertionError(f"slept for {seconds} s")
+
+        monkeypatch.setattr(protocol_socket.time, "sleep", sleep)
+        monkeypatch.setattr(socket, "create_connection", connect_together)
+        with Poller(plant(*lines)) as poller:
+            until_sampled(poller, "fan-1")
+            poller.adopt(plant())
+            poller.adopt(plant(*lines))
+            until_sampled(poller, "fan-1")
+
+
+def until_sampled(poller: Poller, drive: str) -> None:
+    waited = threading.Event()
+    for _ in range(int(PATIENCE / 0.01)):
+        if samples(poller, drive) > 5:
+            return
+        waited.wait(0.01)
+    raise AssertionError(f"no samples of {drive}")
+
+
+# ---- for ever ----
+
+
+@pytest.mark.slow
+def test_a_hundred_adoptions_leave_nothing_behind(both: Hall) -> None:
+    """With threads that read by hand, look at statistics and take batches; every value is its own."""
+    held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
+    sims = [*both.pumps.values(), *both.fans.values()]
+    for value, sim in zip(held_by.values(), sims, strict=True):
+        sim["output_current"] = value
+    with Poller(plant(both.hall(), both.yard(every=None))) as poller:
+        pump = poller.bus("hall").drives[0]
+        is_over = threading.Event()
+        failures: list[BaseException] = []
+
+        def go_on(do: object) -> None:
+            try:
+                while not is_over.is_set():
+                    do()  # type: ignore[operator]
+            except BaseException as failure:
+                failures.append(failure)
+
+        def look() -> None:
+            poller.summary(), poller.statistics(), poller.plant, repr(poller)
+
+        def read_all() -> None:
+            for bus in poller.buses.values():
+                for drive in bus.drives:
+                    with suppress(LineError, NotAttached):
+                        bus.read(drive, CURRENT)
+
+        def take() -> None:
+            for batch in poller.batches(seconds=0.05):
+                for row in batch:
+                    if row.value is not None and row.register == "output_current":
+                        assert row.value == held_by[row.drive], row
+
+        def adopt_some(number: int) -> None:
+            second = (both.hall(1), both.hall(1, 2), both.hall(1, 2, every=0.03))[number % 3]
+            third = [(), (both.yard(),), (both.yard(2),), (both.yard(1, 2, every=None),)][number % 4]
+            assert poller.adopt(plant(second, *third)) == {}
+
+        beside = [
+            threading.Thread(target=go_on, args=[do])
+            for do in (look, lambda: poller.bus("hall").read(pump, CURRENT), read_all, take)
+        ]
+        for thread in beside:
+            thread.start()
+        try:
+            for number in range(12):
+                adopt_some(number)
+            held = descriptors(), threads()
+            gc.collect()
+            tracemalloc.start()
+            before = tracemalloc.take_snapshot()
+            for number in range(96):
+                adopt_some(number)
+            gc.collect()
+            grown = tracemalloc.take_snapshot().compare_to(before, "filename")
+            tracemalloc.stop()
+            assert failures == []
+            assert (descriptors(), threads()) == held
+        finally:
+            is_over.set()
+            for thread in beside:
+                thread.join(PATIENCE)
+        assert failures == []
+        ours = sum(each.size_diff for each in grown if "multidrop" in each.traceback[0].filename)
+        assert ours < 200_000, [str(each) for each in grown[:8]]
+        before_end = samples(poller, "pump-1")
+        until(lambda: samples(poller, "pump-1") > before_end + 10)
