@@ -725,6 +725,31 @@ def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Dr
     assert found == [Failure.LINE_LOST]
 
 
+def test_what_a_port_is_asking_is_told() -> None:
+    """Queued, repeated, urgent and under way; and nothing of another peer."""
+    near, far = socket.socketpair()
+    with near, far:
+        near.setblocking(False)
+        with closing(Port(near.fileno(), NO_SETTINGS, room=4)) as port:
+            queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))
+            assert not port.is_asking(queued.peer)
+            port.submit([queued], [now_ns() + 3600 * 10**9])
+            assert port.is_asking(queued.peer)
+            assert not port.is_asking(other.peer)
+            port.repeat([repeated])
+            assert far.recv(100)  # it is under way
+            port.repeat([])
+            assert port.is_asking(repeated.peer)
+            until(lambda: not port.is_asking(repeated.peer))
+            later = {"not_before_ns": now_ns() + 3600 * 10**9}
+            urgent = threading.Thread(target=port.carry_out, args=[other], kwargs=later)
+            urgent.start()
+            until(lambda: port.is_asking(other.peer))
+            assert port.is_asking(queued.peer)
+            port.stop()
+            urgent.join()
+
+
 def test_ports_come_and_go(drive: Drive) -> None:
     """Opened and closed a thousand times, under way or not, on one engine."""
 

@@ -17,7 +17,9 @@ CC = os.environ.get("CC", "cc")
 SKIPPED = 77  # the exit status of a test program that cannot test anything here, and says why
 
 
-def build_and_run(program: Path, *core: str, arguments: Sequence[str] = ()) -> None:
+def build_and_run(
+    program: Path, *core: str, arguments: Sequence[str] = (), sanitizers: Sequence[str] = SANITIZERS
+) -> None:
     """The test program of that name, with these parts of the core."""
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
@@ -28,7 +30,7 @@ def build_and_run(program: Path, *core: str, arguments: Sequence[str] = ()) -> N
         "-g",
         "-O1",
         *STRICT,
-        *SANITIZERS,
+        *sanitizers,
         "-Icsrc",
         f"tests/c/{program.name}.c",
         *(f"csrc/{name}.c" for name in core),
