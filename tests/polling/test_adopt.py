@@ -290,7 +290,7 @@ def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
 
 
 def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> None:
-    """What is queued of a drive that leaves is asked before the next one comes, and owed to that one."""
+    """Requests that are queued yet are made before the next drive comes, which knows what may be late."""
     wires = {"port of hall": wire(Toy(1))}
     with World.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
@@ -511,3 +511,29 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
             adopt_some(number)
         after = kept()
         assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
+
+
+def test_drives_that_join_are_asked_in_the_best_order() -> None:
+    """As if the line had been polled with them from the start: settings are changed as seldom."""
+
+    def drives() -> list[PolledDrive]:
+        rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}
+        return [polled(Toy(at, name=f"p-{at}", baudrate=rates[at]), [CURRENT]) for at in rates]
+
+    def round_of(made: World) -> list[str]:
+        return [job.owner.name for job in made.poller._lines.find("hall")._schedule._round]
+
+    def quick() -> WorldWire:
+        return wire(*(each.drive for each in drives()))
+
+    with World.of_lines({"port of hall": quick()}, plant(hall(*drives()))) as made:
+        at_start = round_of(made)
+    with World.of_lines({"port of hall": quick()}, plant(hall(*drives()[:1]))) as made:
+        made.run(1)
+        made.poller.adopt(plant(hall(*drives())))
+        joined = round_of(made)
+        rows = made.run(3)
+    assert sorted(joined) == sorted(at_start)
+    assert joined == at_start
+    assert joined != [each.drive.name for each in drives()]
+    assert {name for name, _ in values(rows)} == {"p-1", "p-2", "p-3", "p-4"}

@@ -285,6 +285,36 @@ def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> N
             until_sampled(poller, "fan-1")
 
 
+def test_a_port_that_takes_its_time_holds_up_no_other_one(
+    both: Hall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    open_bus = Bus.__init__
+
+    def slow(bus: Bus, port: str, **details: object) -> None:
+        if port.startswith("socket"):
+            assert go_on.wait(PATIENCE)
+        open_bus(bus, port, **details)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Bus, "__init__", slow)
+    nowhere = line("socket://127.0.0.1:1", quick("far", 1), name="far")
+    found: dict[str, LineError] = {}
+    with Poller(plant(both.hall())) as poller:
+        adopting = threading.Thread(
+            target=lambda: found.update(poller.adopt(plant(nowhere, both.hall(), both.yard())))
+        )
+        adopting.start()
+        until_sampled(poller, "fan-1")
+        until_sampled(poller, "pump-1")
+        assert adopting.is_alive()
+        go_on.set()
+        adopting.join(PATIENCE)
+        assert list(poller.buses) == ["far", "hall", "yard"]
+    assert str(found["far"]) == "socket://127.0.0.1:1: nothing listens there" or "refused" in str(
+        found["far"]
+    )
+
+
 def until_sampled(poller: Poller, drive: str) -> None:
     waited = threading.Event()
     for _ in range(int(PATIENCE / 0.01)):

@@ -264,7 +264,7 @@ class WorldLine:
 
 
 class WorldLines:
-    """What opens lines of a world, in place of the class Line."""
+    """Opens lines of a world, in place of the class Line."""
 
     def __init__(self, world: World) -> None:
         self._world = world

@@ -114,6 +114,12 @@ class Schedule(Generic[J]):
         for job in jobs:
             self.remove(job)
 
+    def put_in_order(self, drives: Sequence[int]) -> None:
+        """Put the jobs of the round in the order of their drives here, and begin it anew."""
+        places = {drive: place for place, drive in enumerate(drives)}
+        self._round.sort(key=lambda job: places[job.drive])
+        self._next = 0
+
     def _await(self, job: J) -> None:
         heapq.heappush(self._waiting, (job.due_ns, job.number, job))
 

@@ -50,6 +50,8 @@ class Staying:
             self.line.set_polls(polled)
         for polled in self.drives.joining:
             self.line.add(polled)
+        if self.drives.joining:
+            self.line.put_in_order()
 
 
 @dataclass(frozen=True)
@@ -145,24 +147,32 @@ class Adoption:
     def _open(self, start: bool) -> dict[str, LineError]:
         """Open the lines that are new; those whose port is not there wait for it, as lost ones do."""
         failures: dict[str, LineError] = {}
-        opened = self._lines.open([coming.wanted for coming in self._coming])
-        for coming, bus in zip(self._coming, opened, strict=True):
+        for place, bus in self._lines.open([coming.wanted for coming in self._coming]):
+            coming = self._coming[place]
             if isinstance(bus, LineError):
                 failures[coming.wanted.name] = bus
                 bus = self._lines.await_port(coming.wanted)
-            if coming.before:
-                bus.remember(coming.before.bus)
-            if self._stops_on_exit:
-                bus.stop_on_exit()
-            line = self._lines.add(replace(coming.wanted, drives=()), bus)
+            elif isinstance(bus, OSError):
+                raise bus
             try:
-                for polled in coming.wanted.drives:
-                    line.add(polled)
+                self._put(coming, bus, start)
             except LineError as failure:
                 failures[coming.wanted.name] = failure
+        return failures
+
+    def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
+        """Poll a line on this bus. Raises LineError where the port cannot have a drive's settings."""
+        if coming.before:
+            bus.remember(coming.before.bus)
+        if self._stops_on_exit:
+            bus.stop_on_exit()
+        line = self._lines.add(replace(coming.wanted, drives=()), bus)
+        try:
+            for polled in coming.wanted.drives:
+                line.add(polled)
+        finally:
             if start:
                 line.start()
-        return failures
 
 
 def _is_free(drive: Drive, buses: set[Bus]) -> bool:

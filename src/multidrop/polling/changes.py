@@ -16,7 +16,7 @@ from multidrop.toml_check import check_period
 
 
 class DriveChanges(NamedTuple):
-    """What becomes of the drives of a line that stays."""
+    """Changes to the drives of a line that stays."""
 
     leaving: list[PolledDrive]
     joining: list[PolledDrive]

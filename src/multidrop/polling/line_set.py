@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,7 +13,6 @@ from multidrop.control.audit_log import AuditLog
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import RowQueue
 from multidrop.drive.family import Drive
-from multidrop.errors import LineError
 from multidrop.plant.model import PlantLine
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
@@ -74,37 +73,36 @@ class LineSet:
 
     def fill(self, declared: Sequence[PlantLine]) -> None:
         """Add all these lines; none is open after LineError for a port, or ValueError."""
-        found = self.open(declared)
+        found = [bus for _, bus in sorted(self.open(declared), key=lambda opened: opened[0])]
         buses = [bus for bus in found if isinstance(bus, Bus)]
         with ExitStack() as stack:
             for bus in buses:
                 stack.callback(bus.close)  # unless all goes well
             for failure in found:
-                if isinstance(failure, LineError):
+                if isinstance(failure, OSError):
                     raise failure
             for line, bus in zip(declared, buses, strict=True):
                 self.add(line, bus)
             stack.pop_all()
 
-    def open(self, declared: Sequence[PlantLine]) -> list[Bus | LineError]:
-        """Open the ports of these lines side by side; return for each the bus, or why there is none."""
+    def open(self, declared: Sequence[PlantLine]) -> Iterator[tuple[int, Bus | OSError]]:
+        """Open the ports of these lines side by side.
 
-        def opened(line: PlantLine) -> Bus | LineError:
-            try:
-                return self._bus(Bus, line)
-            except LineError as failure:
-                return failure
-
+        Yields each line's place here as soon as it is done, with the bus, or why there is none.
+        """
         if len(declared) < 2:
-            return [opened(line) for line in declared]
-        found: list[Bus | LineError] = []
-        with ExitStack() as stack, ThreadPoolExecutor(OPENING, "multidrop opening") as pool:
-            for bus in pool.map(opened, declared):
-                found.append(bus)
-                if isinstance(bus, Bus):
-                    stack.callback(bus.close)  # unless all goes well
-            stack.pop_all()
-        return found
+            yield from enumerate(map(self._opened, declared))
+            return
+        with ThreadPoolExecutor(OPENING, "multidrop opening") as pool:
+            opening = {pool.submit(self._opened, line): place for place, line in enumerate(declared)}
+            for opened in as_completed(opening):
+                yield opening[opened], opened.result()
+
+    def _opened(self, line: PlantLine) -> Bus | OSError:
+        try:
+            return self._bus(Bus, line)
+        except OSError as failure:  # of the port, which is a LineError, or of the audit log
+            return failure
 
     def await_port(self, line: PlantLine) -> Bus:
         """Return a bus for a port that is not there yet."""

@@ -110,6 +110,13 @@ class PolledLine:
                 self._add_jobs(drive, jobs, clock.now_ns())
         self._row_queue.call(self.number)
 
+    def put_in_order(self) -> None:
+        """Ask the drives in the order in which their settings are changed in the least time."""
+        with self._lock:
+            drives = in_order(self.bus.drives, self.switching)
+            self._schedule.put_in_order([drive.address for drive in drives])
+        self._row_queue.call(self.number)
+
     def _await_gone(self, address: int) -> None:
         peer = self._gone.pop(address, None)
         while peer and not self._is_left and (port := self.bus.line.queue) and port.is_asking(peer):
