@@ -17,7 +17,7 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
-from multidrop.errors import LineError, NotAttached, Overtaken
+from multidrop.errors import LineError, NoReply, NotAttached, Overtaken
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
@@ -310,9 +310,9 @@ def test_a_port_that_takes_its_time_holds_up_no_other_one(
         go_on.set()
         adopting.join(PATIENCE)
         assert list(poller.buses) == ["far", "hall", "yard"]
-    assert str(found["far"]) == "socket://127.0.0.1:1: nothing listens there" or "refused" in str(
-        found["far"]
-    )
+    assert {name: str(failure) for name, failure in found.items()} == {
+        "far": "socket://127.0.0.1:1: nothing listens there"
+    }
 
 
 def until_sampled(poller: Poller, drive: str) -> None:
@@ -349,10 +349,14 @@ def test_a_hundred_adoptions_leave_nothing_behind(both: Hall) -> None:
         def look() -> None:
             poller.summary(), poller.statistics(), poller.plant, repr(poller)
 
+        def read_one() -> None:
+            with suppress(NoReply):  # on a busy machine
+                poller.bus("hall").read(pump, CURRENT)
+
         def read_all() -> None:
             for bus in poller.buses.values():
                 for drive in bus.drives:
-                    with suppress(LineError, NotAttached):
+                    with suppress(LineError, NotAttached, NoReply):
                         bus.read(drive, CURRENT)
 
         def take() -> None:
@@ -366,10 +370,7 @@ def test_a_hundred_adoptions_leave_nothing_behind(both: Hall) -> None:
             third = [(), (both.yard(),), (both.yard(2),), (both.yard(1, 2, every=None),)][number % 4]
             assert poller.adopt(plant(second, *third)) == {}
 
-        beside = [
-            threading.Thread(target=go_on, args=[do])
-            for do in (look, lambda: poller.bus("hall").read(pump, CURRENT), read_all, take)
-        ]
+        beside = [threading.Thread(target=go_on, args=[do]) for do in (look, read_one, read_all, take)]
         for thread in beside:
             thread.start()
         try:
