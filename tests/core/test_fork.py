@@ -235,7 +235,7 @@ def test_locks_of_a_poller_do_not_hold_a_child_up(port: str) -> None:
         poller.close()
 
     with Poller(plant(declared(port, toy))) as poller:
-        with held(poller._changing, poller._lines[0]._lock):
+        with held(poller._changing, next(iter(poller._lines))._lock):
             assert in_child(use) is None
         until(lambda: is_polled(poller))
 
