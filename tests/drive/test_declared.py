@@ -9,19 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import (
-    COIL,
-    HOLDING,
-    INPUT,
-    NumberFormat,
-    Register,
-    Table,
-    command,
-    reading,
-    setting,
-)
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
+from multidrop.drive.table import COIL, HOLDING, INPUT, Table
 from multidrop.drives import DelixiNative
 
 

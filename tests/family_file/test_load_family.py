@@ -12,7 +12,9 @@ import pytest
 from families import METER, METER_CSV, Meter, write_meter
 
 from multidrop import Drive, FamilyError, Kept, load_family
-from multidrop.drive.register import HOLDING, INPUT, NumberFormat, Register
+from multidrop.core import NumberFormat
+from multidrop.drive.register import Register
+from multidrop.drive.table import HOLDING, INPUT
 from multidrop.family_file.facts import FAMILY_KEYS
 from multidrop.family_file.loader import SECTIONS
 from multidrop.family_file.register_keys import REGISTER_KEYS

@@ -9,7 +9,8 @@ from typing import Any
 
 from multidrop.core import NumberFormat
 from multidrop.drive.number_format import FLOATS, WORDS, width
-from multidrop.drive.register import Access, Carrier, Register
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier
 
 _PARTED = frozenset(
     {
