@@ -44,7 +44,9 @@ class WriteRecords:
         if why:
             way, advice = "write it less often, or take a setpoint that is kept in RAM", None
             if kept is Kept.UNKNOWN:
-                advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
+                declared = f'ram = ["{register.name}"]'
+                written = f"write {declared} below its [[line.drive]]"
+                advice = Advice(f"declare {declared}", f"add --ram {register.name}", written)
                 way = f"if you know that this drive keeps it in RAM, {advice.program}"
             raise refused(drive, register, f"{why}; {way}", advice)
 

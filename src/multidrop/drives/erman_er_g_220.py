@@ -226,7 +226,11 @@ class ErmanERG220(Drive):
         dealt_with = self.option.get("acknowledged_fault", 0)
         if fault and fault not in (self._reset_fault, dealt_with):
             reset, declare = Advice.call("reset_fault"), Advice.declare("acknowledged_fault", int(fault))
-            way = Advice(f"{reset.program}, or {declare.program}", f"{reset.command} and {declare.command}")
+            way = Advice(
+                f"{reset.program}, or {declare.program}",
+                f"{reset.command} and {declare.command}",
+                f"{reset.command}, or {declare.plant}",
+            )
             shown = self.last_fault.format(fault)
             raise Refused(f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way)
         yield from self._setpoint_in_force()
