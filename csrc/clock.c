@@ -1,10 +1,10 @@
-/* The two clocks: one that only grows, and the time of day. */
+/* Reads the monotonic clock, and by how much the time of day is ahead of it. */
 #include "internal.h"
 
 #include <stdatomic.h>
 #include <time.h>
 
-enum { WRONG_NS = 100000 };
+enum { WRONG_NS = 100000 }; /* a kept difference that is off by more is replaced */
 
 static int64_t read_clock(clockid_t clock)
 {
@@ -23,10 +23,10 @@ int64_t md_utc_minus_monotonic_ns(void)
     static _Atomic int64_t kept;
     int64_t before_ns = md_now_ns(), utc_ns = read_clock(CLOCK_REALTIME), after_ns = md_now_ns();
     int64_t known = atomic_load(&kept), found = utc_ns - before_ns;
-    int is_known = after_ns - before_ns < WRONG_NS; /* else this thread was interrupted meanwhile */
+    int is_known = after_ns - before_ns < WRONG_NS; /* else this thread was interrupted between the two */
     int is_right = found - known <= WRONG_NS && known - found <= WRONG_NS;
     if (known && (is_right || !is_known))
         return known;
-    /* Of two threads that find it wrong at once, the first one's word counts. */
+    /* Where two threads replace it at once, both return what the first one kept. */
     return atomic_compare_exchange_strong(&kept, &known, found) ? found : known;
 }

@@ -1,8 +1,8 @@
-/* Serial settings of a descriptor, made and read back: what was taken is what is found then.
+/* Sets a port's speed and character format, then reads back which of them the driver took.
  *
- * tcsetattr() reports EINVAL when nothing of what it was asked for took effect, so that a pty
- * cannot be reopened at even parity. Linux has an ioctl that does not, and takes any baud rate; other
- * systems take what their termios knows. */
+ * tcsetattr() fails with EINVAL where nothing that it was asked for took effect: a pty could not be
+ * opened again at even parity. Linux's ioctl does not fail then, and takes any speed; elsewhere the speed
+ * is one of those that termios lists. */
 #include "internal.h"
 
 #include <errno.h>
@@ -11,7 +11,7 @@
 #ifdef __linux__
 #include <asm/termbits.h>
 #include <sys/ioctl.h>
-#ifndef TCGETS2 /* musl leaves them out; its requests are ints */
+#ifndef TCGETS2 /* musl does not define them, and its ioctl() takes an int */
 #define TCGETS2 ((int)_IOR('T', 0x2A, struct termios2))
 #define TCSETS2 ((int)_IOW('T', 0x2B, struct termios2))
 #endif
@@ -70,7 +70,7 @@ static struct md_settings describe(const attributes *now)
     };
 }
 
-/* Adapters report the rate that their divisor makes; a character bears 2 % (as the kernel has it). */
+/* An adapter reports the speed that its divisor gives. A receiver bears 2 %, as the kernel has it. */
 static int is_near(uint32_t baudrate, uint32_t wanted)
 {
     uint32_t off = baudrate > wanted ? baudrate - wanted : wanted - baudrate;

@@ -1,4 +1,4 @@
-/* Waiting for many descriptors at once, as Linux does it. */
+/* Waits for many descriptors at once, by epoll. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -9,7 +9,7 @@
 #include <unistd.h>
 
 #ifndef SYS_epoll_pwait2
-#define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11; no kernel has a call of this number */
+#define SYS_epoll_pwait2 (-1) /* headers older than Linux 5.11 lack it; no kernel has a call -1 */
 #endif
 
 enum { EVENTS = 256 }; /* taken at a time */
@@ -21,15 +21,15 @@ struct md_waiter {
     wait_function *wait;
 };
 
-/* By the kernel's number: C libraries before glibc 2.35 and musl have no function for it. Both of its times
- * are 64 bits wide, whatever time_t is. */
+/* Calls epoll_pwait2() by its number, because musl and glibc before 2.35 have no function for it. Its two
+ * times are 64 bits wide, also where time_t is not. */
 static int wait_at_once(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     const int64_t span[] = {timeout_ns / MD_SECOND_NS, timeout_ns % MD_SECOND_NS};
     return (int)syscall(SYS_epoll_pwait2, epoll, events, most, timeout_ns < 0 ? NULL : span, NULL, (size_t)0);
 }
 
-/* Where there is no epoll_pwait2(): before Linux 5.11, and where a container forbids it. */
+/* Waits without epoll_pwait2(), which Linux before 5.11 lacks and some containers forbid. */
 static int poll_first(int epoll, struct epoll_event *events, int most, int64_t timeout_ns)
 {
     struct pollfd any = {.fd = epoll, .events = POLLIN};

@@ -1,4 +1,4 @@
-/* Waiting for many descriptors at once, by what every POSIX system has. */
+/* Waits for many descriptors at once, by poll(), which every POSIX system has. */
 #ifdef __linux__
 #define _GNU_SOURCE
 #endif
@@ -10,7 +10,7 @@
 #include <string.h>
 
 struct md_waiter {
-    struct pollfd *fds; /* looked away from: the complement of the descriptor, which poll() ignores */
+    struct pollfd *fds; /* one that is not watched is kept as its complement, which poll() ignores */
     void **whose;
     int count, room;
 };
@@ -85,7 +85,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
     waiter->whose[at] = waiter->whose[waiter->count];
 }
 
-/* Where there is no ppoll(), what is left of a millisecond is for the caller to wait. */
+/* Without ppoll() the wait ends on a whole millisecond, and the caller waits for the rest. */
 static int wait_for_any(struct md_waiter *waiter, int64_t timeout_ns)
 {
 #ifdef __linux__

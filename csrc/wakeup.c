@@ -1,4 +1,4 @@
-/* A wakeup: any thread may ring it, and whoever waits for its descriptor wakes. */
+/* A pipe by which any thread wakes the one that waits. */
 #include "internal.h"
 
 #include <fcntl.h>
@@ -33,7 +33,7 @@ void md_wakeup_ring(struct md_wakeup *wakeup)
         (void)!write(wakeup->ringer, "", 1);
 }
 
-/* What rings while this goes on leaves a byte, and is heard. */
+/* A ring during this call leaves a byte in the pipe, so it is not lost. */
 void md_wakeup_silence(struct md_wakeup *wakeup)
 {
     char byte;

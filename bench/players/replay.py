@@ -3,7 +3,8 @@
 from typing import Any
 
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, INPUT, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING, INPUT
 from multidrop.drive.timing import Settings
 
 

@@ -127,10 +127,14 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """The advice in a refusal's sentence: for a program, and for the command line instead."""
+    """The advice in a refusal's sentence: for a program, and for the command line instead.
+
+    `plant` is for a drive of a plant file, where that is not what is typed for one by hand.
+    """
 
     program: str
     command: str
+    plant: str = ""
 
     @classmethod
     def call(cls, verb: str) -> Advice:
@@ -140,7 +144,11 @@ class Advice(NamedTuple):
     @classmethod
     def declare(cls, option: str, value: object) -> Advice:
         """Advise to declare an option of the drive."""
-        return cls(f"declare {option} = {value}", f"add --option {option}={value}")
+        return cls(
+            f"declare {option} = {value}",
+            f"add --option {option}={value}",
+            f"write {option} = {value} below its [[line.drive]]",
+        )
 
 
 class Refused(BusError, ValueError):
@@ -161,9 +169,12 @@ class Refused(BusError, ValueError):
         self.rule = rule
         self.place = place
 
-    def for_command_line(self) -> str:
+    def for_command_line(self, *, in_plant: bool = False) -> str:
         """Return the sentence with what to type in place of what a program would call or declare."""
-        return str(self).replace(*self.advice) if self.advice else str(self)
+        if self.advice is None:
+            return str(self)
+        typed = (in_plant and self.advice.plant) or self.advice.command
+        return str(self).replace(self.advice.program, typed)
 
 
 class CheckAgain(Exception):

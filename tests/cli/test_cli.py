@@ -247,11 +247,25 @@ def test_what_a_rule_forbids_comes_with_what_is_to_be_typed(run: Run, words: lis
     assert advice in err
 
 
+def test_advice_for_a_drive_of_a_plant_file_is_what_its_command_takes(run: Run, tmp_path: Path) -> None:
+    plant = tmp_path / "plant.toml"
+    plant.write_text(
+        '[[line]]\nname = "hall"\nport = "/dev/ttyX"\n'
+        '[[line.drive]]\nname = "fan"\nmodel = "invt-che"\naddress = 1\n'
+    )
+    status, out, err = run("set-frequency", plant, "fan", "20")
+    assert (status, out) == (1, "")
+    assert "P0.04: write maximum_frequency = HZ below its [[line.drive]]" in err
+
+
 def test_advice_for_a_program_becomes_a_command_s() -> None:
     reset = Refused("x has a fault: see to it, then call reset_fault()", advice=Advice.call("reset_fault"))
     assert reset.for_command_line() == "x has a fault: see to it, then run `multidrop reset-fault`"
     declare = Refused("and declare confirmed = 1 if it is", advice=Advice.declare("confirmed", 1))
     assert declare.for_command_line() == "and add --option confirmed=1 if it is"
+    in_plant = declare.for_command_line(in_plant=True)
+    assert in_plant == "and write confirmed = 1 below its [[line.drive]] if it is"
+    assert reset.for_command_line(in_plant=True) == reset.for_command_line()
     assert Refused("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 

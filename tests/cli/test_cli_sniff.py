@@ -300,7 +300,8 @@ def test_noise_is_told_though_it_does_not_end() -> None:
 METER = """\
 from multidrop.core import NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 
 class Meter(Drive):
     model = "meter"

@@ -13,7 +13,7 @@ from multidrop.drives.registry import find_model
 
 FAN = """\
 from multidrop.drive.family import Drive
-from multidrop.drive.register import reading
+from multidrop.drive.declare import reading
 
 class Fan(Drive):
     model = "fan"

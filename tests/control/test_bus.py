@@ -15,7 +15,8 @@ from toy import Fault, Toy
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message
 from multidrop.drive import Drive, Script
-from multidrop.drive.register import HOLDING, Kept, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.table import HOLDING, Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.innovert_ibd import IBDControl

@@ -16,7 +16,8 @@ from toy import Status, Toy
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
 from multidrop.drive import Drive
-from multidrop.drive.register import COIL, Kept, setting
+from multidrop.drive.declare import setting
+from multidrop.drive.table import COIL, Kept
 from multidrop.errors import Refused
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import port_identity, simulated_ports

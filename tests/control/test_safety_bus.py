@@ -20,7 +20,8 @@ from multidrop.control.outcome import Effect, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
-from multidrop.drive.register import COIL, Kept, reading, setting
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import COIL, Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.invt_che import CHEControl, parameter

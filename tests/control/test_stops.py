@@ -22,7 +22,8 @@ from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stop_attempt import LEAST_S
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, wait, write
-from multidrop.drive.register import Kept, reading, setting
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import (

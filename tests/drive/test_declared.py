@@ -9,19 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import (
-    COIL,
-    HOLDING,
-    INPUT,
-    NumberFormat,
-    Register,
-    Table,
-    command,
-    reading,
-    setting,
-)
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
+from multidrop.drive.table import COIL, HOLDING, INPUT, Table
 from multidrop.drives import DelixiNative
 
 
@@ -113,10 +106,8 @@ PARTS: dict[str, dict[str, Any]] = {
         "part": (0, 3),
         "number_format": NumberFormat.F32,
     },
-    "FAR = 131072 is not within 0 to 65535, which its number can be": {
-        "what": IntFlag("Bits", {"FAR": 1 << 17})
-    },
-    "HIGH = 16 is not within 0 to 15, which its number can be": {
+    "FAR is bit 17, and its number has bits 0 to 15": {"what": IntFlag("Bits", {"FAR": 1 << 17})},
+    "HIGH is bit 4, and its number has bits 0 to 3": {
         "what": IntFlag("Bits", {"HIGH": 16}),
         "part": (4, 7),
     },
@@ -141,6 +132,37 @@ def test_a_mistake_of_a_reading_is_told(mistake: str) -> None:
     details = dict(PARTS[mistake])
     (sentence,) = told(level=reading(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
+
+
+BITS = IntFlag("Bits", {"RUN": 1, "RESET": 8})
+WRITTEN: dict[str, dict[str, Any]] = {
+    "harmless = 65536 is not within 0 to 65535, which its number can be": {"harmless": (0, 65536)},
+    "harmless = -1 is not within 0 to 65535, which its number can be": {"harmless": (-1,)},
+    "broadcast = 40000 is not within -32768 to 32767, which its number can be": {
+        "broadcast": (40000,),
+        "number_format": NumberFormat.I16,
+    },
+    "broadcast = 2 is not within 0 to 1, which its number can be": {"broadcast": (2,), "table": COIL},
+    "never_together = 0088H forbids nothing: only bits with names are checked": {"never_together": (0x88,)},
+    "never_together = 0009H forbids nothing": {"what": Run, "never_together": (9,)},
+    "never_together = 0H is no mask of its bits": {"what": BITS, "never_together": (0,)},
+    "never_together = 10009H is no mask of its bits": {"what": BITS, "never_together": (0x10009,)},
+    "its default cannot be: level = 70000 does not fit: 0 to 65535": {"default": 70000},
+}
+
+
+@pytest.mark.parametrize("mistake", WRITTEN)
+def test_a_count_that_no_write_can_have_is_told(mistake: str) -> None:
+    details = dict(WRITTEN[mistake])
+    (sentence,) = told(level=setting(5, details.pop("what", ""), **details))
+    assert sentence.startswith(f"level: {mistake}")
+
+
+def test_counts_that_a_write_can_have() -> None:
+    assert declare(
+        level=setting(5, harmless=(-1, 0), number_format=NumberFormat.I16, default=-3),
+        control=command(6, BITS, harmless=(0, 0x8000), never_together=(9,), broadcast=(0,)),
+    )
 
 
 POWER = reading(12, number_format=NumberFormat.I16)

@@ -10,7 +10,8 @@ from simulated_bus import SimulatedBus
 
 from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive, Script, State, insist, read, write
-from multidrop.drive.register import Kept, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.table import Kept
 from multidrop.drive.verbs import verb
 from multidrop.errors import Refused, Unconfirmed
 from multidrop.plant.loader import load_plant

@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.register import COIL, Kept, NumberFormat, Register, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
+from multidrop.drive.table import COIL, Kept
 
 
 class Run(IntEnum):

@@ -14,7 +14,8 @@ from simulated_bus import SimulatedBus
 from multidrop.core import Message
 from multidrop.drive import Drive, Refused, Script, read, verb
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import COIL, INPUT, Kept, reading, setting
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import COIL, INPUT, Kept
 from multidrop.drive.text import Text, text
 from multidrop.scan.identify import _read
 from multidrop.sim import SimulatedDrive, Simulator, Wire

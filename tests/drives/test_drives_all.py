@@ -16,10 +16,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import multidrop.drives
-from multidrop.core import Message, build_reply, build_request, parse_reply, parse_request, raw_value
+from multidrop.core import (
+    Message,
+    NumberFormat,
+    build_reply,
+    build_request,
+    parse_reply,
+    parse_request,
+    raw_value,
+)
 from multidrop.drive import Condition, Direction, Drive, State, Unsupported
-from multidrop.drive.register import Access, Carrier, NumberFormat, Register, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.register import Access, Register
 from multidrop.drive.request import write_request
+from multidrop.drive.table import Carrier
 from multidrop.drive.verbs import VERBS
 from multidrop.drives import MODELS
 from multidrop.drives.invt_che import CHEStatus

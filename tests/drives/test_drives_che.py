@@ -10,6 +10,7 @@ from scripts import Wire, rows, typed
 from simulated_bus import one
 
 from multidrop.control.eeprom_ledger import Ledger
+from multidrop.core import NumberFormat
 from multidrop.drive import (
     Condition,
     Direction,
@@ -20,7 +21,7 @@ from multidrop.drive import (
     Unconfirmed,
     Unsupported,
 )
-from multidrop.drive.register import HOLDING, Kept, NumberFormat
+from multidrop.drive.table import HOLDING, Kept
 from multidrop.drives.invt_che import (
     CHEControl,
     CHEFault,

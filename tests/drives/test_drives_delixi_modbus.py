@@ -7,7 +7,7 @@ from delixi_tables import MONITORS
 from scripts import Wire, frame, rows, typed
 
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
-from multidrop.drive.register import HOLDING, Kept
+from multidrop.drive.table import HOLDING, Kept
 from multidrop.drives.delixi_modbus import DelixiModbus, DelixiModbusControl
 from multidrop.drives.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource
 

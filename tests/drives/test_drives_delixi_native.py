@@ -11,7 +11,8 @@ from simulated_bus import one
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotDone, Refused, State, Unconfirmed, Unsupported
-from multidrop.drive.register import Carrier, Kept, setting
+from multidrop.drive.declare import setting
+from multidrop.drive.table import Carrier, Kept
 from multidrop.drives.delixi_native import PARAMETER, PARAMETER_RAM, DelixiNative, DelixiNativeStatus
 from multidrop.drives.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource, parameter
 from multidrop.errors import NoReply

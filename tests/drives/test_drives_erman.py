@@ -7,8 +7,9 @@ import pytest
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
-from multidrop.drive.register import COIL, HOLDING, INPUT, Kept, NumberFormat
+from multidrop.drive.table import COIL, HOLDING, INPUT, Kept
 from multidrop.drives.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
 from multidrop.errors import NoReply
 

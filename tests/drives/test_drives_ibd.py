@@ -8,7 +8,7 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 
 from multidrop.drive import Condition, Direction, DriveRefused, Framing, Refused, Unconfirmed, Unsupported
-from multidrop.drive.register import HOLDING
+from multidrop.drive.table import HOLDING
 from multidrop.drives.innovert_ibd import (
     FrequencySource,
     IBDBaudrate,

@@ -8,7 +8,7 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 
 from multidrop.drive import Condition, Direction, DriveRefused, NotDone, Refused, State, Unconfirmed
-from multidrop.drive.register import HOLDING, Kept
+from multidrop.drive.table import HOLDING, Kept
 from multidrop.drives.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
 
 FORWARD = "01 06 10 00 C4 00 DF CA"

@@ -17,9 +17,9 @@ import checksums
 import pytest
 from simulated_bus import SimulatedBus, one, text
 
-from multidrop.core import Framing, Message, build_reply, build_request, parse_reply
+from multidrop.core import Framing, Message, NumberFormat, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
-from multidrop.drive.register import HOLDING, Kept, NumberFormat
+from multidrop.drive.table import HOLDING, Kept
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.drives.delixi_native import DelixiNativeStatus
 from multidrop.drives.erman_er_g_220 import ErmanFault, ErmanStatus, Modes

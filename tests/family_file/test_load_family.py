@@ -12,7 +12,9 @@ import pytest
 from families import METER, METER_CSV, Meter, write_meter
 
 from multidrop import Drive, FamilyError, Kept, load_family
-from multidrop.drive.register import HOLDING, INPUT, NumberFormat, Register
+from multidrop.core import NumberFormat
+from multidrop.drive.register import Register
+from multidrop.drive.table import HOLDING, INPUT
 from multidrop.family_file.facts import FAMILY_KEYS
 from multidrop.family_file.loader import SECTIONS
 from multidrop.family_file.register_keys import REGISTER_KEYS
@@ -204,6 +206,41 @@ def test_more_than_twenty_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
         load_family(path)
     assert [mistake.removeprefix(f"{tmp_path}/") for mistake in wrong.value.mistakes] == TOLD
     assert len(TOLD) > 20
+
+
+BESIDE = """
+[reading]
+a = { at = 70000, bits = { run = 0 } }
+[command]
+control = { at = 14 }
+[look]
+runs = { register = "a", has = ["run"] }
+[state]
+runs = "running"
+far = "fault"
+[identify]
+register = "a"
+[shows]
+a = ["run"]
+[verb.stop]
+steps = [{ insist = "control", value = 0 }, { await = "runs", limit = "forever" }, { fly = 1 }]
+[verb.dance]
+steps = []
+"""
+
+
+def test_mistakes_of_verbs_are_told_beside_those_of_a_register(tmp_path: Path) -> None:
+    """Only what follows from the register is not told: that nobody can look at it."""
+    (tmp_path / "t.toml").write_text(HEAD + BESIDE)
+    with pytest.raises(FamilyError) as wrong:
+        load_family(tmp_path / "t.toml")
+    assert [mistake.partition("t.toml: ")[2][:60] for mistake in wrong.value.mistakes] == [
+        "[reading] a: at: 70000 is outside 0 to FFFFH",
+        "[state]: far is no look of [look]; there are none that is ri",
+        "[verb.stop], step 2: 'forever' is not a duration from 100 us",
+        "[verb.stop], step 3: {'fly': 1} is no step; each has one of ",
+        "[verb.dance]: dance is no verb that a file declares; there a",
+    ]
 
 
 @pytest.mark.parametrize(

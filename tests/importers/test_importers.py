@@ -299,7 +299,98 @@ def test_texts_of_a_file_cannot_leave_their_places(tmp_path: Path) -> None:
     assert list(tomllib.loads(family_text(device, "x\n[command]\n"))) == ["family", "reading"]
 
 
+# ---- the line ----
+
+HUBS = """
+modbus:
+  - {name: north, type: serial, port: /dev/ttyUSB3, baudrate: 19200, parity: E, method: rtu,
+     sensors: [{name: volt, slave: 1, address: 0}]}
+  - {name: south, type: rtuovertcp, host: 10.0.0.7, port: 4001, sensors: [{name: amp, slave: 1, address: 9}]}
+  - {name: west, type: tcp, host: "fe80::1", sensors: [{name: watt, slave: 1, address: 9}]}
+  - {name: east, type: serial, port: /dev/ttyS1, baudrate: 300, bytesize: 7, parity: E, method: ascii,
+     sensors: [{name: hertz, slave: 2, address: 9}]}
+"""
+
+
+def test_the_settings_of_a_line_are_carried_into_the_plant_file(tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    north, south, west, east = devices(tmp_path, "configuration.yaml", HUBS)
+    assert [list(entries(hub)) for hub in (north, south, west)] == [["volt"], ["amp"], ["watt"]]
+    lines = [tomllib.loads(plant_text(hub, "hub.toml"))["line"][0] for hub in (north, south, west, east)]
+    assert [line["port"] for line in lines] == [
+        "/dev/ttyUSB3", "socket://10.0.0.7:4001", "tcp://[fe80::1]:502", "/dev/ttyS1",
+    ]  # fmt: skip
+    known = [
+        {key: drive[key] for key in ("baudrate", "format", "framing") if key in drive}
+        for line in lines
+        for drive in line["drive"]
+    ]
+    assert known == [{"baudrate": 19200, "format": "8E1"}, {}, {}, {"framing": "ascii", "format": "7E1"}]
+    assert "gap: baudrates, formats, together: what the manual says of the line; there it is 300, 7E1" in (
+        family_text(east, "x")
+    )
+
+
+def test_the_line_of_telegraf_and_esphome(tmp_path: Path) -> None:
+    plugin = (
+        '[[inputs.modbus]]\nslave_id = 1\ncontroller = "{}"\n{}\n'
+        'holding_registers = [{{ name = "a", byte_order = "AB", data_type = "INT16", address = [7] }}]\n'
+    )
+    serial = 'baud_rate = 4800\ndata_bits = 8\nparity = "N"\nstop_bits = 2'
+    given = [
+        plugin.format("file:///dev/ttyUSB1", serial),
+        plugin.format("tcp://gate:1502", ""),
+        plugin.format("tcp://gate", 'transmission_mode = "RTUoverTCP"'),
+    ]
+    found = devices(tmp_path, "t.conf", "".join(given))
+    assert [(str(each.line), each.line.port) for each in found] == [
+        ("4800, 8N2", "/dev/ttyUSB1"), ("", "tcp://gate:1502"), ("", "socket://gate:502"),
+    ]  # fmt: skip
+    pytest.importorskip("yaml")
+    node = "uart: {baud_rate: 9600, parity: EVEN, stop_bits: 1}\nmodbus_controller: {id: m, address: 2}\n"
+    sensor = "sensor:\n  - {platform: modbus_controller, name: a, address: 1, register_type: holding}\n"
+    assert str(only(tmp_path, "node.yaml", node + sensor).line) == "9600, 8E1"
+
+
+def test_addresses_that_are_not_side_by_side_are_no_number(tmp_path: Path) -> None:
+    field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
+    listed = ", ".join(
+        field.format(*each) for each in (("good", [4, 5]), ("split", [4, 9]), ("one", [4, 5, 6]))
+    )
+    device = only(tmp_path, "t.conf", f"[[inputs.modbus]]\nslave_id = 1\nholding_registers = [{listed}]\n")
+    assert list(entries(device)) == ["good"]
+    assert told(device) == [
+        "split: its addresses 4, 9 are not those of a UINT32, side by side",
+        "one: its addresses 4, 5, 6 are not those of a UINT32, side by side",
+    ]
+
+
+def test_what_one_request_reads_is_carried_over(tmp_path: Path) -> None:
+    template = '{{"device": {{"max_read_registers": {}, "channels": [{}]}}}}'
+    channels = ", ".join(
+        f'{{"name": "{name}", "address": {at}, "format": "{kind}"}}'
+        for name, at, kind in (("a", 1, "u16"), ("b", 2, "u64"))
+    )
+    for most in (1, 2, 60):
+        device = only(tmp_path, f"t{most}.json", template.format(most, channels))
+        assert f"together = {{ holding = {most}, input = {most} }}" in family_text(device, "x")
+        assert set(loaded(tmp_path, device, "a", "b")) == {"a", "b"}
+    assert "together =" not in family_text(only(tmp_path, "t.json", template.format(0, channels)), "x")
+
+
 # ---- the command ----
+
+
+def test_hubs_with_a_device_of_one_address_each(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("yaml")
+    source = tmp_path / "configuration.yaml"
+    source.write_text(HUBS)
+    status, _, err = run("import", source, "--address", "1")
+    assert status == 2
+    assert "devices at 1 of 'north', 1 of 'south'" in err
+    assert "say which, such as --address 1 --title 'north'" in err
+    status, out, _ = run("import", source, "--address", "1", "--title", "south")
+    assert (status, "amp = " in out) == (0, True)
 
 
 def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:

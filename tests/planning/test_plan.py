@@ -9,21 +9,12 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from multidrop.core import Framing, Message, build_request, reply_length
+from multidrop.core import Framing, Message, NumberFormat, build_request, reply_length
 from multidrop.drive import Drive
-from multidrop.drive.register import (
-    COIL,
-    DISCRETE,
-    HOLDING,
-    INPUT,
-    NumberFormat,
-    Register,
-    Table,
-    command,
-    reading,
-    setting,
-)
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
 from multidrop.drive.request import read_request, write_request
+from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Table
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import Block, blocks, plan, planned
 from multidrop.planning.bus_time import gap, in_order, sending, silence

@@ -13,7 +13,8 @@ from line_driver import LineDriver
 
 from multidrop.core import Peer, build_reply
 from multidrop.drive import Drive, Framing
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 from multidrop.drives import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.bus_time import in_order

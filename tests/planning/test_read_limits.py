@@ -11,23 +11,13 @@ from hypothesis import strategies as st
 from meter import ADDRESSES, Meter, StatedMeter
 
 from multidrop import HOLDING_MULTIPLE
-from multidrop.core import Message
+from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive, Framing
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import (
-    COIL,
-    DISCRETE,
-    HOLDING,
-    INPUT,
-    Carrier,
-    NumberFormat,
-    Register,
-    Table,
-    command,
-    reading,
-    setting,
-)
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
 from multidrop.drive.request import write_request
+from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT, Carrier, Table
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import Block, blocks, planned
 from multidrop.planning.bus_time import sending, silence

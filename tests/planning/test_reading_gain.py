@@ -10,7 +10,8 @@ from meter import ADDRESSES, Meter, StatedMeter
 
 from multidrop.cli import main
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, INPUT, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING, INPUT
 from multidrop.drives import MODELS
 from multidrop.drives.registry import SHIPPED
 from multidrop.family_file.loader import load_family

@@ -17,7 +17,7 @@ from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing, Option
-from multidrop.drive.register import command, reading, setting
+from multidrop.drive.declare import command, reading, setting
 
 class Toy(Drive):
     model = "toy"

@@ -9,7 +9,8 @@ from lines import polled
 from toy import Toy
 from worlds import S, World, WorldWire
 
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 from multidrop.polling.batch import Row
 from multidrop.polling.jobs import JobMaker
 from multidrop.sim import Faults, SimulatedDrive

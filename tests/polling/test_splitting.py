@@ -13,8 +13,9 @@ from picky import Picky, family
 from simulated_bus import SimulatedBus
 from worlds import World, WorldWire
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.register import NumberFormat, reading
+from multidrop.drive.declare import reading
 from multidrop.errors import DriveRefused, NoReply
 from multidrop.planning.blocks import blocks
 from multidrop.planning.splitting import halves

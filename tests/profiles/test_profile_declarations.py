@@ -9,9 +9,11 @@ import pytest
 from profile_families import MAKE, V20, Acs355, Atv320, Fc51, Goodrive, VfdEl
 from scripts import Wire
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive, DriveRefused, Refused
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.register import COIL, NumberFormat, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.table import COIL
 from multidrop.drive.verbs import VERBS
 from multidrop.profiles import PROFILES, Delta, Profidrive
 

@@ -11,7 +11,8 @@ import pytest
 
 from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
-from multidrop.drive.register import Carrier, setting
+from multidrop.drive.declare import setting
+from multidrop.drive.table import Carrier
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.delixi_native import PARAMETER, DelixiNative
 from multidrop.drives.erman_er_g_220 import ErmanERG220

@@ -8,7 +8,8 @@ from functools import partial
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.register import Kept, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.table import Kept
 from multidrop.drives.registry import shipped_family
 from multidrop.profiles import CiA402, DanfossFC, Delta, Invt, Optidrive, Profidrive
 

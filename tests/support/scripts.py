@@ -11,7 +11,8 @@ from typing import Any
 from multidrop.control.rules import conditions, raw_count
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive, Read, Script, Wait
-from multidrop.drive.register import COIL, Carrier, Register
+from multidrop.drive.register import Register
+from multidrop.drive.table import COIL, Carrier
 
 
 def frame(drive: Drive, register: Register[Any], value: Any) -> str:

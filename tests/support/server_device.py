@@ -1,7 +1,9 @@
 """A device as a user declares it, for the servers that we did not write."""
 
+from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
-from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, NumberFormat, reading, setting
+from multidrop.drive.declare import reading, setting
+from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT
 
 
 class Device(Drive):

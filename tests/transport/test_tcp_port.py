@@ -14,7 +14,8 @@ from lines import PATIENCE, rows_of, until
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, build_request, parse_request
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 from multidrop.drives import YD1000, DelixiNative, InnovertIBD
 from multidrop.errors import BadReply, LineError, NoReply, NoSuchPort, PortLost, Refused
 from multidrop.plant.loader import PlantError, load_plant

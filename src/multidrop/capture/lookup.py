@@ -7,7 +7,8 @@ from typing import Any
 
 from multidrop.core import Framing, Message, NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Carrier, Register
+from multidrop.drive.register import Register
+from multidrop.drive.table import Carrier
 from multidrop.plant.model import Plant, PlantLine
 
 _TABLES = {

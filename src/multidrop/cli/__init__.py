@@ -90,8 +90,6 @@ def _guarded(command: str, words: list[str]) -> int:
     except BrokenPipeError:  # such as of `multidrop models | head`
         _abandon_output()
         return DONE
-    except Refused as refusal:
-        return _fail(refusal.for_command_line(), FAILED)
     except (ValueError, TypeError, Unsupported) as mistake:
         return _fail(str(mistake), MISTAKE)
     except OSError as failure:
@@ -119,7 +117,13 @@ def _run(command: str, words: list[str]) -> int:
         arguments = parser.parse_intermixed_args(words)  # an option may stand between positionals
     except SystemExit:  # --help was printed
         return DONE
-    return int(module.run(arguments))
+    try:
+        return int(module.run(arguments))
+    except Refused as refusal:
+        from multidrop.cli.support.plants import is_plant
+
+        in_plant = any(is_plant(first) for first in getattr(arguments, "words", [])[:1])
+        return _fail(refusal.for_command_line(in_plant=in_plant), FAILED)
 
 
 class _Parser(argparse.ArgumentParser):

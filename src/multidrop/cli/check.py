@@ -16,7 +16,8 @@ from multidrop.cli.support.values import wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
 from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Kept, Register
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Kept
 from multidrop.drive.verbs import MOVING
 from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model

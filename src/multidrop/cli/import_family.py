@@ -8,6 +8,7 @@ from pathlib import Path
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import print_text, warn
 from multidrop.importers import ImportedDevice, family_text, plant_text, read_devices
+from multidrop.printable import printable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="CSV, TSV, YAML (Home Assistant, ESPHome), TOML (Telegraf) or JSON",
     )
     parser.add_argument("--address", metavar="N", type=int, help="the device, where the file has several")
+    parser.add_argument("--title", metavar="NAME", help="and its hub, where several have that address")
     parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; printed without it")
     parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")
 
@@ -31,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         devices = read_devices(arguments.file)
     except ImportError as failure:
         raise ValueError(str(failure)) from failure
-    device = _chosen(devices, arguments.address)
+    device = _chosen(devices, arguments.address, arguments.title)
     text = family_text(device, arguments.file.name)
     plant = plant_text(device, arguments.out.name) if arguments.plant else ""
     if arguments.out:
@@ -47,9 +49,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _chosen(devices: list[ImportedDevice], address: int | None) -> ImportedDevice:
-    found = [device for device in devices if address is None or device.address == address]
+def _chosen(devices: list[ImportedDevice], address: int | None, title: str | None) -> ImportedDevice:
+    found = [
+        device for device in devices if address in (None, device.address) and title in (None, device.title)
+    ]
     if len(found) == 1:
         return found[0]
-    known = ", ".join(str(device.address) for device in devices)
-    raise ValueError(f"the file has devices at {known}: say which, such as --address {devices[0].address}")
+    first = devices[0]
+    if len({device.address for device in devices}) == len(devices):
+        known = ", ".join(str(device.address) for device in devices)
+        raise ValueError(f"the file has devices at {known}: say which, such as --address {first.address}")
+    known = ", ".join(printable(f"{device.address} of {device.title!r}"[:100]) for device in devices)
+    raise ValueError(
+        f"the file has devices at {known}: say which, such as --address {first.address} "
+        f"--title {printable(first.title[:60])!r}"
+    )

@@ -8,9 +8,10 @@ from contextlib import suppress
 from contextvars import copy_context
 
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Access, Kept, Register
+from multidrop.drive.register import Access, Register
 from multidrop.drive.script import Script, read, wait
 from multidrop.drive.state import Direction
+from multidrop.drive.table import Kept
 from multidrop.errors import BusError, Refused
 
 

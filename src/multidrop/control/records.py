@@ -17,7 +17,8 @@ from multidrop.control.outcome import Effect
 from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Kept, Register
+from multidrop.drive.register import Register
+from multidrop.drive.table import Kept
 from multidrop.errors import Advice
 from multidrop.transport import clock
 from multidrop.transport.line import Line
@@ -43,7 +44,9 @@ class WriteRecords:
         if why:
             way, advice = "write it less often, or take a setpoint that is kept in RAM", None
             if kept is Kept.UNKNOWN:
-                advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
+                declared = f'ram = ["{register.name}"]'
+                written = f"write {declared} below its [[line.drive]]"
+                advice = Advice(f"declare {declared}", f"add --ram {register.name}", written)
                 way = f"if you know that this drive keeps it in RAM, {advice.program}"
             raise refused(drive, register, f"{why}; {way}", advice)
 

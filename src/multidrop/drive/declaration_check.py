@@ -11,7 +11,8 @@ from typing import Any
 from multidrop.core import MOST_INVALID, NumberFormat
 from multidrop.drive.number_check import number_errors
 from multidrop.drive.number_format import ORDERS, WORDS
-from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier, Kept, Table
 
 LAST_ADDRESS = 0xFFFF
 _TEXTS = ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")

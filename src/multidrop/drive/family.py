@@ -15,10 +15,11 @@ from multidrop.core import MODBUS, Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.network import speaks_tcp
 from multidrop.drive.read_limits import limit_errors
-from multidrop.drive.register import Access, Kept, Register, Table
+from multidrop.drive.register import Access, Register
 from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.table import Kept, Table
 from multidrop.drive.text import Text, text_errors
 from multidrop.drive.timing import Settings
 from multidrop.drive.verbs import MOVING, Option, verb

@@ -1,4 +1,4 @@
-"""Check what a declaration says of a register's number: order, part, invalid counts."""
+"""Check what a declaration says of a register's number: order, part, invalid counts, counts to be written."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 from multidrop.core import NumberFormat
 from multidrop.drive.number_format import FLOATS, WORDS, width
-from multidrop.drive.register import Access, Carrier, Register
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier
 
 _PARTED = frozenset(
     {
@@ -21,6 +22,7 @@ _PARTED = frozenset(
 
 def number_errors(register: Register[Any]) -> Iterator[str]:
     """Yield a sentence for each error; number format and table fit each other already."""
+    yield from _written(register)
     if register.table.carrier is not Carrier.WORD:
         yield from _only_words(register)
         return
@@ -62,12 +64,46 @@ def _named(register: Register[Any]) -> Iterator[str]:
     """Find names that the register cannot show: a look for a fault would wait for it in vain."""
     if register.values is None or (register.part is not None and register.number_format not in _PARTED):
         return
-    least, most = register.coding.raw_span
-    if issubclass(register.values, IntFlag):  # its highest bit too, of a signed number
-        least, most = Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
+    flags = _is_flags(register)
+    least, most = _counts(register)
     for member in register.values:
-        if not least <= member.value <= most:
+        if least <= member.value <= most:
+            continue
+        if flags and member.value > 0 and member.value.bit_count() == 1:
+            last = register.coding.mask.bit_count() - 1
+            yield f"{member.name} is bit {member.value.bit_length() - 1}, and its number has bits 0 to {last}"
+        else:
             yield f"{member.name} = {member.value} is not within {least} to {most}, which its number can be"
+
+
+def _is_flags(register: Register[Any]) -> bool:
+    return register.values is not None and issubclass(register.values, IntFlag)
+
+
+def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
+    """Return the least and the greatest count, of bits without a sign."""
+    if _is_flags(register):  # its highest bit too, of a signed number
+        return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
+    return register.coding.raw_span
+
+
+def _written(register: Register[Any]) -> Iterator[str]:
+    """Find counts that no write can have: what they allow or forbid would be something else."""
+    least, most = _counts(register)
+    for key in ("harmless", "broadcast"):
+        for count in getattr(register, key) or ():
+            if not least <= count <= most:
+                yield f"{key} = {count} is not within {least} to {most}, which its number can be"
+    for mask in register.never_together:
+        if not _is_flags(register):
+            yield f"never_together = {mask:04X}H forbids nothing: only bits with names are checked; name them"
+        elif not 0 < mask <= most:
+            yield f"never_together = {mask:X}H is no mask of its bits"
+    if register.default is not None and register.values is None:
+        try:
+            register.encode(register.default)
+        except ValueError as mistake:
+            yield f"its default cannot be: {mistake}"
 
 
 def _invalid(register: Register[Any]) -> Iterator[str]:

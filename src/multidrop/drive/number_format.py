@@ -6,7 +6,8 @@ import math
 import struct
 from fractions import Fraction
 
-from multidrop.core import LOW_BYTE_FIRST, LOW_WORD_FIRST, NumberFormat
+from multidrop.core import LOW_BYTE_FIRST, LOW_WORD_FIRST
+from multidrop.core import NumberFormat as NumberFormat
 
 WORDS = {  # of 16 bits
     NumberFormat.U16: 1,

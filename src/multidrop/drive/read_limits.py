@@ -10,7 +10,8 @@ from functools import lru_cache
 from math import isfinite
 from typing import Any
 
-from multidrop.drive.register import Carrier, Register, Table
+from multidrop.drive.register import Register
+from multidrop.drive.table import Carrier, Table
 
 # The application protocol V1.1b3, 6.1 to 6.4; Delixi's own frames have room for one.
 STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}

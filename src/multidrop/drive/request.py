@@ -8,7 +8,8 @@ from typing import Any
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import FUNCTIONS, function_limit
-from multidrop.drive.register import Carrier, Register, Table
+from multidrop.drive.register import Register
+from multidrop.drive.table import Carrier, Table
 
 _WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # several at once
 _ADDRESSES = 0x10000  # of each of a drive's four tables (application protocol V1.1b3, 4.3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from multidrop.drive.register import HOLDING, Table
+from multidrop.drive.table import HOLDING, Table
 
 _LAST_ADDRESS = 0xFFFF
 MOST_WORDS = 125  # of one request

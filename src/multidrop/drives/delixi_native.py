@@ -6,9 +6,11 @@ from enum import IntEnum
 from typing import Any
 
 from multidrop.drive import Framing, NotDone, Refused
-from multidrop.drive.register import Carrier, Kept, Register, Table, command, reading, setting
+from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.verbs import verb
 from multidrop.drives.delixi_parameters import KEYPAD, DelixiParameters, parameter
 

@@ -6,20 +6,12 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import Advice, BusError, Drive, DriveRefused, Refused, Unconfirmed
-from multidrop.drive.register import (
-    COIL,
-    HOLDING,
-    INPUT,
-    Details,
-    NumberFormat,
-    Register,
-    command,
-    declaration,
-    reading,
-    setting,
-)
+from multidrop.drive.declare import Details, command, declaration, reading, setting
+from multidrop.drive.number_format import NumberFormat
+from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
+from multidrop.drive.table import COIL, HOLDING, INPUT
 from multidrop.drive.verbs import Option, verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
@@ -234,7 +226,11 @@ class ErmanERG220(Drive):
         dealt_with = self.option.get("acknowledged_fault", 0)
         if fault and fault not in (self._reset_fault, dealt_with):
             reset, declare = Advice.call("reset_fault"), Advice.declare("acknowledged_fault", int(fault))
-            way = Advice(f"{reset.program}, or {declare.program}", f"{reset.command} and {declare.command}")
+            way = Advice(
+                f"{reset.program}, or {declare.program}",
+                f"{reset.command} and {declare.command}",
+                f"{reset.command}, or {declare.plant}",
+            )
             shown = self.last_fault.format(fault)
             raise Refused(f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way)
         yield from self._setpoint_in_force()

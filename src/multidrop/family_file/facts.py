@@ -8,7 +8,7 @@ from typing import Any
 from multidrop.core import Framing
 from multidrop.drive.family import LONGEST_SILENCE
 from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
-from multidrop.drive.register import Table
+from multidrop.drive.table import Table
 from multidrop.drive.timing import Settings
 from multidrop.family_file.addresses import TABLES, Counting
 from multidrop.family_file.register_keys import WRITES, shown

@@ -244,16 +244,24 @@ def _is_number(value: Any) -> bool:
 def _add_verbs(
     namespace: dict[str, Any], document: Mapping[str, Any], declared: Declared, place: TomlPlace
 ) -> None:
-    """Add the verbs of the document. Mistakes that follow from those of a register are left out."""
+    """Add the verbs of the document. Mistakes that follow from those of a register or a look are left out."""
     if not document.keys() & set(VERB_SECTIONS):
         return
     own = TomlPlace(place.path)
     add_verbs(namespace, document, declared.registers, own)
-    broken = [re.escape(name) for name in declared.places.keys() - declared.registers.keys()]
-    follows = re.compile(rf"\b({'|'.join(broken)})\b" if broken else "(?!)")
+    looks = document.get("look", {})
+    follows = re.compile(
+        f"{_any_of(declared.places.keys() - declared.registers.keys())} is no register of this file"
+        rf"|{_any_of(looks if isinstance(looks, dict) else ())} is no look of \[look\]"
+    )
     place.config_errors.extend(mistake for mistake in own.config_errors if not follows.search(mistake))
     if own.config_errors and not place.config_errors:
         place.config_errors.extend(own.config_errors)
+
+
+def _any_of(names: Collection[str]) -> str:
+    """Return a pattern of one of these names, as a sentence shows it with or without quotes."""
+    return rf"(?<!\w)(?:{'|'.join(map(re.escape, names))})'?" if names else "(?!)"
 
 
 # ---- the class ----

@@ -11,7 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from multidrop.drive.register import Access, Kept, NumberFormat
+from multidrop.core import NumberFormat
+from multidrop.drive.register import Access
+from multidrop.drive.table import Kept
 from multidrop.family_file import cells
 from multidrop.family_file.addresses import TABLES
 

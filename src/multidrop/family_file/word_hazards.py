@@ -11,7 +11,8 @@ from itertools import chain
 from typing import Any
 
 from multidrop.core import NumberFormat
-from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.verbs import STOPPING
 from multidrop.family_file.declared import DeclaredVerbs
 from multidrop.family_file.hazards import STARTING

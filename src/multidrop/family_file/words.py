@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Any
 
-from multidrop.drive.register import Carrier, Register
+from multidrop.drive.register import Register
 from multidrop.drive.state import Direction
+from multidrop.drive.table import Carrier
 from multidrop.family_file.places import whole
 from multidrop.toml_check import TomlPlace
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from multidrop.drive.family import TAKEN_NAMES
 from multidrop.family_file.names import OF_ENUMERATIONS, unusable
+from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings
 
 WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
@@ -67,6 +68,8 @@ class ImportedDevice:
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
     readable: range = range(0)  # holding registers, of which any may be read across
+    together: int = 0  # registers that one request may read; 0 is not stated
+    line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:

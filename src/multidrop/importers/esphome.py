@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, names_of, unit_address
+from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, serial_settings
 from multidrop.importers.numbers import put_number, scaled
 
 _KINDS = ("sensor", "binary_sensor", "text_sensor", "switch", "number", "select", "output")
@@ -31,16 +32,26 @@ def read_esphome(document: Mapping[str, Any]) -> list[ImportedDevice]:
         str(controller.get("id")): unit_address(controller.get("address"))
         for controller in (listed if isinstance(listed, list) else [listed])
     }
+    line = _line(document.get("uart"))
     only = next(iter(addresses.values())) if len(addresses) == 1 else None
     found: dict[str, ImportedDevice] = {}
     for kind, entry in _entries(document):
         controller = str(entry.get("modbus_controller_id"))
         address = addresses.get(controller, only)
-        device = found.setdefault(controller, ImportedDevice(title, address))
+        device = found.setdefault(controller, ImportedDevice(title, address, line=line))
         name = str(entry.get("name") or entry.get("id") or "register")
         with device.entry(name):
             _add(device, kind, name, entry)
     return list(found.values())
+
+
+def _line(uart: Any) -> LineSettings:
+    """Return the settings of the node's only UART; where it has several, they are not known."""
+    ports = [uart] if isinstance(uart, dict) else uart
+    if not isinstance(ports, list) or len(ports) != 1 or not isinstance(ports[0], dict):
+        return UNKNOWN_LINE
+    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
+    return serial_settings({key: ports[0][theirs] for key, theirs in keys.items() if theirs in ports[0]})
 
 
 def _entries(document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -34,8 +34,10 @@ def family_text(device: ImportedDevice, source: str) -> str:
         f"title = {_value(device.title or source)}  # gap: maker and type",
         f"manual = {_value(f'not stated: imported from {source}')}  # gap: the document and its version",
         "counts_from = 0  # the addresses below are those that are sent",
-        "# gap: baudrates, formats, together: what the manual says of the line",
+        _line_gap(device),
     ]
+    if device.together:
+        lines.append(f"together = {{ holding = {device.together}, input = {device.together} }}")
     if device.readable:
         first, last = (sent_as(at, "holding") for at in (device.readable[0], device.readable[-1]))
         lines.append(f"gaps = {{ holding = [{first}, {last}] }}")
@@ -76,15 +78,22 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
         [
             "[[line]]",
             'name = "line-1"',
-            'port = "/dev/ttyUSB0"  # gap: the port',
+            f"port = {_value(device.line.port or '/dev/ttyUSB0')}  # gap: the port",
             "",
             "[[line.drive]]",
             f"name = {_value(f'device-{device.address}')}",
             f"model = {_value(family_file)}",
             f"address = {device.address}",
+            *(f"{key} = {_value(value)}" for key, value in device.line.drive_keys().items()),
             "",
         ]
     )
+
+
+def _line_gap(device: ImportedDevice) -> str:
+    wanted = "baudrates, formats" if device.together else "baudrates, formats, together"
+    there = f"; there it is {_comment(str(device.line))}" if str(device.line) else ""
+    return f"# gap: {wanted}: what the manual says of the line{there}"
 
 
 def entry_line(register: ImportedRegister) -> str:

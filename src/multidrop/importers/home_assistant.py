@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
+from multidrop.importers.line_settings import UNKNOWN_LINE, LineSettings, network_settings, serial_settings
 from multidrop.importers.numbers import count, number, number_format, put_number, scaled, words_of
 
 _SWAPS = {"byte": "BADC", "word": "CDAB", "word_byte": "DCBA", "none": "", "": ""}
@@ -19,13 +20,14 @@ MOST_REPEATED = 1000  # of virtual_count
 
 
 def read_home_assistant(document: Any) -> list[ImportedDevice]:
-    """Return a device for each slave of a document."""
+    """Return a device for each slave of each hub of a document."""
     hubs = document.get("modbus") or [] if isinstance(document, dict) else document
-    found: dict[int | None, ImportedDevice] = {}
-    for hub in hubs if isinstance(hubs, list) else [hubs]:
+    found: dict[tuple[int, int | None], ImportedDevice] = {}
+    for which, hub in enumerate(hubs if isinstance(hubs, list) else [hubs]):
+        line, title = _line(hub), str(hub.get("name", ""))
         for kind, entry in _entries(hub):
             slave = unit_address(entry.get("slave", entry.get("device_address")))
-            device = found.setdefault(slave, ImportedDevice(str(hub.get("name", "")), slave))
+            device = found.setdefault((which, slave), ImportedDevice(title, slave, line=line))
             name = str(entry.get("name", "register"))
             with device.entry(name):
                 if kind in _NOT_READ:
@@ -33,6 +35,18 @@ def read_home_assistant(document: Any) -> list[ImportedDevice]:
                 else:
                     _add(device, kind, name, entry)
     return list(found.values())
+
+
+def _line(hub: Mapping[str, Any]) -> LineSettings:
+    """Return the line of a hub: of type serial, tcp, or rtuovertcp."""
+    kind = str(hub.get("type", ""))
+    if kind in ("tcp", "rtuovertcp"):
+        return network_settings(hub.get("host"), hub.get("port", 502), is_rtu=kind == "rtuovertcp")
+    if kind != "serial":
+        return UNKNOWN_LINE
+    keys = {"baudrate": "baudrate", "bits": "bytesize", "parity": "parity", "stop": "stopbits"}
+    given = {key: hub[theirs] for key, theirs in keys.items() if theirs in hub}
+    return serial_settings(given, port=hub.get("port", ""), framing=hub.get("method", "rtu"))
 
 
 def _entries(hub: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

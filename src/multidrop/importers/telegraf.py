@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
+from urllib.parse import urlsplit
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
+from multidrop.importers.line_settings import LineSettings, network_settings, serial_settings
 from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, words_of
 
 _STYLE = {
@@ -23,15 +25,27 @@ _ORDERS = {  # for any width: the plugin takes ABCD's four for 16 and 64 bits as
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each slave id."""
-    found: dict[int | None, ImportedDevice] = {}
+    """Return a device for each slave id of each line."""
+    found: dict[tuple[LineSettings, int | None], ImportedDevice] = {}
     for plugin in document.get("inputs", {}).get("modbus", []):
+        line, title = _line(plugin), str(plugin.get("name", ""))
         for slave, table, order, field in _fields(plugin):
             address = unit_address(slave)
-            device = found.setdefault(address, ImportedDevice(str(plugin.get("name", "")), address))
+            device = found.setdefault((line, address), ImportedDevice(title, address, line=line))
             with device.entry(str(field.get("name", "register"))):
                 _add(device, table, order, field)
     return list(found.values())
+
+
+def _line(plugin: Mapping[str, Any]) -> LineSettings:
+    """Return the line of a plugin: a controller of file:///dev/ttyUSB0 or tcp://host:port, and its mode."""
+    controller, mode = str(plugin.get("controller", "")), str(plugin.get("transmission_mode", ""))
+    if controller.startswith("tcp://"):
+        parts = urlsplit(controller)
+        return network_settings(parts.hostname, parts.port or 502, is_rtu=mode.lower() == "rtuovertcp")
+    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
+    given = {key: plugin[theirs] for key, theirs in keys.items() if theirs in plugin}
+    return serial_settings(given, port=controller.removeprefix("file://"), framing=mode)
 
 
 def _fields(plugin: Mapping[str, Any]) -> Iterator[tuple[Any, str, str, Mapping[str, Any]]]:
@@ -91,6 +105,10 @@ def _number(
         register.lacks = f"its order of bytes {order[:40]}"
     elif not order and words_of(found) > 1:
         register.gaps.append("the order of its words is not stated")
+    if len(addresses) > 1 and addresses != list(range(addresses[0], addresses[0] + words_of(found))):
+        listed = ", ".join(str(each)[:10] for each in addresses[:5])
+        device.lose(register.name, f"its addresses {listed} are not those of a {kind[:40]}, side by side")
+        return False
     put_number(register.details, found, _ORDERS.get(order, ""))
     scaled(register.details, field.get("scale", 1))
     return True

@@ -12,6 +12,7 @@ from multidrop.importers.numbers import count, put_number, scaled
 # Comments, and a comma before the end of a list: what JSON does not have. Strings are left as they are; what
 # has no end goes to the text's end, so that each character is looked at once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
+MOST_READ = 125
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -40,6 +41,8 @@ def read_wb(document: Any) -> list[ImportedDevice]:
     if not str(template.get("protocol", "modbus")).startswith("modbus"):
         raise ValueError(f"is a template of another protocol than Modbus: {template['protocol']!r}")
     device = ImportedDevice(str(document.get("title", template.get("name", ""))))
+    most = template.get("max_read_registers")
+    device.together = most if isinstance(most, int) and 1 <= most <= MOST_READ else 0
     for name, entry in _entries(template):
         with device.entry(name):
             _add(device, name, entry)

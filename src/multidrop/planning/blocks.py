@@ -12,8 +12,9 @@ from typing import Any
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import may_be_crossed, read_limit, read_span
-from multidrop.drive.register import Carrier, Register, Table
+from multidrop.drive.register import Register
 from multidrop.drive.request import read_request
+from multidrop.drive.table import Carrier, Table
 from multidrop.drive.text import Text
 from multidrop.planning.bus_time import characters, silence
 

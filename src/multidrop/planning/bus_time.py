@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Carrier
+from multidrop.drive.table import Carrier
 
 if TYPE_CHECKING:
     from multidrop.planning.blocks import Block

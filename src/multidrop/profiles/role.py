@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 from typing import Any, cast
 
-from multidrop.drive.register import Access, Carrier, NumberFormat, Register
+from multidrop.drive.number_format import NumberFormat
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier
 
 _CODED = "what the profile itself says; leave it out"
 

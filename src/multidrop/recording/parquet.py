@@ -107,10 +107,10 @@ class ParquetReader(RecordingReader):
 
         rows = 0
         with self._open() as file:
-            for group in range(file.num_row_groups):
-                for batch in self._read_group(file, group, rows):
-                    yield RecordedRows(c_array(batch))
-                    rows += len(batch)
+            batches = file.iter_batches(GROUP_ROWS)  # not by groups: a damaged one may claim any size
+            while (batch := self._next(batches, rows)) is not None:
+                yield RecordedRows(c_array(batch))
+                rows += len(batch)
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
@@ -121,16 +121,19 @@ class ParquetReader(RecordingReader):
                 raise self._not_a_recording(f"it is no whole Parquet file; {UNREADABLE}") from failure
             yield opened
 
-    def _read_group(self, file: Any, group: int, rows: int) -> Any:
+    def _next(self, batches: Iterator[Any], rows: int) -> Any:
+        """Return the next batch, None after the last."""
         try:
-            table = file.read_row_group(group).combine_chunks()
-            table.validate(full=True)
+            batch = next(batches, None)
+            if batch is None:
+                return None
+            batch.validate(full=True)
         except (OSError, ValueError, self._arrow.ArrowException) as failure:
             raise self._damaged(rows, "what follows cannot be unpacked") from failure
         for field in self._arrow.schema(schema()):
-            if not field.nullable and table[field.name].null_count:
+            if not field.nullable and batch[field.name].null_count:
                 raise self._damaged(rows, f"there is a row without a {field.name}")
-        return table.replace_schema_metadata().to_batches()
+        return batch.replace_schema_metadata()
 
 
 writer, reader = ParquetWriter, ParquetReader

@@ -6,7 +6,8 @@ import math
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.register import Carrier, Register, Table
+from multidrop.drive.register import Register
+from multidrop.drive.table import Carrier, Table
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.memory import MemoryCell
 

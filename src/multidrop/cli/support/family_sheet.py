@@ -11,7 +11,8 @@ from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.read_limits import read_limit, stated_limit
-from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import Access, Register
+from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS, Option
 from multidrop.drives.registry import is_users_own

@@ -1,0 +1,69 @@
+"""Settings of the line that another program's table states: port, baud rate and format of a byte."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from multidrop.drive.family import Drive
+
+_PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
+# What a family takes that says nothing of its formats; an ASCII frame may have 7 bits.
+_FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
+
+
+@dataclass(frozen=True)
+class LineSettings:
+    """What is stated of a line; an empty port, a baud rate of 0 and an empty format are not known."""
+
+    port: str = ""
+    baudrate: int = 0
+    format: str = ""
+    framing: str = "rtu"
+
+    def drive_keys(self) -> dict[str, Any]:
+        """Return the keys of a drive in a plant file; a network's line has none."""
+        if "://" in self.port:
+            return {}
+        found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
+        if self.baudrate in Drive.baudrates:
+            found["baudrate"] = self.baudrate
+        if self.format in _FORMATS[self.framing]:
+            found["format"] = self.format
+        return found
+
+    def __str__(self) -> str:
+        stated = [str(self.baudrate)] * bool(self.baudrate) + [self.format] * bool(self.format)
+        return "" if "://" in self.port else ", ".join(stated)
+
+
+UNKNOWN_LINE = LineSettings()
+
+
+def serial_settings(given: Mapping[str, Any], *, port: Any = "", framing: Any = "rtu") -> LineSettings:
+    """Return a serial line's settings of `baudrate`, `bits`, `parity` and `stop`, each where it is stated."""
+    parity = _PARITIES.get(str(given.get("parity", "")).lower(), "")
+    bits, stop = _whole(given.get("bits")) or 8, _whole(given.get("stop")) or 1
+    return LineSettings(
+        str(port)[:200] if isinstance(port, str) else "",
+        _whole(given.get("baudrate")),
+        f"{bits}{parity}{stop}" if parity else "",
+        "ascii" if str(framing).lower() == "ascii" else "rtu",
+    )
+
+
+def network_settings(host: Any, port: Any, *, is_rtu: bool = False) -> LineSettings:
+    """Return the line of a host: Modbus TCP, or RTU frames over a socket."""
+    number = _whole(port)
+    if not isinstance(host, str) or not host or not 0 < number < 1 << 16:
+        return UNKNOWN_LINE
+    host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    return LineSettings(f"{'socket' if is_rtu else 'tcp'}://{host[:200]}:{number}")
+
+
+def _whole(given: Any) -> int:
+    """Return a whole number that may be text; 0 for what is none."""
+    if isinstance(given, str) and given.strip().isdecimal():
+        given = int(given.strip()[:9])
+    return given if isinstance(given, int) and not isinstance(given, bool) and 0 < given < 10**9 else 0
