@@ -514,7 +514,7 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
 
 
 def test_drives_that_join_are_asked_in_the_best_order() -> None:
-    """As if the line had been polled with them from the start: settings are changed as seldom."""
+    """The order is that of a line polled with them from the start: settings are changed as seldom."""
 
     def drives() -> list[PolledDrive]:
         rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}
