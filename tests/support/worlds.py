@@ -34,6 +34,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
+from multidrop.sim import wire as wire_of_drives
 from multidrop.transport import clock
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
@@ -54,6 +55,7 @@ class WorldWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
 
     ids = TransactionIds.MATCH  # of its gateway, on tcp://
+    chunk = wire_of_drives.CHUNK  # s; characters that end within it come together
 
     def open(self) -> None:
         path = "world"
@@ -240,6 +242,7 @@ class World:
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "sleep", lambda seconds: self._pass_until(self.now + round(seconds * S)))
         patch.setattr(poller, "RowQueue", self._row_queue)
+        patch.setattr(wire_of_drives, "CHUNK", wire.chunk)
         wire.open()
         declared = line(wire.where if speaks_tcp(wire.where) else "world", *drives)
         self.poller = Poller(plant(replace(declared, ids=wire.ids)))
@@ -294,7 +297,8 @@ class World:
         try:
             with self._turn:
                 self._is_waiting = True
-                self._turn.notify_all()
+                if self.now >= self._limit:
+                    self._turn.notify_all()
                 while self.now >= self._limit and not self._leaving:
                     self._turn.wait()
                 self._is_waiting = False
