@@ -1,5 +1,6 @@
 """Rules for all tests: none of them writes into the ledger of the user who runs them."""
 
+import gc
 import os
 import signal
 import sys
@@ -74,6 +75,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         begins = slow[worker::workers]
         dealt += [*begins, *islice(others, max(0, share - len(begins)))]
     items[:] = [*dealt, *others]
+
+
+def pytest_collection_finish() -> None:
+    """Spare every collection of garbage, and every child of a fork, all that pytest keeps to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -25,7 +25,6 @@ class PathWire(WorldWire):
     """A hostile wire at the far end of a path that delays what the drives say."""
 
     delay: Delay
-    chunk = 1.0  # s: the path carries a reply whole
 
     def __init__(self, *arguments: Any, **details: Any) -> None:
         super().__init__(*arguments, **details)

@@ -55,7 +55,7 @@ class WorldWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
 
     ids = TransactionIds.MATCH  # of its gateway, on tcp://
-    chunk = wire_of_drives.CHUNK  # s; characters that end within it come together
+    chunk = 1.0  # s; characters that end within it come together: a reply is heard when it is whole
 
     def open(self) -> None:
         path = "world"
