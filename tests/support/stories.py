@@ -20,7 +20,6 @@ from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, simulated
-from multidrop.sim.wire import CHUNK
 
 S = 1_000_000_000
 REGISTERS = 5  # of each drive
@@ -34,7 +33,7 @@ START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 
 class PieceWire(WorldWire):
     """A hostile wire whose bytes come as they do from a serial port, a few at a time."""
 
-    chunk = CHUNK
+    chunk = 4e-3
 
 
 class Story:
