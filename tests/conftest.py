@@ -1,15 +1,19 @@
 """Rules for all tests: none of them writes into the ledger of the user who runs them."""
 
+import gc
 import os
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from importlib import import_module
 from itertools import count, islice
 from pathlib import Path
-from subprocess import DEVNULL, Popen
+from typing import IO
 
 import pytest
 from commands import Run
+from examples import examples
 from hypothesis import HealthCheck, settings
 
 from multidrop.cli import main
@@ -20,7 +24,9 @@ TESTS = Path(__file__).parent
 PATIENCE = 60.0  # s
 
 # A busy machine is slow, and nothing is wrong with it.
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "any machine", max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("any machine")
 
 # A shell's background job ignores SIGINT, and so would the programs that it tests.
@@ -28,8 +34,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Three times as many as there are processors, because half of the tests wait for a line; 3 to 12."""
-    return min(3 * len(os.sched_getaffinity(0)), 12)
+    """Five for two processors: many tests wait for a line, but each worker collects all; 2 to 12."""
+    return min(5 * len(os.sched_getaffinity(0)) // 2, 12)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,13 +43,24 @@ def pytest_configure(config: pytest.Config) -> None:
     is_worker = hasattr(config, "workerinput")
     if is_worker or not config.getoption("numprocesses", None) or sys.dont_write_bytecode:
         return
-    rooms = [room for room in sorted(TESTS.iterdir()) if [*room.glob("test_*.py")]]
-    if any((room / "__pycache__").exists() for room in rooms):
+    tests = sorted(TESTS.glob("*/test_*.py"))
+    if any((test.parent / "__pycache__").exists() for test in tests):
         return
-    collect = [sys.executable, "-m", "pytest", "-qq", "-n", "0", "--collect-only"]
-    halves = [Popen([*collect, *part], stdout=DEVNULL, stderr=DEVNULL) for part in (rooms[::2], rooms[1::2])]
-    for half in halves:
-        half.wait()
+    halves = [_compiling(half) for half in (tests[::2], tests[1::2])]
+    for child in halves:
+        os.waitpid(child, 0)
+
+
+def _compiling(tests: list[Path]) -> int:
+    """Import them in a child: pytest rewrites their assertions then, and keeps what it compiled."""
+    child = os.fork()
+    if child:
+        return child
+    for test in tests:
+        sys.path.insert(0, str(test.parent))
+        with suppress(BaseException):  # the workers tell what is wrong with it
+            import_module(test.stem)
+    os._exit(0)
 
 
 @pytest.hookimpl(trylast=True)  # when what is not wanted has been left out
@@ -58,6 +75,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         begins = slow[worker::workers]
         dealt += [*begins, *islice(others, max(0, share - len(begins)))]
     items[:] = [*dealt, *others]
+
+
+def pytest_collection_finish() -> None:
+    """Spare every collection of garbage, and every child of a fork, all that pytest keeps to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -88,6 +111,16 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
         return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
 
     monkeypatch.setattr(exchanges, "Peer", peer)
+
+
+@pytest.fixture
+def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out what takes the time of a picture: its pixels; for tests of what is said beside it."""
+
+    def savefig(figure: object, file: IO[bytes], **options: object) -> None:
+        file.write(b"\x89PNG\r\n\x1a\n")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)
 
 
 @pytest.fixture(scope="session")

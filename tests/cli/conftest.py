@@ -1,4 +1,4 @@
-"""A plant whose line is simulated by a process of its own."""
+"""A plant whose line is simulated at the pace of a real one."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import plant_file, running
+from commands import plant_file
+from toy import Toy
+
+from multidrop.sim import Simulator, Wire, simulated, wire
 
 
 @pytest.fixture
-def plant(tmp_path: Path) -> Iterator[Path]:
-    """A plant file whose port is there, with one of its two drives."""
-    with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports", "--unpaced") as (_, out):
-        assert out.readline() == f"ready hall-1 {tmp_path}/ports/hall-1\n"
+def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A plant file whose port is there, with one of its two drives; a busy machine cuts no reply short."""
+    monkeypatch.setattr(wire, "CHUNK", 1.0)
+    port = tmp_path / "ports" / "hall-1"
+    port.parent.mkdir()
+    with Simulator([Wire([simulated(Toy(1))], port=str(port))]):
         yield plant_file(tmp_path, dead=True)

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from commands import TOY, Run, multidrop
+from commands import TOY, Run
 
 LINE = '[[line]]\nname = "{}"\nport = "/dev/there-is-no-such-port-{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
@@ -167,9 +167,8 @@ def test_a_file_that_is_not_there_is_status_2(run: Run, tmp_path: Path) -> None:
 
 
 def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
-    done = multidrop("poll", plant, "--seconds", 1, "--json")
-    found = json.loads(done.stdout)["lines"]["hall-1"]["comparison"]
-    summary = json.loads(done.stdout)["lines"]["hall-1"]
+    summary = json.loads(run("poll", plant, "--seconds", 1, "--json")[1])["lines"]["hall-1"]
+    found = summary["comparison"]
     planned = json.loads(run("plan", plant, "--json")[1])["lines"]["hall-1"]
     assert list(found) == ["predicted", "predicted_with_measured_delays", "measured"]
     assert found["predicted"]["cycle_ms"] == planned["cycle_ms"]
@@ -183,8 +182,8 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
     assert found["measured"]["switching_ms"] == summary["switching_ms"] > 0
 
 
-def test_poll_shows_them_to_a_person(plant: Path) -> None:
-    lines = multidrop("poll", plant, "--seconds", 1).stdout.splitlines()
+def test_poll_shows_them_to_a_person(run: Run, plant: Path) -> None:
+    lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     heading = next(
         at for at, line in enumerate(lines) if line.split() == ["PREDICTED", "BY", "DELAYS", "MEASURED"]
     )
@@ -194,15 +193,14 @@ def test_poll_shows_them_to_a_person(plant: Path) -> None:
     assert max(map(len, lines)) <= 80
 
 
-def test_what_switching_took_is_told_where_drives_differ(plant: Path) -> None:
+def test_what_switching_took_is_told_where_drives_differ(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
-    told = multidrop("poll", plant, "--seconds", 1).stdout
+    told = run("poll", plant, "--seconds", 1)[1]
     assert re.search(r"\n  and with the \d+\.\d\d ms that the port needed to change its settings\n", told)
 
 
-def test_where_drives_wait_to_be_due_no_cycle_is_measured(plant: Path) -> None:
+def test_where_drives_wait_to_be_due_no_cycle_is_measured(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
-    done = multidrop("poll", plant, "--seconds", 1, "--json")
-    found = json.loads(done.stdout)["lines"]["hall-1"]["comparison"]
+    found = json.loads(run("poll", plant, "--seconds", 1, "--json")[1])["lines"]["hall-1"]["comparison"]
     assert found["measured"]["cycle_ms"] is None
     assert found["predicted"]["exchanges_per_second"]["pump-1"] == 5

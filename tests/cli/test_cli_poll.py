@@ -61,11 +61,11 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
 LATE_OR_SILENT = {str(it) for it in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
 
 
-def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> None:
+def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
-    done = multidrop("poll", plant, "--seconds", 1.5, "--out", out, "--json")
-    assert (done.returncode, done.stderr) == (0, "")
-    summary = json.loads(done.stdout)
+    status, told, err = run("poll", plant, "--seconds", 1.5, "--out", out, "--json")
+    assert (status, err) == (0, "")
+    summary = json.loads(told)
     rows = recorded(out)
     samples = [row for row in rows if row.value is not None]
     assert {row.drive for row in samples} == {"pump-1"}
@@ -80,9 +80,9 @@ def test_poll_records_what_its_summary_counts(plant: Path, tmp_path: Path) -> No
     assert summary["lines"]["hall-1"]["utilisation"] > 0
 
 
-def test_a_recording_says_what_its_registers_are(plant: Path, tmp_path: Path) -> None:
+def test_a_recording_says_what_its_registers_are(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
-    multidrop("poll", plant, "--seconds", 0.5, "--out", out)
+    run("poll", plant, "--seconds", 0.1, "--out", out)
     drive = open_reader(out).metadata["drives"]["pump-1"]
     assert (drive["line"], drive["model"], drive["address"], drive["settings"]) == (
         "hall-1",
@@ -121,9 +121,8 @@ def test_poll_ended_by_a_signal_keeps_what_it_recorded(plant: Path, tmp_path: Pa
     assert len(recorded(out)) == json.loads(text)["samples"] + json.loads(text)["misses"]
 
 
-def test_poll_tells_a_person_the_same(plant: Path) -> None:
-    done = multidrop("poll", plant, "--seconds", 1)
-    lines = done.stdout.splitlines()
+def test_poll_tells_a_person_the_same(run: Run, plant: Path) -> None:
+    lines = run("poll", plant, "--seconds", 1)[1].splitlines()
     assert lines[0].startswith("hall-1: ")
     assert lines[1].split() == ["DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES"]
     living, dead = (next(line for line in lines if line.split()[0] == name) for name in ("pump-1", "pump-9"))
@@ -133,11 +132,11 @@ def test_poll_tells_a_person_the_same(plant: Path) -> None:
     assert max(map(len, lines)) <= 80
 
 
-def test_nothing_read_at_all_is_status_1(plant: Path) -> None:
+def test_nothing_read_at_all_is_status_1(run: Run, plant: Path) -> None:
     text = plant.read_text().replace("address = 1\n", "address = 8\n")
     plant.write_text(text)
-    done = multidrop("poll", plant, "--seconds", 1, "--json")
-    assert (done.returncode, json.loads(done.stdout)["samples"]) == (1, 0)
+    status, out, _ = run("poll", plant, "--seconds", 0.5, "--json")
+    assert (status, json.loads(out)["samples"]) == (1, 0)
 
 
 def test_a_plant_file_s_mistakes_are_all_told(run: Run, tmp_path: Path) -> None:
@@ -176,10 +175,10 @@ def test_a_recording_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     ],
 )
 def test_a_place_that_takes_no_recording_is_a_sentence(
-    plant: Path, tmp_path: Path, out: str, status: int, sentence: str
+    run: Run, plant: Path, tmp_path: Path, out: str, status: int, sentence: str
 ) -> None:
-    done = multidrop("poll", plant, "--seconds", 1, "--out", tmp_path / out)
-    assert (done.returncode, done.stderr) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
+    done, _, err = run("poll", plant, "--seconds", 1, "--out", tmp_path / out)
+    assert (done, err) == (status, f"multidrop: {tmp_path / out}: {sentence}\n")
 
 
 @pytest.mark.uncounted
@@ -187,7 +186,7 @@ def test_a_full_disk_ends_polling_with_a_sentence_and_keeps_the_rows_before(
     plant: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.arrows"
-    done = multidrop("poll", plant, "--seconds", 30, "--out", out, most_bytes=20_000)
+    done = multidrop("poll", plant, "--seconds", 30, "--out", out, most_bytes=12_000)
     rows = len(recorded(out))
     assert rows > 0
     assert done.returncode == 1
@@ -205,14 +204,14 @@ def test_a_port_that_is_not_there_is_a_sentence(run: Run, tmp_path: Path) -> Non
 
 
 def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
-    multidrop("poll", plant, "--seconds", 1, "--out", tmp_path / "a.arrows")
+    run("poll", plant, "--seconds", 1, "--out", tmp_path / "a.arrows")
     rows = recorded(tmp_path / "a.arrows")
     status, out, _ = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (0, f"{len(rows)} rows in {tmp_path}/b.csv\n")
     assert recorded(tmp_path / "b.csv") == rows
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"

@@ -39,7 +39,7 @@ def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorD
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     heard = Heard(sim)
-    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path, expiry=60) as bus:
         yield bus.attach(drive), sim, heard
 
 

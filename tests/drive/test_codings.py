@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from batches import UTC_0, completion
 from completions import add_rows
+from examples import examples
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
@@ -125,7 +126,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
     )
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(numbers())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 1))
 @example((NumberFormat.I64, "DCBA", 0.001, 0, -(2**63)))
@@ -158,7 +159,7 @@ def test_a_number_of_any_format_order_step_and_offset(
     assert number_format in (NumberFormat.U64, NumberFormat.I64) or value == row.value
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(numbers().filter(lambda case: case[0] in WRITTEN and case[0] not in FLOATS))
 @example((NumberFormat.U64, "BADC", 1, 0, 2**64 - 1))
 def test_a_whole_number_is_written_held_and_read_back(
@@ -185,7 +186,9 @@ def test_a_whole_number_is_written_held_and_read_back(
 
 @pytest.mark.parametrize("number_format", FLOATS)
 @pytest.mark.parametrize("order", ["ABCD", "CDAB", "BADC", "DCBA"])
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_a_float_is_written_held_and_read_back(
     number_format: NumberFormat, order: str, data: st.DataObject
@@ -223,7 +226,7 @@ def bit_fields(draw: st.DrawFn) -> Bits:
     return Bits(number_format, draw(orders(number_format)), (low, high), draw(st.integers(0, 2**bits - 1)))
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(bit_fields())
 @example(Bits(NumberFormat.U64, "CDAB", (0, 63), 2**64 - 1))
 @example(Bits(NumberFormat.I16, "BA", (15, 15), 0x8000))
@@ -276,7 +279,7 @@ def test_a_field_may_have_names() -> None:
 # ---- no value ----
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(numbers().filter(lambda case: case[0] not in DIGITS), st.data())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 2), None)
 def test_an_invalid_count_is_no_value_and_its_neighbour_is_one(
@@ -355,7 +358,7 @@ def test_a_register_without_a_value_is_told_by_the_bus(monkeypatch: pytest.Monke
 # ---- a scale register ----
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.sampled_from([NumberFormat.U16, NumberFormat.I16, NumberFormat.U32, NumberFormat.I32]),
     st.sampled_from([1, 0.1, -1]),

@@ -7,6 +7,7 @@ import struct
 from typing import Any
 
 import pytest
+from examples import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
@@ -97,7 +98,7 @@ def attached() -> Any:
 
 
 @formats
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(data=st.data())
 def test_a_number_is_written_held_and_read_back(
     attached: Any, register: Register[float], data: st.DataObject
@@ -111,7 +112,7 @@ def test_a_number_is_written_held_and_read_back(
     assert hall.bus.read(meter, register) == number
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(st.floats(-3e38, 3e38))
 @example(12.1)
 @example(16_777_217)

@@ -103,6 +103,7 @@ def test_values_are_those_of_a_class(plant: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_unpainted")
 def test_a_plant_of_two_files_from_the_wire_to_the_report(
     run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,7 +113,9 @@ def test_a_plant_of_two_files_from_the_wire_to_the_report(
     drives[0]["voltage"], drives[1]["pressure"] = 230.5, 1.25
     with Simulator([Wire(drives, port=str(plant.parent / "hall"), unpaced=True)]):
         assert run("plan", plant)[0] == 0
-        assert run("poll", plant, "--seconds", "2", "--out", "run.arrows", "--capture", "run.pcapng")[0] == 0
+        assert (
+            run("poll", plant, "--seconds", "0.5", "--out", "run.arrows", "--capture", "run.pcapng")[0] == 0
+        )
         found = json.loads(run("scan", "hall", "--model", "families/pump.toml", "--addresses", "1-2",
                                "--baudrates", "9600", "--formats", "8N1", "--json",
                                "--out", "found.toml")[1])  # fmt: skip

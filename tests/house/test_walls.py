@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
@@ -40,6 +41,9 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/audit_log.py",
     "control/exit_hook.py",
 }
+
+
+IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 
 
 def room(path: Path) -> str:
@@ -112,7 +116,8 @@ def test_imports_for_types_alone_point_downwards_too() -> None:
 def test_no_test_imports_another_one() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
-    assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in tests}) == {}
+    maybe = [path for path in tests if IMPORT_OF_A_TEST.search(path.read_text("utf-8"))]  # few are parsed
+    assert offenders({str(path.relative_to(ROOT)): _imported(path) & names for path in maybe}) == {}
 
 
 def _imported(path: Path) -> set[str]:

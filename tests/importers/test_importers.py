@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from examples import usually
 from imported import ESPHOME, HOME, IOBROKER, MODPOLL, NEURON, OWN, SUNSPEC, TELEGRAF, WB
 
 from multidrop import load_family
@@ -251,10 +252,12 @@ def bomb(levels: int) -> str:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (bomb(9), "has more than 50000 entries, aliases counted as what they stand for"),
+        *usually(
+            (bomb(9), "has more than 50000 entries, aliases counted as what they stand for"),
+            ("modbus: [" + "1," * 60_000 + "]", "has more than 50000 entries"),
+        ),
         ("a: &a [*a]\nmodbus: *a\n", "has more than 50000 entries"),
-        ("modbus: [" + "1," * 60_000 + "]", "has more than 50000 entries"),
-        ("[" * 50_000, "is YAML that is nested too deeply"),
+        ("[" * 5_000, "is YAML that is nested too deeply"),
         ("a" * 1_000_001, "has more than 1000000 characters"),
         ("modbus: !!python/object/apply:os.system [true]", "is not YAML"),
         ("modbus: [}", "is not YAML"),

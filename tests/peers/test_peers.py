@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from lines import patient
 from peers import build_with_libmodbus, require_module
 from ptys import linked_ptys
 
@@ -52,6 +53,7 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str
             process.kill()
 
 
+@patient
 def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
@@ -67,6 +69,7 @@ def test_registers_and_coils_are_read(server: tuple[str, str]) -> None:
         }
 
 
+@patient
 def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
     """Registers and coils that nothing declares hold what the servers' own sources say."""
     port, framing = server
@@ -81,6 +84,7 @@ def test_any_address_may_be_asked_for(server: tuple[str, str]) -> None:
         assert refusal.value.code == 2
 
 
+@patient
 def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
@@ -89,6 +93,7 @@ def test_what_is_written_is_what_is_read_back(server: tuple[str, str]) -> None:
             assert bus.write(device, device.register(name), value) == value
 
 
+@patient
 def test_an_exception_is_the_device_s_refusal(server: tuple[str, str]) -> None:
     port, framing = server
     with Bus(port) as bus:
@@ -106,6 +111,7 @@ def test_another_address_is_silence(server: tuple[str, str]) -> None:
             bus.read(device, device.register("current"))
 
 
+@patient
 def test_the_command_line_reads_and_writes_it_too(
     server: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:

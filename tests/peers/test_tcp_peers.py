@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from lines import HOST_LATE, rows_of, until
+from lines import HOST_LATE, patient, rows_of, until
 from peers import build_with_libmodbus, require_module, require_program
 
 from multidrop.bus import Bus
@@ -57,12 +57,14 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
         process.kill()
 
 
+@patient
 def test_registers_and_coils_are_read(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(Device, ADDRESS)
         assert bus.read_many(device, Device.registers.values()) == HELD
 
 
+@patient
 def test_what_is_written_is_what_is_read_back(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(Device, ADDRESS)
@@ -70,6 +72,7 @@ def test_what_is_written_is_what_is_read_back(server: str) -> None:
             assert bus.write(device, device.register(name), value) == value
 
 
+@patient
 def test_an_exception_is_the_device_s_refusal(server: str) -> None:
     with Bus(server) as bus:
         device = bus.attach(find_model(DEVICE.replace("Device", "Mistaken")), ADDRESS)
@@ -87,11 +90,12 @@ def test_all_values_of_a_poll_are_the_server_s(server: str, tmp_path: Path) -> N
     )
     rows = []
     with Poller(load_plant(path)) as poller:
-        until(lambda: rows.extend(rows_of(poller)) or len(rows) > 2000)
+        until(lambda: rows.extend(rows_of(poller)) or len(rows) > 500)
     assert {row.status for row in rows} <= {"ok"} | HOST_LATE
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 
+@patient
 def test_the_command_line_reads_and_writes_it_too(server: str, capsys: pytest.CaptureFixture[str]) -> None:
     where = [server, DEVICE, str(ADDRESS)]
     assert main(["write", *where, "frequency", "31.4", "--yes"]) == 0

@@ -470,7 +470,7 @@ def test_no_drift_no_burst_whatever_stalls(
             assert it.due_ns // it.period_ns == len(taken) + it.skipped  # and none unaccounted for
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(KINDS)
 def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None, int, int]]) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
@@ -484,7 +484,7 @@ def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None,
     assert not turns or max(turns) - min(turns) <= 1
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 @given(KINDS)
 def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> None:
     """All jobs fit into the shortest period together: none is ever left out."""

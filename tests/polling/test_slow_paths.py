@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from examples import usually
+from examples import every_other, usually
 from lines import proof
 from motors import MAKE, Heard
 from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
@@ -27,33 +27,30 @@ from multidrop.transport import clock
 pytestmark = pytest.mark.story
 
 PATHS = [
-    pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
+    (path, seconds)
     for path, delays in (
         (constant, (0.0, 0.1, 0.3, 0.45, 0.6, 1.5, 4.0, 10.0)),
         (jittering, (0.3, 0.6, 10.0)),
     )
     for seconds in delays
 ]
-FEW = [
-    pytest.param(name, marks=() if name in ("innovert-ibd rtu", "yd1000 rtu") else pytest.mark.long)
-    for name in LINES
-]
-STALLS = usually(0.9, 0.1, 0.3, 3.0, 15.0, 60.0)
+FRAMINGS = ("innovert-ibd rtu", "innovert-ibd ascii", "delixi-native delixi")
+STORIES = every_other(LINES, PATHS, [(name, (constant, 0.6)) for name in FRAMINGS])
+STALLS = every_other(LINES, (0.9, 0.1, 0.3, 3.0, 15.0, 60.0), [("innovert-ibd rtu", 0.9)])
+READS = every_other(LINES, PATHS, [(name, (constant, 0.6)) for name in LINES])
+ASKED = [pair for pair in READS if "native" not in pair.values[0]]
 
 
-@pytest.mark.parametrize(("path", "seconds"), PATHS)
-@pytest.mark.parametrize("name", LINES)
-def test_a_slow_path_costs_time_and_no_truth(
-    name: str, seconds: float, path: Callable[[float], Delay]
-) -> None:
+@pytest.mark.parametrize(("name", "slow"), STORIES)
+def test_a_slow_path_costs_time_and_no_truth(name: str, slow: tuple[Callable[[float], Delay], float]) -> None:
+    path, seconds = slow
     story = Path(of_one_variant(LINES[name]))
     answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
     assert answering == {drive.name for drive in story.drives}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("longest", STALLS)
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize(("name", "longest"), STALLS)
 def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
     Path(of_one_variant(LINES[name])).tell_of(stalling(longest))
 
@@ -76,12 +73,14 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
     return made
 
 
-@pytest.mark.parametrize(("path", "seconds"), PATHS)
-@pytest.mark.parametrize("name", LINES)
+@pytest.mark.parametrize(("name", "slow"), READS)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
-    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str,
+    slow: tuple[Callable[[float], Delay], float],
+    path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
     """Four registers of each of two drives, read one after another by a client that only tries again."""
+    path, seconds = slow
     drives = of_one_variant(LINES[name])
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
@@ -99,12 +98,14 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     assert set(read) == {drive.name for drive in drives}
 
 
-@pytest.mark.parametrize(("path", "seconds"), PATHS)
-@pytest.mark.parametrize("name", [name for name in LINES if "native" not in name])
+@pytest.mark.parametrize(("name", "slow"), ASKED)
 def test_what_a_bus_is_asked_for_over_a_slow_path_is_true(
-    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str,
+    slow: tuple[Callable[[float], Delay], float],
+    path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
     """Reads past the table, each once, beside reads of the same function and length from other addresses."""
+    path, seconds = slow
     drives = [drive for drive in of_one_variant(LINES[name]) if drive.framing is not Framing.DELIXI]
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
     plain = {

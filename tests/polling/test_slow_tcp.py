@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
-from examples import usually
+from examples import every_other, usually
 from lines import proof
 from motors import MAKE, Heard
 from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
@@ -29,12 +29,12 @@ pytestmark = pytest.mark.story
 
 TCP = "tcp://world:502"
 FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
-FEW = [pytest.param(name, marks=() if name == "innovert-ibd" else pytest.mark.long) for name in FAMILIES]
 PATHS = [
-    pytest.param(path, seconds, marks=() if (path, seconds) == (constant, 0.6) else pytest.mark.long)
+    (path, seconds)
     for path, delays in ((constant, (0.0, 0.3, 0.6, 1.5, 10.0)), (jittering, (0.6, 10.0)))
     for seconds in delays
 ]
+ON_PATHS = every_other(FAMILIES, PATHS, [("innovert-ibd", (constant, 0.6))])
 KINDS = ("delay", "twice", "merge")  # what a gateway may do without damage to the stream
 
 
@@ -72,11 +72,11 @@ def two_of(name: str) -> list[Drive]:
 
 
 @STORIES
-@pytest.mark.parametrize(("path", "seconds"), PATHS)
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize(("name", "slow"), ON_PATHS)
 def test_a_slow_path_costs_time_and_no_truth(
-    name: str, seconds: float, path: Callable[[float], Delay], story_of: type[Path]
+    name: str, slow: tuple[Callable[[float], Delay], float], story_of: type[Path]
 ) -> None:
+    path, seconds = slow
     story = story_of(two_of(name), port=TCP)
     assert {drive.framing for drive in story.drives} == {Framing.TCP}
     answering = story.tell_of(path(seconds), TAIL + TURNS * seconds)
@@ -130,11 +130,13 @@ def path_of(
     return made
 
 
-@pytest.mark.parametrize(("path", "seconds"), PATHS)
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize(("name", "slow"), ON_PATHS)
 def test_what_a_bus_reads_over_a_slow_path_is_true(
-    name: str, seconds: float, path: Callable[[float], Delay], path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str,
+    slow: tuple[Callable[[float], Delay], float],
+    path_of: Callable[..., tuple[Bus, PathLine]],
 ) -> None:
+    path, seconds = slow
     drives = two_of(name)
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]

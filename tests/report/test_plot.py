@@ -198,6 +198,7 @@ def turns() -> list[Row]:
     return rows
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_what_was_used_of_a_line(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
     (line,) = line_uses(look)
@@ -241,6 +242,7 @@ def test_a_plan_that_makes_no_sense_is_none(tmp_path: Path, planned: Any) -> Non
     assert line_uses(look) == []
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_a_report_says_that_there_is_no_plan(tmp_path: Path) -> None:
     assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
 
@@ -259,6 +261,7 @@ def test_the_plan_is_what_polling_carries(tmp_path: Path) -> None:
     assert told["hall-1"]["drives"]["pump"]["character_ms"] == pytest.approx(10 / 9.6, abs=1e-6)
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
     planned = json.loads(json.dumps(PLANNED))
     planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"] = 100
@@ -269,6 +272,7 @@ def test_a_line_polled_at_rates_has_no_bus_cycle(tmp_path: Path) -> None:
     assert "bus cycle" not in report_page(look)
 
 
+@pytest.mark.usefixtures("_unpainted")
 @pytest.mark.long
 def test_nothing_is_used_of_a_line_without_drives(tmp_path: Path) -> None:
     planned = {"hall-2": {"utilisation": 0.0, "cycle_ms": 0.0, "drives": {}}}
@@ -431,8 +435,8 @@ def test_a_panel_has_room_for_so_many_lanes_only(tmp_path: Path) -> None:
 
 
 def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
-    rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(100_000)]
-    rows[50_001] = row(500.01, "che", "status", 4)
+    rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
+    rows[10_001] = row(100.01, "che", "status", 4)
     (axes,) = plot(states(tmp_path, rows))[0].axes
     assert len(drawn(axes)["che"]) == 3
     order = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -447,6 +451,7 @@ def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
     assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
 
 
+@pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.long
 def test_what_has_no_room_is_named(run: Run, tmp_path: Path) -> None:
@@ -476,6 +481,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(look: Recording) -> None
     assert re.search(r"<td[^>]*>pump</td><td[^>]*>1000</td><td[^>]*>10\.6</td>", page)  # least delay, ms
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_names_cannot_break_the_page(tmp_path: Path) -> None:
     rows = [row(at, "<script>&", "output_frequency", at) for at in range(3)]
     look = load(record(tmp_path / "<b>.arrows", rows))
@@ -492,6 +498,7 @@ def test_a_recording_of_nothing_but_misses_has_a_report(tmp_path: Path) -> None:
     assert "100.00%" in page
 
 
+@pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize(("value", "status"), [(0.0, "ok"), (None, "no reply")])
 def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, status: str) -> None:
     rows = [row(at, "pump", "fault", value, status) for at in range(3)]
@@ -500,11 +507,13 @@ def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, s
     assert "<p>None was seen.</p>" in report_page(look)
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_a_long_recording_is_told_in_hours(tmp_path: Path) -> None:
     rows = [row(second, "pump", "output_frequency", 50.0) for second in (0, 7384)]
     assert "UTC, 2 h 03 min; 1 drive; 2 values" in report_page(load(record(tmp_path / "it.arrows", rows)))
 
 
+@pytest.mark.usefixtures("_unpainted")
 def test_what_has_no_values_is_not_drawn(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
     rows += [row(at, "fan", "output_frequency", 5.0) for at in range(3)]
@@ -542,6 +551,7 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
             yield whole
 
 
+@pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
 def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> None:
@@ -573,7 +583,6 @@ def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: floa
     rows += [row(40, drive, register, value), row(40.5, drive, register, -value)]
     look = load(record(tmp_path / "it.arrows", rows))
     figure, _ = plot(look)
-    assert png(figure).startswith(PNG)
     assert report_page(look)
     title = figure.axes[-1].get_title(loc="left")
     assert ("are not drawn" in title) == (abs(value) >= 1e150 and register != "fault")

@@ -124,24 +124,29 @@ def declared(*drives: object) -> set[tuple[int, str, str, str]]:
     return {(it.address, it.model, f"{it.settings}", f"{it.framing}") for it in drives}
 
 
-@pytest.mark.slow
-@pytest.mark.story
-def test_all_eight_are_found_at_their_settings_and_nothing_else() -> None:
+@pytest.fixture(scope="module")
+def whole_scan() -> tuple[Line, list[object]]:
+    """All sweeps over a line of all eight, and what they found."""
     line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
-    findings = found(line, sweeps(FAMILIES))
+    return line, found(line, sweeps(FAMILIES))
+
+
+@pytest.mark.story
+def test_all_eight_are_found_at_their_settings_and_nothing_else(
+    whole_scan: tuple[Line, list[object]],
+) -> None:
+    _, findings = whole_scan
     assert drives(findings) == declared(*ALL_EIGHT)
     assert len(findings) == len(ALL_EIGHT)
     assert not any(it.doubt for it in findings)
 
 
 @pytest.mark.story
-def test_only_reads_are_sent() -> None:
-    wire = Pair([simulated(it) for it in ALL_EIGHT])
-    line = Line(wire)
-    found(line, sweeps(FAMILIES))
+def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
+    line, _ = whole_scan
     functions = {(framing, parse_request(framing, frame)[1].function) for framing, frame in line.sent}
     assert all(function in READS[framing] for framing, function in functions)
-    assert not any(it.counters.writes for it in wire.drives)
+    assert not any(it.counters.writes for it in line.wire.drives)
 
 
 def test_the_usual_settings_come_first() -> None:
@@ -194,7 +199,7 @@ class Echo(Line):
 def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
     there = [it for it in ALL_EIGHT if type(it) in families and it.settings.baudrate in (9600, 19200)]
     line = Echo(Pair([simulated(it) for it in ALL_EIGHT]))
-    plan = sweeps(families, baudrates=[9600, 19200])
+    plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
     assert drives(found(line, plan, families)) == declared(*there)
 
 
@@ -217,7 +222,7 @@ class Junk(Line):
 
 def test_some_noise_is_neither_a_drive_nor_several() -> None:
     line = Junk(Pair([simulated(it) for it in ALL_EIGHT]))
-    findings = found(line, sweeps(FAMILIES, baudrates=[9600, 38400]))
+    findings = found(line, sweeps(FAMILIES, addresses=range(1, 12), baudrates=[9600, 38400]))
     assert drives(findings) == declared(*(it for it in ALL_EIGHT if it.settings.baudrate in (9600, 38400)))
     assert not any(isinstance(it, Crowd) for it in findings)
 

@@ -29,6 +29,21 @@ def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
     ]
 
 
+def every_other(each: Iterable[object], cases: Sequence[object], tried: Sequence[object]) -> list[Any]:
+    """Return every other pair, as a chessboard's black squares: all but those `tried` are marked `long`."""
+    return [
+        pytest.param(one, case, id=f"{one}-{_told(case)}", marks=() if is_tried else pytest.mark.long)
+        for number, one in enumerate(each)
+        for nth, case in enumerate(cases)
+        if (is_tried := (one, case) in tried) or (number + nth) % 2 == 0
+    ]
+
+
+def _told(case: object) -> str:
+    parts = case if isinstance(case, tuple) else (case,)
+    return "-".join(getattr(part, "__name__", str(part)) for part in parts)
+
+
 def _long(other: object) -> Any:
     values = other if isinstance(other, tuple) else (other,)
     return pytest.param(*values, marks=pytest.mark.long)

@@ -35,30 +35,30 @@ def place(path: Path, line: int) -> str:
 
 def run_time_imports(path: Path) -> set[str]:
     """Return the modules that a file imports when it runs, in functions too."""
-    return _imports(path) - _imports(path, for_types=True)
+    at_run_time, for_types = _imports(path)
+    return at_run_time - for_types
 
 
 def type_imports(path: Path) -> set[str]:
     """Return the modules that a file imports for its annotations alone."""
-    return _imports(path, for_types=True) - run_time_imports(path)
+    return _imports(path)[1]
 
 
 @cache
-def _imports(path: Path, for_types: bool = False) -> set[str]:
-    found: set[str] = set()
-    for node, is_for_types in _import_nodes(parsed(path), False):
-        if is_for_types != for_types:
-            continue
+def _imports(path: Path) -> tuple[set[str], set[str]]:
+    found: tuple[set[str], set[str]] = set(), set()
+    for node, for_types in _import_nodes(parsed(path), False):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            found[for_types].update(alias.name for alias in node.names)
         elif node.module:
-            found.add(node.module)
+            found[for_types].add(node.module)
             if node.module == "multidrop":
-                found |= {f"multidrop.{alias.name}" for alias in node.names}
+                found[for_types].update(f"multidrop.{alias.name}" for alias in node.names)
     return found
 
 
 def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Yield imports with a mark of those that only a type checker sees; they are never in an expression."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child, for_types
@@ -67,7 +67,7 @@ def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import |
                 yield from _import_nodes(ast.Module([part], []), True)
             for part in child.orelse:
                 yield from _import_nodes(ast.Module([part], []), for_types)
-        else:
+        elif isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
             yield from _import_nodes(child, for_types)
 
 

@@ -30,10 +30,16 @@ UNASKED = {str(it) for it in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_AN
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 
+class PieceWire(WorldWire):
+    """A hostile wire whose bytes come as they do from a serial port, a few at a time."""
+
+    chunk = 4e-3
+
+
 class Story:
     """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
 
-    wires: type[WorldWire] = WorldWire
+    wires: type[WorldWire] = PieceWire
 
     def __init__(
         self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY, port: str = "pty"

@@ -36,6 +36,7 @@ from multidrop.plant.model import Plant, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
+from multidrop.sim import wire as wire_of_drives
 from multidrop.transport import clock
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
@@ -56,6 +57,7 @@ class WorldWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
 
     ids = TransactionIds.MATCH  # of its gateway, on tcp://
+    chunk = 1.0  # s; characters that end within it come together: a reply is heard when it is whole
 
     def open(self) -> None:
         path = "world"
@@ -311,6 +313,7 @@ class World:
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
         patch.setattr(poller, "RowQueue", self._row_queue)
+        patch.setattr(wire_of_drives, "CHUNK", min(wire.chunk for wire in wires.values()))
         self.poller = Poller(polled)
 
     @property
@@ -389,7 +392,8 @@ class World:
         try:
             with self._turn:
                 self._is_waiting = True
-                self._turn.notify_all()
+                if self.now >= self._limit:
+                    self._turn.notify_all()
                 while self.now >= self._limit and not self._leaving:
                     self._turn.wait()
                 self._is_waiting = False

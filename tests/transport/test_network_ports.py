@@ -27,7 +27,7 @@ from multidrop.bus import Bus
 from multidrop.errors import Unconfirmed
 from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, hand_on_nothing_late
 from multidrop.transport.exchange import WRITE_TIMEOUT
-from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, MOST_SUBOPTION, RFC2217Port, Telnet
+from multidrop.transport.rfc2217 import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, Telnet
 
 SERVER = Path(__file__).parents[1] / "support" / "servers" / "network_server.py"
 IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
@@ -91,7 +91,7 @@ def test_a_suboption_without_an_end_fills_no_memory() -> None:
         for _ in range(100):
             for _, content in telnet.split(flood):
                 assert len(content) <= len(flood)
-        assert tracemalloc.get_traced_memory()[0] < 8 * MOST_SUBOPTION
+        assert tracemalloc.get_traced_memory()[0] < len(flood)  # of a hundred; other threads have some
     finally:
         tracemalloc.stop()
 
