@@ -15,7 +15,7 @@ _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """What is stated of a line; an empty port, a baud rate of 0 and an empty format are not known."""
+    """A line, as far as it is stated: an empty port, a baud rate of 0 and an empty format are not known."""
 
     port: str = ""
     baudrate: int = 0
