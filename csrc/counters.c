@@ -61,3 +61,8 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
     counters->longest_ns = later(counters->longest_ns, delay_ns);
     drive->history->delays[bucket(delay_ns)]++;
 }
+
+const uint64_t *md_usual_delays(const struct md_drive *drive)
+{
+    return &drive->history->delays[bucket(drive->delay_ns)];
+}
