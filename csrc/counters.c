@@ -48,7 +48,8 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
         history->busies += exception == BUSY;
         history->refused[exception] += (uint32_t)values;
     } else {
-        uint64_t lacking = exchange->block ? md_count_lacking(exchange->block, &completion->reply) : 0;
+        const struct md_block *block = exchange->block;
+        uint64_t lacking = block && block->may_lack ? md_count_lacking(block, &completion->reply) : 0;
         counters->values += values - lacking;
         history->missed[MD_NO_VALUE] += lacking;
     }
