@@ -169,7 +169,7 @@ uint64_t md_count_lacking(const struct md_block *block, const struct md_message 
 {
     uint64_t lacking = 0;
     double value;
-    for (int i = 0; block->may_lack && i < block->count; i++)
+    for (int i = 0; i < block->count; i++)
         lacking += find_value(reply, block, &block->fields[i], &value) == MD_NO_VALUE;
     return lacking;
 }

@@ -101,7 +101,10 @@ static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
 {
     int64_t now_ns = 0;
     *is_woken = 0;
-    for (int i = 0; i < n; i++) {
+    for (int i = -MD_STEPS_AHEAD; i < n; i++) {
+        md_look_ahead(ready, n, i + 1);
+        if (i < 0)
+            continue;
         if (ready[i])
             now_ns = md_port_advance(ready[i], md_port_receive(ready[i]));
         else

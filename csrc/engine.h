@@ -51,4 +51,11 @@ int64_t md_port_receive(struct md_port *port); /* what has come; return when it 
 /* Carry on until there is nothing to do but wait; return what time it is then. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 
+/* ---- ahead.c ---- */
+
+enum { MD_STEPS_AHEAD = 4 };
+
+/* Go one step on with the `next` port, which may be negative, and with each of those behind it. */
+void md_look_ahead(struct md_port *const *ports, int n, int next);
+
 #endif

@@ -16,7 +16,7 @@ import numpy
 import pyarrow
 
 from bench.players.replay import Played, Unpaced, Unreliable
-from multidrop.core import Echo, Port
+from multidrop.core import Echo, Port, TransactionIds
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import planned
@@ -40,8 +40,8 @@ class Inherited(Line):
             self._core = None
 
 
-def _opened(port: str, echo: Echo) -> Line:
-    return Inherited(port, echo) if port.isdigit() else Line(port, echo)
+def _opened(port: str, echo: Echo, ids: TransactionIds) -> Line:
+    return Inherited(port, echo, ids) if port.isdigit() else Line(port, echo, ids)
 
 
 @contextmanager

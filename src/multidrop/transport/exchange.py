@@ -144,7 +144,7 @@ class Exchanges:
         exchange = read.exchange
         if insists:
             exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
-        return dict(read.decode(self._ask(drive, exchange, attempts)))
+        return read.decode(self._ask(drive, exchange, attempts).data)
 
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
@@ -208,7 +208,7 @@ class Exchanges:
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return _with_values(drive, dict(read.decode(self._ask(drive, insisting, 1))))[register.name]
+        return _with_values(drive, read.decode(self._ask(drive, insisting, 1).data))[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
         """Return the data of the reply to any read, sent once, and begun within so many seconds."""

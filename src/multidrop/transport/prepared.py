@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +12,7 @@ from multidrop.drive.register import Register
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.splitting import may_be_too_long
+from multidrop.transport.block_decoder import BlockDecoder
 
 MOST_PREPARED = 256  # sets of registers, and blocks, of one drive; the least recently read ones go
 NO_ROWS = core.RowLayout(0, [])  # of a command: a poll's summary counts the values of its rows alone
@@ -48,19 +48,13 @@ def make_read(
 
 
 class PreparedRead:
-    """A block of one drive's registers, the exchange that reads it, and where each lies in the reply."""
+    """A block of one drive's registers, the exchange that reads it, and what its reply's data means."""
 
     def __init__(self, drive: Drive, block: Block, peer: Peer) -> None:
         self.block = block
         self.exchange = make_read(drive, block, peer)
         self.may_be_too_long = may_be_too_long(drive, block)
-        self._places = [(register, block.offset(register)) for register in block.registers]
-
-    def decode(self, reply: Message) -> Iterator[tuple[str, Any]]:
-        """Yield the name and the value of each register; None where the drive gave none."""
-        data = reply.data
-        for register, at in self._places:
-            yield register.name, register.value_in(data, at)
+        self.decode = BlockDecoder(block).decode
 
 
 class PreparedReads:

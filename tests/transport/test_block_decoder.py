@@ -1,0 +1,89 @@
+"""A block's numbers are decoded at once, and mean what each register by itself means."""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop.core import NumberFormat
+from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, reading
+from multidrop.planning.blocks import Block
+from multidrop.transport.block_decoder import BlockDecoder
+
+
+class Mode(IntEnum):
+    OFF = 0
+    ON = 1
+
+
+class Mixed(Drive):
+    """A drive whose table holds what can be decoded at once and what cannot."""
+
+    model = "mixed"
+    title = "MIXED"
+    manual = "none"
+    most_registers = {HOLDING: 40}
+
+    tenths = reading(1, "Hz", step=0.1)
+    celsius = reading(2, "°C", number_format=NumberFormat.I16, offset=-40)
+    energy = reading(3, "kWh", number_format=NumberFormat.U32, step=0.001)
+    swapped = reading(5, "kWh", number_format=NumberFormat.U32, order="CDAB")
+    power = reading(7, "W", number_format=NumberFormat.F32)
+    pulses = reading(10, "", number_format=NumberFormat.U64)
+    drift = reading(14, "", number_format=NumberFormat.I64, step=0.5)
+    mode = reading(18, Mode)
+    again = reading(18, "")
+    perhaps = reading(19, "V", invalid=0xFFFF)
+    balance = reading(20, "J", number_format=NumberFormat.I32)
+
+
+REGISTERS = tuple(Mixed.registers.values())
+FIRST, WORDS = 1, 21
+
+
+def expected(data: bytes) -> dict[str, Any]:
+    """Return the values as `struct` and the table's own words tell them."""
+    tenths, celsius, energy, low, high, power = struct.unpack_from(">HhIHHf", data)
+    pulses, drift, mode, perhaps, balance = struct.unpack_from(">QqHHi", data, 18)
+    return {
+        "tenths": tenths / 10,
+        "celsius": celsius - 40,
+        "energy": energy / 1000,
+        "swapped": high << 16 | low,
+        "power": None if power != power else power,
+        "pulses": pulses,
+        "drift": drift / 2,
+        "mode": Mode(mode) if mode in (0, 1) else mode,
+        "again": mode,
+        "perhaps": None if perhaps == 0xFFFF else perhaps,
+        "balance": balance,
+    }
+
+
+def decoder() -> BlockDecoder:
+    return BlockDecoder(Block.of(Mixed(1), REGISTERS))
+
+
+@given(st.binary(min_size=2 * WORDS, max_size=2 * WORDS))
+def test_each_value_is_the_one_that_its_bytes_say(data: bytes) -> None:
+    found = decoder().decode(data)
+    assert found == expected(data)
+    assert type(found["pulses"]) is int  # a float would not hold all of it
+
+
+@given(st.binary(max_size=2 * WORDS - 1))
+def test_a_reply_that_ends_too_soon_has_the_values_that_are_whole(data: bytes) -> None:
+    block = Block.of(Mixed(1), REGISTERS)
+    found = BlockDecoder(block).decode(data)
+    assert found == {one.name: one.value_in(data, one.address - FIRST) for one in REGISTERS}
+    assert found["balance"] is None
+
+
+def test_plain_numbers_are_decoded_at_once() -> None:
+    plain = {register.name for register, *_ in decoder()._plain}
+    assert plain == {"tenths", "celsius", "energy", "pulses", "drift", "mode", "balance"}
