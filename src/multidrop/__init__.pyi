@@ -25,6 +25,7 @@ from multidrop.drive import verb as verb
 from multidrop.drive import wait as wait
 from multidrop.drive import write as write
 from multidrop.drive.declaration_check import DeclarationError as DeclarationError
+from multidrop.drive.known_state import StateReader as StateReader
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
 from multidrop.drive.register import HOLDING as HOLDING
