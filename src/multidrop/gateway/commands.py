@@ -95,6 +95,7 @@ class Commands:
     def __init__(self, lines: PolledLines, may: May) -> None:
         self.may = may
         self._lines = lines
+        self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
         self._stops: dict[str, int] = {}  # that were called so far, by drive
 
@@ -111,6 +112,7 @@ class Commands:
         wanted = dict.fromkeys(names if drives is None else drives)
         if caller.role < Right.STOP:
             return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
+        self.called += 1
         told: dict[str, Told] = {}
         waited: list[asyncio.Future[dict[str, Told]]] = []
         for line in plant.lines:
@@ -179,6 +181,7 @@ class Commands:
         if self._under_way.get(line.name, 0) >= MOST_WRITES:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
             return _failed(Refused(reason, rule=BUSY))
+        self.called += 1
         stops = self._stops.get(drive, 0)
 
         def checked() -> Told:

@@ -16,7 +16,8 @@ from multidrop.gateway.events import Events
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 
-LEAST_S = 0.1  # between two frames
+LEAST_S = 0.1  # between two frames, on the whole
+EARLY_S = 0.02  # by which one may come sooner after one that was late
 WAIT_S = 20.0  # for which a viewer waits for a frame
 MOST_VIEWERS = 200  # that wait at the same time
 MOST_ALARMS = 50  # in a frame
@@ -89,7 +90,8 @@ class Frames:
         self._make = make
         self._clock = clock
         self._newest: Encoded | None = None
-        self._made_at = -LEAST_S
+        self._due = 0.0
+        self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
         self._is_closed = False
         self._waiting: set[asyncio.Future[None]] = set()
@@ -103,15 +105,27 @@ class Frames:
     def note_news(self) -> None:
         """Tell that a frame of now would differ from the newest one."""
         self._has_news = True
-        if self._waiting and self._clock() - self._made_at >= LEAST_S:
+        self._build_when_due()
+
+    def _build_when_due(self) -> None:
+        if self._timer is not None or not self._waiting or not self._has_news:
+            return
+        wait = self._due - self._clock()
+        if wait <= 0:
             self._build()
+        else:
+            self._timer = asyncio.get_running_loop().call_later(wait, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
         """Return a frame other than the n-th, as soon as there is one; None when there is none for long.
 
         Raises OverflowError when too many wait already.
         """
-        if self._has_news and self._clock() - self._made_at >= LEAST_S:
+        if self._has_news and self._clock() >= self._due:
             self._build()
         if self._newest is not None and self._newest.n != n:
             return self._newest
@@ -121,6 +135,7 @@ class Frames:
             return None
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.add(turn)
+        self._build_when_due()
         try:
             await asyncio.wait_for(turn, WAIT_S)
         except TimeoutError:
@@ -138,7 +153,7 @@ class Frames:
         self.made += 1
         plain = json.dumps(self._make(self.made), separators=(",", ":"), allow_nan=False).encode()
         self._newest = Encoded(self.made, plain, gzip.compress(plain, 5, mtime=0))
-        self._made_at = self._clock()
+        self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
         self._has_news = False
         self._wake()
 

@@ -53,6 +53,7 @@ class Gateway:
         self.failures: dict[str, int] = {}
         self.dead: dict[str, str] = {}  # parts, and why they do not live any more
         self.feeds: dict[str, Feed] = {}
+        self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._ticked = self.clock()

@@ -85,7 +85,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         tokens=gateway.tokens,
         may=gateway.settings.may,
         behind_proxy=gateway.settings.behind_proxy,
-        clock=gateway.clock,
+        clock=lambda: gateway.guard_clock(),
     )
 
 
@@ -273,11 +273,11 @@ class _Pages:
         """Keep a token in a cookie that no script can read."""
         gateway, caller = self._gateway, _caller(request)
         secret = _text(await _body(request), "token")
-        if gateway.tokens.is_shut(caller.address, gateway.clock()):
+        if gateway.tokens.is_shut(caller.address, gateway.guard_clock()):
             raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         token = gateway.tokens.find(secret)
         if token is None:
-            gateway.tokens.note_wrong(caller.address, gateway.clock())
+            gateway.tokens.note_wrong(caller.address, gateway.guard_clock())
             _log.warning("wrong token from %s", caller.address)
             raise Denied(401, "the token is wrong")
         response = JSONResponse({"name": token.name, "role": token.right.name.lower()})
