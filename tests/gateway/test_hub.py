@@ -59,7 +59,7 @@ def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub)
     sent, missed = 10 * PERIOD, 11 * PERIOD
     assert hub.last_good("pump-1", "output_frequency") == Newest(UTC_0 + sent, sent, 25.0, "ok")
     assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert hub.is_fresh("pump-1", "output_frequency")
 
 
 @pytest.mark.parametrize(

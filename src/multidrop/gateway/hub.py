@@ -160,9 +160,9 @@ class Hub:
         return self._row(cell.good) if cell and cell.good else None
 
     def is_fresh(self, drive: str, register: str) -> bool:
-        """Return True while the newest row has a value, and none is overdue."""
+        """Return True while the newest value is young: a single miss after it makes it no older."""
         cell = self._known(drive, register)
-        return cell is not None and self._fresh(cell) and cell.newest is cell.good
+        return cell is not None and self._fresh(cell)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
