@@ -29,6 +29,7 @@ from multidrop.gateway.side_reads import SideReads
 from multidrop.gateway.web import make_app
 
 TAKE_S = 0.05  # between looks for new rows
+EVENTS_S = 0.2  # between looks for faults and silence
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
 END_S = 3.0  # for which requests under way are waited for at the end
@@ -56,7 +57,7 @@ class Gateway:
         self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
-        self._ticked = self.clock()
+        self._looked = 0.0
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None
         self._end = asyncio.Event()
@@ -165,18 +166,21 @@ class Gateway:
     def _hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
         is_new = False
+        self.hub.pass_time(time.monotonic_ns())
         while batch := poller.take():
             is_new = True
             self._guarded("hub", self.hub.take, batch)
             for name, feed in self.feeds.items():
                 self._guarded(name, feed.take, batch)
         if is_new:
-            self._guarded("events", self._look_for_events)
             self._guarded("frames", self.frames.note_news)
+        if self.clock() - self._looked >= EVENTS_S:
+            self._looked = self.clock()
+            self._guarded("events", self._look_for_events)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
-            self.events.look(self.hub.time // 1_000_000, name, self.hub.seen(name))
+            self.events.look(_utc_ms(), name, self.hub.seen(name))
 
     def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
         try:
@@ -202,7 +206,7 @@ class Gateway:
         while True:
             if self.poller is not None:
                 self._guarded("statistics", self._read_statistics)
-            self._ticked = self.clock()
+            self._guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)

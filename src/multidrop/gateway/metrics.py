@@ -130,7 +130,11 @@ def _family(name: str, kind: str, text: str, samples: Iterable[Sample]) -> Itera
     for suffix, labels, value in samples:
         if isfinite(value):
             inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
-            yield f"{name}{suffix}{{{inside}}} {float(value)!r}\n" if inside else f"{name}{suffix} {float(value)!r}\n"
+            yield (
+                f"{name}{suffix}{{{inside}}} {float(value)!r}\n"
+                if inside
+                else f"{name}{suffix} {float(value)!r}\n"
+            )
 
 
 def _escaped(text: str) -> str:
