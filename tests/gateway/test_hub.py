@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.events import Events
+from multidrop.gateway.frames import lost_of
 from multidrop.gateway.hub import NOT_ASKED, Hub, Newest, Shown
 from multidrop.polling.batch import Batch
 
@@ -100,6 +101,25 @@ def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
         layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
         assert add_rows(columns, layout, completion(SECOND, exception=6), UTC_0)
     hub.take(Batch(columns, Names(DRIVES), Names(REGISTERS)))
+    assert hub.state("pump-1") == "unknown"
+
+
+def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows((31, FAULT, Status.LINE_LOST)))
+    assert lost_of(hub, "hall") == "port lost"
+    assert hub.seen("pump-1") == Shown("silent", "port lost")
+
+
+def test_values_grow_old_where_no_row_comes(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    hub.pass_time(10 * PERIOD + SECOND)
+    assert hub.is_fresh("pump-1", "output_frequency")
+    hub.pass_time(10 * PERIOD + SECOND + 1)
+    assert not hub.is_fresh("pump-1", "output_frequency")
     assert hub.state("pump-1") == "unknown"
 
 

@@ -40,6 +40,11 @@ class SideReads:
             self._tasks[name] = asyncio.create_task(self._read(line.name, drive, names))
         return found
 
+    @property
+    def under_way(self) -> int:
+        """Return how many drives are read at present."""
+        return len(self._tasks)
+
     async def close(self) -> None:
         """Read no more."""
         for task in self._tasks.values():
