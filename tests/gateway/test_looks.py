@@ -94,6 +94,7 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(side_reads, "PAUSE_S", 0.0)
+    monkeypatch.setattr(side_reads, "SHARE", 0)
     gateway.sims["pump-1"]["dc_bus_voltage"] = 537.0
 
     def looked() -> dict[str, list[object]]:
@@ -108,6 +109,19 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
     assert sum(count for _, count in asked["delays"]["counts"]) == asked["delays"]["replies"]
     monkeypatch.setattr(side_reads, "LOOKED_S", -1.0)
     until(lambda: not gateway.gateway.side_reads.under_way)
+
+
+def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
+    gateway.sims["pump-2"].deaf_until = float("inf")
+    gateway.await_state("pump-2", "silent")
+    asked: list[object] = []
+    bus = gateway.gateway.bus("hall")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(side_reads, "PAUSE_S", 0.0)
+        patch.setattr(bus, "read", lambda *arguments: asked.append(arguments))
+        for _ in range(20):
+            assert gateway.get("/api/drive/pump-2").json["values"] == {}
+    assert asked == []
 
 
 def test_lines_show_what_each_drive_costs(gateway: Served) -> None:

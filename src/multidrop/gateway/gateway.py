@@ -18,7 +18,7 @@ from multidrop import Batch, Bus, Ledger, Plant, Poller
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of
-from multidrop.gateway.hub import Hub
+from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import listen
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
@@ -71,7 +71,7 @@ class Gateway:
         self.lately = Lately(plant)
         self.frames = Frames(self._frame, self.clock)
         self.commands = Commands(self, settings.may)
-        self.side_reads = SideReads(self.bus, self.clock, _utc_ms)
+        self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
 
     # ---- life ----
 
@@ -109,7 +109,8 @@ class Gateway:
                     if task.done():
                         task.result()
                 await self.side_reads.close()
-                await asyncio.to_thread(self.poller.close)
+                with ThreadPoolExecutor(1, "multidrop close") as own:  # others may be busy
+                    await asyncio.get_running_loop().run_in_executor(own, self.poller.close)
         finally:
             for task in tasks:
                 task.cancel()
@@ -216,6 +217,9 @@ class Gateway:
         self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
 
     # ---- for commands, parts and pages ----
+
+    def _is_there(self, drive: str) -> bool:
+        return self.hub.state(drive) != SILENT
 
     def bus(self, line: str) -> Bus:
         """Return a line's bus. Raises ValueError for an unknown line, or before polling has begun."""
