@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from multidrop.gateway.settings import read_settings
 
 MAY = """[serve.may]
 stop = "anyone"
-write = ["pump-1.setpoint", "pump-2.setpoint"]
+write = ["pump-1.setpoint", "pump-2.setpoint", "pump-1.control"]
 verbs = ["pump-1.start", "pump-2.start", "pump-1.set_frequency", "pump-1.jog"]
 """
 BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
@@ -222,6 +223,17 @@ def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
         assert write(150.0) == (
             "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
         )
+        assert "takes a finite number, not nan" in write(float("nan"))
+        told = gateway.post(
+            "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
+        ).json
+        assert told["text"] == "control takes the number of a choice, not 1.5"
+        told = gateway.post(
+            "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
+        ).json
+        assert told["done"] is False
+        assert "start" in told["text"]
+        assert stands(gateway, "pump-1")
         assert act("fly") == (
             "there is no verb 'fly'; there are start, jog, reset_fault, set_frequency, coast, "
             "emergency_stop, stop"
@@ -270,7 +282,7 @@ def test_a_part_that_this_version_lacks(tmp_path: Path, monkeypatch: pytest.Monk
 def test_nothing_is_left_open_where_a_port_is_missing(tmp_path: Path) -> None:
     plant = written(tmp_path, port=str(tmp_path / "nosuch"))
     settings = read_settings(plant, {})
-    gateway = Gateway(plant, settings)
+    gateway = Gateway(plant, replace(settings, port=0))
     with pytest.raises(OSError, match="nosuch"), running(gateway):
         pass
     assert gateway.listener.fileno() == -1

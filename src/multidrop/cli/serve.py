@@ -12,7 +12,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -98,6 +98,7 @@ def _demo_registers() -> list[str]:
 
 def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     from multidrop.gateway.commands import verbs_of
+    from multidrop.gateway.parts import PARTS, settings_class
     from multidrop.gateway.rights import May, Right
     from multidrop.gateway.settings import ServeSettings
 
@@ -107,8 +108,11 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     ]
     verbs = [f"{one.name}.{verb}" for one in drives for verb in verbs_of(one)]
     may = May("anyone", Right.WRITE, frozenset(writes), frozenset(verbs))
+    parts: dict[str, object] = {}
+    with suppress(ValueError):  # a version without this part
+        parts["history"] = settings_class(PARTS["history"])()
     audit = folder / "audit.jsonl"
-    return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, is_demo=True)
+    return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, parts=parts, is_demo=True)
 
 
 def _serve(plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None]) -> int:

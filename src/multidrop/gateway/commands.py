@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from math import isfinite
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from multidrop import (
@@ -21,6 +22,7 @@ from multidrop import (
     Effect,
     Plant,
     Refused,
+    Register,
     Seen,
     Stopped,
     Unsupported,
@@ -283,13 +285,21 @@ def _of_stop(stopped: Stopped) -> Told:
 def _write(drive: Drive, register: str, value: float) -> Told:
     try:
         known = drive.register(register)
-        typed = known.decode(value) if known.values is not None else value
-        outcome = drive.bus.try_write(drive, known, typed)
+        outcome = drive.bus.try_write(drive, known, _typed(known, value))
     except (BusError, ValueError, TypeError) as failure:
         return _failed(failure)
     if outcome.effect is Effect.DONE:
         return Told(True, str(outcome))
     return Told(False, str(outcome), outcome.failure or BusError(str(outcome)))
+
+
+def _typed(register: Register[Any], value: float) -> Any:
+    """Return a number as the register takes it: a choice by its raw count, which is never rounded."""
+    if register.values is None:
+        return value
+    if not isfinite(value) or value != int(value):
+        raise ValueError(f"{register.name} takes the number of a choice, not {value!r}")
+    return register.decode(value)
 
 
 def _act(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Told:
