@@ -126,6 +126,7 @@ def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, pat
     assert headers["cross-origin-resource-policy"] == "same-origin"
     assert headers["x-content-type-options"] == "nosniff"
     assert "server" not in headers
+    assert headers["cache-control"] == ("no-cache" if path == "/" else "no-store")
 
 
 def test_methods_and_bodies(open_gateway: Served) -> None:

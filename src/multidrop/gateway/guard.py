@@ -69,12 +69,15 @@ class Guard:
         if scope["type"] != "http":
             return  # uvicorn refuses a connection that nobody accepts
 
+        is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
+        kept = "no-cache" if is_page else "no-store"  # a page's file is asked for again, by its ETag
+
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers[name] = value
-                headers.setdefault("cache-control", "no-store")
+                headers.setdefault("cache-control", kept)
             await send(message)
 
         try:
