@@ -1,0 +1,19 @@
+"""The audit log's newest records, for the page."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from multidrop import read_audit
+
+MOST_RECORDS = 200  # of an answer
+
+
+def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> list[dict[str, Any]]:
+    """Return so many records before this time (ISO 8601, UTC; "": all), the newest first. Raises OSError."""
+    if path is None or not path.exists():
+        return []
+    earlier = (record for record in read_audit(path) if not before or str(record.get("time", "")) < before)
+    return list(reversed(deque(earlier, maxlen=max(1, min(count, MOST_RECORDS)))))
