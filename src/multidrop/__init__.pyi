@@ -28,6 +28,7 @@ from multidrop.drive.declaration_check import DeclarationError as DeclarationErr
 from multidrop.drive.declare import command as command
 from multidrop.drive.declare import reading as reading
 from multidrop.drive.declare import setting as setting
+from multidrop.drive.known_state import StateReader as StateReader
 from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Register as Register
 from multidrop.drive.table import COIL as COIL
