@@ -1,0 +1,78 @@
+"""Events: faults and silence of drives, from when to when. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from multidrop.gateway.hub import FAULT, NOT_ASKED, SILENT, Shown
+
+MOST_ENDED = 1000  # that are remembered
+MOST_SHOWN = 20  # of them beside those that last
+
+
+class Alarm(NamedTuple):
+    """A fault or a silence of a drive; times are UTC in ms."""
+
+    time: int
+    drive: str
+    text: str
+    ended: int | None
+    kind: str  # "fault" or "silent"
+
+
+class Events:
+    """Alarms that last, and the latest of those that are over."""
+
+    def __init__(self) -> None:
+        self._lasting: dict[tuple[str, str], Alarm] = {}  # by drive and kind, the oldest first
+        self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
+        self.begun = 0  # so far
+
+    def look(self, time: int, drive: str, shown: Shown) -> None:
+        """Note what a drive shows. A fault lasts while the drive is silent: nobody saw it go."""
+        state, words = shown
+        if state == SILENT:
+            self._begin(time, drive, SILENT, words or "no reply")
+            return
+        if words == NOT_ASKED:
+            return
+        self._end(time, drive, SILENT)
+        if state == FAULT:
+            self._begin(time, drive, FAULT, words or "it shows a fault")
+        else:
+            self._end(time, drive, FAULT)
+
+    def forget(self, drive: str, time: int) -> None:
+        """End what lasts of a drive that is no longer there."""
+        self._end(time, drive, SILENT)
+        self._end(time, drive, FAULT)
+
+    def shown(self) -> list[Alarm]:
+        """Return those that last and the newest that ended, by the time of their begin, the newest first."""
+        ended = [*self._ended][-MOST_SHOWN:]
+        return sorted([*self._lasting.values(), *ended], key=lambda alarm: -alarm.time)
+
+    def between(self, begin: int, end: int) -> list[Alarm]:
+        """Return the alarms of a span of time, the newest first."""
+        found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
+        return sorted(
+            (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time
+        )
+
+    @property
+    def lasting(self) -> list[Alarm]:
+        return list(self._lasting.values())
+
+    def _begin(self, time: int, drive: str, kind: str, text: str) -> None:
+        before = self._lasting.get((drive, kind))
+        if before is not None and (before.text == text or kind == SILENT):
+            return
+        self._end(time, drive, kind)
+        self._lasting[drive, kind] = Alarm(time, drive, text, None, kind)
+        self.begun += 1
+
+    def _end(self, time: int, drive: str, kind: str) -> None:
+        before = self._lasting.pop((drive, kind), None)
+        if before is not None:
+            self._ended.append(before._replace(ended=time))

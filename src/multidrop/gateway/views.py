@@ -1,0 +1,126 @@
+"""Views: what pages and probes are told of a gateway, made when they ask."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, Any
+
+from multidrop import Ledger, Statistics
+from multidrop.gateway.frames import lost_of
+from multidrop.gateway.lately import misses_of
+from multidrop.gateway.metrics import Figures
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
+
+async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
+    """Return what the page shows of one drive alone. Raises ValueError for an unknown one."""
+    line, drive = gateway.plant.find_drive(name)
+    wear = await asyncio.to_thread(_wear, gateway.ledger, line.port, drive.address)  # it may wait for a lock
+    found = gateway.side_reads.look(gateway.plant, name)
+    statistics = gateway.lately.drive(line.name, name)
+    return {
+        "drive": name,
+        "delays": _delays(statistics),
+        "misses": misses_of(statistics) if statistics else {},
+        "asked": statistics.exchanges if statistics else 0,
+        "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
+        "values": found,
+        "ledger": wear,
+    }
+
+
+def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
+    if statistics is None:
+        return None
+    delays = statistics.delays
+    return {
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "longest": round(delays.longest * 1e3, 3),
+        "replies": delays.replies,
+        "counts": [[round(least * 1e3, 3), count] for least, count in statistics.delay_counts],
+    }
+
+
+def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
+    """Return the writes of a year to each cell of a drive's EEPROM, and how many it may have."""
+    with contextlib.suppress(OSError):
+        book = ledger.at(port)
+        return [
+            {
+                "register": wear.cell.register,
+                "year": wear.this_year,
+                "budget": book.budget,
+                "total": wear.writes,
+            }
+            for wear in book.wear(time.time())
+            if wear.cell.address == address
+        ]
+    return []
+
+
+def look_at_lines(gateway: Gateway) -> dict[str, Any]:
+    """Return what the page shows of the lines alone."""
+    return {
+        line.name: {
+            "lost": lost_of(gateway.hub, line.name),
+            "minutes": gateway.lately.hour(line.name),
+            "drives": {
+                polled.drive.name: _drive_figures(gateway.lately.drive(line.name, polled.drive.name))
+                for polled in line.drives
+            },
+        }
+        for line in gateway.plant.lines
+    }
+
+
+def health_of(gateway: Gateway) -> dict[str, Any]:
+    """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
+    lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
+    parts = {name: gateway.dead.get(name) or _health_of_part(feed) for name, feed in gateway.feeds.items()}
+    is_well = all(said == "ok" for said in (*lost.values(), *parts.values()))
+    return {
+        "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
+        "version": gateway.version,
+        "uptime_s": round(gateway.clock() - gateway.begun, 1),
+        "newest_row": gateway.hub.time // 1_000_000,
+        "lines": lost,
+        "parts": parts,
+        "failures": gateway.failures,
+    }
+
+
+def _health_of_part(feed: object) -> str:
+    try:
+        return str(getattr(feed, "health", str)()) or "ok"
+    except Exception as failure:  # it is not well then
+        return f"{type(failure).__name__}: {failure}"
+
+
+def figures_of(gateway: Gateway) -> Figures:
+    """Return what the metrics say of the gateway itself."""
+    parts = {}
+    for name, feed in gateway.feeds.items():
+        said = getattr(feed, "figures", None)
+        if said is not None:
+            with contextlib.suppress(Exception):  # a part's failure hides its own figures alone
+                parts[name] = dict(said())
+    dropped = gateway.poller.summary()["dropped"] if gateway.poller else 0
+    failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures
+    return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)
+
+
+def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:
+    if statistics is None:
+        return None
+    delays = statistics.delays
+    return {
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "asked": statistics.exchanges,
+        "missed": sum(statistics.misses.values()),
+    }
