@@ -261,7 +261,7 @@ def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listen
 
 
 def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
-    start(home_assistant=True, commands=True, every=2.0)
+    start(home_assistant=True, commands=True, every="2 s")
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
     found = json_of(said)
     assert found["availability"] == [{"topic": "multidrop/gateway"}, {"topic": "multidrop/pump-1/available"}]
@@ -302,9 +302,9 @@ def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start
 
 def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="broker = ") as told:
-        MqttSettings("http://x", prefix="a/+", every=0.0, sparkplug="a/b", node="#", password="/none")
+        MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
     sentences = str(told.value).splitlines()
-    assert len(sentences) == 6
+    assert len(sentences) == 5
     assert (
         sentences[0] == 'broker = "http://x" is no broker; write broker = "mqtt://broker:1883", or mqtts://'
     )
@@ -314,6 +314,10 @@ def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
     plant = inside(tmp_path).plant
     odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway"))
     plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
-    assert MqttSettings().check(plant) == [
-        f"drive {name!r} cannot be a topic: give it a name without + # and /" for name in ("a/b", "gateway")
+    assert MqttSettings(password="secret").check(plant) == [
+        f'password = "secret": there is no file {tmp_path}/secret',
+        *(
+            f"drive {name!r} cannot be a topic: give it a name without + # and /"
+            for name in ("a/b", "gateway")
+        ),
     ]

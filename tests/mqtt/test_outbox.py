@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from multidrop.gateway.outbox import MOST_UNDER_WAY, Message, Outbox
+from multidrop.gateway.outbox import MOST_UNDER_WAY, Outbox, Publication
 
 
 class Wire:
@@ -12,15 +12,15 @@ class Wire:
         self.sent: list[tuple[str, bytes]] = []
         self.is_open = True
 
-    def send(self, message: Message) -> int | None:
+    def send(self, message: Publication) -> int | None:
         if not self.is_open:
             return None
         self.sent.append((message.topic, message.make()))
         return len(self.sent)
 
 
-def said(topic: str, text: bytes = b"") -> Message:
-    return Message(topic, lambda: text)
+def said(topic: str, text: bytes = b"") -> Publication:
+    return Publication(topic, lambda: text)
 
 
 def test_no_more_than_the_bound_is_under_way_and_the_newest_of_a_topic_is_sent() -> None:
@@ -45,7 +45,7 @@ def test_what_waits_says_what_is_so_when_it_is_sent() -> None:
     wire, now = Wire(), [b"old"]
     outbox = Outbox(wire.send)
     wire.is_open = False
-    outbox.put(Message("state", lambda: now[0]))
+    outbox.put(Publication("state", lambda: now[0]))
     now[0], wire.is_open = b"new", True
     outbox.flush()
     assert wire.sent == [("state", b"new")]

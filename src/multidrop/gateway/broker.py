@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-from multidrop.gateway.outbox import Message, Outbox
+from multidrop.gateway.outbox import Outbox, Publication
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
@@ -52,7 +52,7 @@ class Login(NamedTuple):
 class Speaker(Protocol):
     """Who speaks over a connection. All of it is called in the loop."""
 
-    def will(self) -> Message:
+    def will(self) -> Publication:
         """Return what the broker is to say when this connection breaks."""
 
     def topics(self) -> list[tuple[str, int]]:
@@ -109,7 +109,7 @@ class Broker:
         self._client.disconnect()
         await asyncio.get_running_loop().run_in_executor(None, self._client.loop_stop)
 
-    def _send(self, message: Message) -> int | None:
+    def _send(self, message: Publication) -> int | None:
         if not self.is_connected:
             return None
         sent = self._client.publish(message.topic, message.make(), message.qos, message.is_retained)

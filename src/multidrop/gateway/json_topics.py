@@ -6,6 +6,7 @@ PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told sa
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,9 +14,9 @@ from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.hub import SILENT
-from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values, utc_ms
+from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
-from multidrop.gateway.outbox import Message
+from multidrop.gateway.outbox import Publication
 from multidrop.gateway.parts import Inside
 from multidrop.gateway.rights import Caller, Right
 
@@ -31,7 +32,7 @@ class JsonTopics:
 
     kind = "json"
 
-    def __init__(self, settings: MqttSettings, inside: Inside) -> None:
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
         self.outbox: Any = None
         self._settings = settings
         self._inside = inside
@@ -44,13 +45,13 @@ class JsonTopics:
         return "/".join((self._settings.prefix, *levels))
 
     @staticmethod
-    def _kept(topic: str, payload: bytes) -> Message:
+    def _kept(topic: str, payload: bytes) -> Publication:
         """Return a message that the broker keeps for those who come later."""
-        return Message(topic, lambda: payload, is_retained=True)
+        return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- a speaker ----
 
-    def will(self) -> Message:
+    def will(self) -> Publication:
         return self._kept(self._topic("gateway"), OFFLINE)
 
     def topics(self) -> list[tuple[str, int]]:
@@ -93,7 +94,7 @@ class JsonTopics:
     def publish(self) -> None:
         """Say the newest values of each drive."""
         for drive in self._hub.drives:
-            self.outbox.put(Message(self._topic(drive), partial(self._state, drive), is_retained=True))
+            self.outbox.put(Publication(self._topic(drive), partial(self._state, drive), is_retained=True))
             available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE
             if self._available.get(drive) != available:
                 self._available[drive] = available
@@ -117,7 +118,7 @@ class JsonTopics:
 
     def _tell(self, drive: str, what: str, told: Told) -> None:
         said = json.dumps({"what": what, "done": told.is_done, "text": told.text}, ensure_ascii=False)
-        self.outbox.put(Message(self._topic(drive, "told"), said.encode))
+        self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 
     def _discover(self, name: str) -> None:
         _, drive = self._inside.plant.find_drive(name)
@@ -136,7 +137,7 @@ class JsonTopics:
             topics,
             prefix=self._settings.prefix,
             version=self._inside.version,
-            every_s=self._settings.every,
+            every_s=self._settings.every_s,
             writable=writable,
             takes_commands=self._settings.commands,
         )
@@ -175,5 +176,5 @@ def _read(payload: bytes, *keys: str) -> dict[str, Any]:
         if key not in given:
             raise ValueError(f"{key} is missing")
     if isinstance(given["time"], bool) or not isinstance(given["time"], int):
-        raise ValueError("time is no whole number of ms")
+        raise ValueError("time is no whole number of ms")  # noqa: TRY004 (a person's mistake)
     return given

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -16,18 +17,22 @@ from multidrop.gateway.sparkplug_node import SparkplugNode
 
 def build(settings: MqttSettings, inside: Inside) -> Feed:
     """Return the part. Raises ImportError without paho."""
-    speakers: list[Any] = [JsonTopics(settings, inside)]
+    speakers: list[Any] = [JsonTopics(settings, inside, _utc_ms)]
     if settings.sparkplug:
-        speakers.append(SparkplugNode(settings, inside))
+        speakers.append(SparkplugNode(settings, inside, _utc_ms))
     return Mqtt(settings, inside, speakers)
+
+
+def _utc_ms() -> int:
+    return time.time_ns() // 1_000_000
 
 
 class Mqtt:
     """All that speaks by MQTT, each with a connection: a connection has one last will."""
 
     def __init__(self, settings: MqttSettings, inside: Inside, speakers: list[Any]) -> None:
-        address, login = parse_broker(settings.broker), settings.login()
-        self._every = settings.every
+        address, login = parse_broker(settings.broker), settings.login(inside.plant)
+        self._every = settings.every_s
         self._speakers = speakers
         self._brokers = []
         for speaker in speakers:

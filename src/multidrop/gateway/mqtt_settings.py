@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from multidrop import Plant, Register
+from multidrop import Plant, Register, parse_duration
 from multidrop.gateway.broker import Login, parse_broker
 from multidrop.gateway.hub import Hub
 
@@ -22,7 +21,7 @@ class MqttSettings:
 
     broker: str = "mqtt://localhost:1883"
     prefix: str = "multidrop"
-    every: float = 1.0  # s between two messages of a drive
+    every: str = "1 s"  # between two messages of a drive
     user: str = ""
     password: str = ""  # a file that has it
     authorities: str = ""  # a file of certificates, by which a broker of mqtts:// is known
@@ -37,8 +36,12 @@ class MqttSettings:
             parse_broker(self.broker)
         except ValueError as mistake:
             wrong.append(str(mistake))
-        if not LEAST_EVERY_S <= self.every <= MOST_EVERY_S:
-            wrong.append(f"every = {self.every:g} is not {LEAST_EVERY_S:g} to {MOST_EVERY_S:g} s")
+        try:
+            is_right = LEAST_EVERY_S <= self.every_s <= MOST_EVERY_S
+        except ValueError:
+            is_right = False
+        if not is_right:
+            wrong.append(f'every = "{self.every}" is not "{LEAST_EVERY_S:g} s" to "{MOST_EVERY_S:g} s"')
         if not all(LEVEL.fullmatch(level) for level in self.prefix.split("/")) or self.prefix[0] == "$":
             wrong.append(f'prefix = "{self.prefix}" is no topic; write prefix = "multidrop"')
         wrong += [
@@ -46,32 +49,37 @@ class MqttSettings:
             for key, name in (("sparkplug", self.sparkplug), ("node", self.node))
             if name and not LEVEL.fullmatch(name)
         ]
-        wrong += [
-            f'{key} = "{name}" cannot be read'
-            for key, name in (("password", self.password), ("authorities", self.authorities))
-            if name and not Path(name).is_file()
-        ]
         if wrong:
             raise ValueError("\n".join(wrong))
 
+    @property
+    def every_s(self) -> float:
+        """Seconds between two messages of a drive."""
+        return parse_duration(self.every)
+
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each drive whose name cannot be a level of a topic."""
+        """Return a sentence for each file that cannot be read, and each drive that cannot be a topic."""
         names = [polled.drive.name for line in plant.lines for polled in line.drives]
+        files = (("password", self.password), ("authorities", self.authorities))
         return [
+            f'{key} = "{name}": there is no file {_beside(plant, name)}'
+            for key, name in files
+            if name and not _beside(plant, name).is_file()
+        ] + [
             f"drive {name!r} cannot be a topic: give it a name without + # and /"
             for name in names
             if not LEVEL.fullmatch(name) or name == "gateway"
         ]
 
-    def login(self) -> Login:
+    def login(self, plant: Plant) -> Login:
         """Return what the broker wants to know. Raises OSError where the password cannot be read."""
-        password = Path(self.password).read_text("utf-8").strip() if self.password else ""
-        return Login(self.user, password, self.authorities or None)
+        password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
+        return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
 
 
-def utc_ms() -> int:
-    """Return the time of day."""
-    return time.time_ns() // 1_000_000
+def _beside(plant: Plant, name: str) -> Path:
+    """Return the path of a file that is named relative to the plant file."""
+    return plant.path.parent / name
 
 
 def shown(register: Register[Any], value: float) -> float | str:

@@ -13,7 +13,7 @@ MOST_UNDER_WAY = 20  # messages that were sent, and not acknowledged
 MOST_WAITING = 4096  # topics; more than any plant has
 
 
-class Message(NamedTuple):
+class Publication(NamedTuple):
     """A topic, and what it says at the moment when it is sent."""
 
     topic: str
@@ -28,14 +28,14 @@ class Outbox:
     `send` takes a message and returns its number, or None where it cannot be sent now.
     """
 
-    def __init__(self, send: Callable[[Message], int | None]) -> None:
+    def __init__(self, send: Callable[[Publication], int | None]) -> None:
         self._send = send
-        self._waiting: dict[str, Message] = {}
+        self._waiting: dict[str, Publication] = {}
         self._under_way: set[int] = set()
         self.sent = 0
         self.dropped = 0  # replaced by a newer one, or lost with the connection
 
-    def put(self, message: Message) -> None:
+    def put(self, message: Publication) -> None:
         """Send the message as soon as there is room, in the place of an older one of its topic."""
         if message.topic in self._waiting or len(self._waiting) >= MOST_WAITING:
             self.dropped += 1

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 from multidrop import Register
 from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.hub import SILENT
-from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values, utc_ms
+from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
-from multidrop.gateway.outbox import Message
+from multidrop.gateway.outbox import Publication
 from multidrop.gateway.parts import Inside
 from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.sparkplug import (
@@ -36,11 +37,12 @@ class SparkplugNode:
 
     kind = "sparkplug"
 
-    def __init__(self, settings: MqttSettings, inside: Inside) -> None:
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
         self.outbox: Any = None
         self._settings = settings
         self._inside = inside
         self._hub = inside.hub
+        self._utc_ms = utc_ms
         self._node = settings.node or inside.plant.path.stem
         caller = Caller("sparkplug", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
         self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
@@ -55,9 +57,9 @@ class SparkplugNode:
 
     # ---- a speaker ----
 
-    def will(self) -> Message:
+    def will(self) -> Publication:
         self._birth = (self._birth + 1) % SEQUENCES
-        return Message(self._topic("NDEATH"), self._death, qos=1)
+        return Publication(self._topic("NDEATH"), self._death, qos=1)
 
     def topics(self) -> list[tuple[str, int]]:
         listened = [(self._topic("NCMD"), 1)]
@@ -66,7 +68,7 @@ class SparkplugNode:
     def connected(self) -> None:
         self._said.clear()
         self._changed.clear()
-        self.outbox.put(Message(self._topic("NBIRTH"), self._node_birth, qos=0))
+        self.outbox.put(Publication(self._topic("NBIRTH"), self._node_birth, qos=0))
         self.publish()
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
@@ -88,7 +90,7 @@ class SparkplugNode:
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
                 if self._said.pop(drive, None) is not None:
-                    self.outbox.put(Message(self._topic("DDEATH", drive), self._device_death, qos=0))
+                    self.outbox.put(Publication(self._topic("DDEATH", drive), self._device_death, qos=0))
                 continue
             values = self._values(drive)
             before = self._said.get(drive)
@@ -103,23 +105,23 @@ class SparkplugNode:
 
     def leave(self) -> None:
         """Say that the node goes: its will is not sent at a disconnect in good order."""
-        self.outbox.put(Message(self._topic("NDEATH"), self._death, qos=1))
+        self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
 
     # ---- payloads, each made when it is sent: their numbers go up by one ----
 
     def _put(self, drive: str, kind: str, make: Any) -> None:
-        self.outbox.put(Message(self._topic(kind, drive), lambda: make(drive), qos=0))
+        self.outbox.put(Publication(self._topic(kind, drive), lambda: make(drive), qos=0))
 
     def _next(self) -> int:
         self._seq = (self._seq + 1) % SEQUENCES
         return self._seq
 
     def _death(self) -> bytes:
-        now = utc_ms()
+        now = self._utc_ms()
         return payload(now, [Metric(DataType.INT64, self._birth, now, BIRTH_DEATH)], None)
 
     def _node_birth(self) -> bytes:
-        self._seq, now = 0, utc_ms()
+        self._seq, now = 0, self._utc_ms()
         metrics = [
             Metric(DataType.INT64, self._birth, now, BIRTH_DEATH),
             Metric(DataType.BOOLEAN, False, now, REBIRTH),
@@ -127,7 +129,7 @@ class SparkplugNode:
         return payload(now, metrics, self._seq)
 
     def _device_birth(self, drive: str) -> bytes:
-        now, values = utc_ms(), self._values(drive)
+        now, values = self._utc_ms(), self._values(drive)
         self._said[drive] = values
         self._changed.pop(drive, None)
         metrics = [
@@ -139,10 +141,10 @@ class SparkplugNode:
         return payload(now, metrics, self._next())
 
     def _device_death(self) -> bytes:
-        return payload(utc_ms(), [], self._next())
+        return payload(self._utc_ms(), [], self._next())
 
     def _data(self, drive: str) -> bytes:
-        now = utc_ms()
+        now = self._utc_ms()
         metrics = [
             Metric(self._datatype(drive, name), value, now, alias=self._alias(drive, name))
             for name, value in self._changed.pop(drive, {}).items()
