@@ -50,7 +50,7 @@ class Login(NamedTuple):
 
 
 class Speaker(Protocol):
-    """Who speaks over a connection. All of it is called in the loop."""
+    """A user of a connection: what it says, and what it is told. All of it is called in the loop."""
 
     def will(self) -> Publication:
         """Return what the broker is to say when this connection breaks."""
