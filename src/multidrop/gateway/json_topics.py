@@ -37,7 +37,7 @@ class JsonTopics:
         self._settings = settings
         self._inside = inside
         self._hub = inside.hub
-        caller = Caller("mqtt", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
+        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
         self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
 

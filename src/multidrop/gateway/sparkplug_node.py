@@ -44,7 +44,7 @@ class SparkplugNode:
         self._hub = inside.hub
         self._utc_ms = utc_ms
         self._node = settings.node or inside.plant.path.stem
-        caller = Caller("sparkplug", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
+        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
         self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
