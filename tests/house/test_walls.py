@@ -43,6 +43,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/exit_hook.py",
     "gateway/gateway.py",
     "gateway/listener.py",
+    "gateway/mqtt.py",
     "gateway/sd_notify.py",
     "gateway/views.py",
 }

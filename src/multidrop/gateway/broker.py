@@ -1,0 +1,165 @@
+"""Broker: one connection to an MQTT broker, made again for as long as it takes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+from urllib.parse import urlsplit
+
+from multidrop.gateway.outbox import Outbox, Publication
+
+PORTS = {"mqtt": 1883, "mqtts": 8883}
+RETRY_S = (1, 30)  # before the first attempt to connect again, and at most
+KEEP_ALIVE_S = 15
+MOST_COMMAND = 65_536  # bytes of a message that comes in
+FAREWELL_S = 1.0  # that the last messages may take
+
+_log = logging.getLogger("multidrop.gateway.mqtt")
+
+
+class Address(NamedTuple):
+    """A broker's address."""
+
+    host: str
+    port: int
+    is_tls: bool
+
+
+def parse_broker(text: str) -> Address:
+    """Return the parts of `mqtt://host:port`. Raises ValueError for anything else."""
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError:
+        parts, port = urlsplit(""), None
+    is_plain = not (parts.path.strip("/") or parts.query or parts.fragment or parts.username)
+    if parts.scheme not in PORTS or not parts.hostname or not is_plain:
+        raise ValueError(f'broker = "{text}" is no broker; write broker = "mqtt://broker:1883", or mqtts://')
+    return Address(parts.hostname, port or PORTS[parts.scheme], parts.scheme == "mqtts")
+
+
+class Login(NamedTuple):
+    """A user and his password, and the certificates by which the broker is known."""
+
+    user: str = ""
+    password: str = ""
+    authorities: str | None = None  # a file; None: the system's
+
+
+class Speaker(Protocol):
+    """A user of a connection: what it says, and what it is told. All of it is called in the loop."""
+
+    def will(self) -> Publication:
+        """Return what the broker is to say when this connection breaks."""
+
+    def topics(self) -> list[tuple[str, int]]:
+        """Return the topics to listen to, with their QoS."""
+
+    def connected(self) -> None:
+        """Say what is to be said first."""
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
+        """Take a message."""
+
+
+class Broker:
+    """The connection of a speaker. Paho's thread does the sending; nothing here waits for it."""
+
+    def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        self._address = address
+        self._speaker = speaker
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.outbox = Outbox(self._send)
+        self.is_connected = False
+        self._client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
+        self._client.reconnect_delay_set(*RETRY_S)
+        self._client.max_inflight_messages_set(0)  # the outbox has the bound
+        if login.user:
+            self._client.username_pw_set(login.user, login.password or None)
+        if address.is_tls:
+            self._client.tls_set_context(ssl.create_default_context(cafile=login.authorities))
+        self._client.on_connect = self._on_connect
+        self._client.on_connect_fail = lambda *_: self._call(self._failed, "it does not answer")
+        self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))
+        self._client.on_publish = lambda *given: self._call(self.outbox.acknowledge, given[2])
+        self._client.on_message = self._on_message
+        self._why = ""
+
+    def open(self) -> None:
+        """Begin to connect, and go on with it."""
+        self._loop = asyncio.get_running_loop()
+        self._set_will()
+        self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
+        self._client.loop_start()
+
+    async def close(self) -> None:
+        """Wait a moment until all is said, and let go."""
+        begun = asyncio.get_running_loop().time()
+        while self.is_connected and not self.outbox.is_idle:
+            if asyncio.get_running_loop().time() - begun > FAREWELL_S:
+                break
+            await asyncio.sleep(0.01)
+        self._loop = None
+        self._client.disconnect()
+        await asyncio.get_running_loop().run_in_executor(None, self._client.loop_stop)
+
+    def _send(self, message: Publication) -> int | None:
+        if not self.is_connected:
+            return None
+        sent = self._client.publish(message.topic, message.make(), message.qos, message.is_retained)
+        return int(sent.mid) if sent.rc == 0 else None
+
+    def _set_will(self) -> None:
+        will = self._speaker.will()
+        self._client.will_set(will.topic, will.make(), will.qos, will.is_retained)
+
+    # ---- in the loop ----
+
+    def _greet(self) -> None:
+        self.is_connected = True
+        self._why = ""
+        _log.info("connected to %s:%d", self._address.host, self._address.port)
+        for topic, qos in self._speaker.topics():
+            self._client.subscribe(topic, qos)
+        self._speaker.connected()
+
+    def _failed(self, why: str) -> None:
+        if why != self._why:
+            _log.warning("no connection to %s:%d: %s", self._address.host, self._address.port, why)
+        self._why = why
+
+    def _lost(self, why: str) -> None:
+        self.is_connected = False
+        self.outbox.forget()
+        self._set_will()
+        self._failed(why)
+
+    # ---- in paho's thread ----
+
+    def _call(self, what: Callable[..., None], *given: Any) -> None:
+        loop = self._loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(what, *given)
+
+    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        if reason.is_failure:
+            self._call(self._failed, str(reason))
+        else:
+            self._call(self._greet)
+
+    def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
+        if len(message.payload) > MOST_COMMAND:
+            _log.warning("a message of %d bytes on %s is left out", len(message.payload), message.topic)
+            return
+        received = self._speaker.received
+
+        def take() -> None:
+            received(message.topic, bytes(message.payload), is_retained=bool(message.retain))
+
+        self._call(take)

@@ -1,0 +1,180 @@
+"""Topics in JSON: PREFIX/DRIVE has a drive's newest values, and null for one that is not fresh.
+
+PREFIX/DRIVE/available and PREFIX/gateway say who is there; PREFIX/DRIVE/told says what became of a command.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from multidrop.gateway.broker import parse_broker
+from multidrop.gateway.commands import Told
+from multidrop.gateway.homeassistant import discovery, discovery_topic
+from multidrop.gateway.hub import SILENT
+from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
+from multidrop.gateway.orders import Orders
+from multidrop.gateway.outbox import Publication
+from multidrop.gateway.parts import Inside
+from multidrop.gateway.rights import Caller, Right
+
+EXAMPLES = {
+    "set": '{"value": 25.0, "time": UTC in ms}',
+    "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
+}
+ONLINE, OFFLINE = b"online", b"offline"
+
+
+class JsonTopics:
+    """Messages in JSON, and Home Assistant's discovery of them."""
+
+    kind = "json"
+
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+        self.outbox: Any = None
+        self._settings = settings
+        self._inside = inside
+        self._hub = inside.hub
+        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
+        self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
+        self._available: dict[str, bytes] = {}
+
+    def _topic(self, *levels: str) -> str:
+        return "/".join((self._settings.prefix, *levels))
+
+    @staticmethod
+    def _kept(topic: str, payload: bytes) -> Publication:
+        """Return a message that the broker keeps for those who come later."""
+        return Publication(topic, lambda: payload, is_retained=True)
+
+    # ---- a speaker ----
+
+    def will(self) -> Publication:
+        return self._kept(self._topic("gateway"), OFFLINE)
+
+    def topics(self) -> list[tuple[str, int]]:
+        if not self._settings.commands:
+            return []
+        once = [(self._topic("+", "set", "+"), 0), (self._topic("+", "act"), 0)]
+        return [*once, (self._topic("+", "stop"), 1), (self._topic("stop"), 1)]
+
+    def connected(self) -> None:
+        self._available.clear()
+        self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
+        if self._settings.home_assistant:
+            for drive in self._hub.drives:
+                self._discover(drive)
+        self.publish()
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
+        levels = topic.removeprefix(self._settings.prefix + "/").split("/")
+        if levels == ["stop"]:
+            self._orders.stop(None)
+        elif levels[-1] == "stop":
+            self._orders.stop([levels[0]])
+        elif is_retained:  # it comes at every connection
+            self._orders.refuse(levels[0], topic, "the broker had kept it; publish it without retain")
+        else:
+            self._order(levels, payload)
+
+    def _order(self, levels: list[str], payload: bytes) -> None:
+        drive, *what = levels
+        try:
+            if what[0] == "set":
+                self._orders.write(drive, what[1], *_read_write(payload))
+            else:
+                self._orders.act(drive, *_read_act(drive, payload))
+        except ValueError as mistake:
+            self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
+
+    # ---- what is said ----
+
+    def publish(self) -> None:
+        """Say the newest values of each drive."""
+        for drive in self._hub.drives:
+            self.outbox.put(Publication(self._topic(drive), partial(self._state, drive), is_retained=True))
+            available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE
+            if self._available.get(drive) != available:
+                self._available[drive] = available
+                self.outbox.put(self._kept(self._topic(drive, "available"), available))
+
+    def leave(self) -> None:
+        """Say that the gateway goes."""
+        self.outbox.put(self.will())
+
+    def _state(self, drive: str) -> bytes:
+        seen_ns = self._hub.seen_at(drive)
+        return json.dumps(
+            {
+                "time": None if seen_ns is None else seen_ns // 1_000_000,
+                "state": self._hub.state(drive),
+                "fault": self._hub.fault(drive),
+                "values": fresh_values(self._hub, drive),
+            },
+            ensure_ascii=False,
+        ).encode()
+
+    def _tell(self, drive: str, what: str, told: Told) -> None:
+        said = json.dumps({"what": what, "done": told.is_done, "text": told.text}, ensure_ascii=False)
+        self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
+
+    def _discover(self, name: str) -> None:
+        _, drive = self._inside.plant.find_drive(name)
+        may = self._inside.commands.may.write
+        writable = [register for register in drive.registers if f"{name}.{register}" in may]
+        topics = {
+            "state": self._topic(name),
+            "gateway": self._topic("gateway"),
+            "available": self._topic(name, "available"),
+            "set": self._topic(name, "set"),
+            "stop": self._topic(name, "stop"),
+        }
+        said = discovery(
+            drive,
+            self._hub.polled(name),
+            topics,
+            prefix=self._settings.prefix,
+            version=self._inside.version,
+            every_s=self._settings.every_s,
+            writable=writable,
+            takes_commands=self._settings.commands,
+        )
+        self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
+
+
+def _read_write(payload: bytes) -> tuple[float, int]:
+    """Return value and time of a write. Raises ValueError for what is none."""
+    given = _read(payload, "value")
+    value = given["value"]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"value is {value!r}, and not a number")  # noqa: TRY004 (a person's mistake)
+    return value, given["time"]
+
+
+def _read_act(drive: str, payload: bytes) -> tuple[str, dict[str, object], int]:
+    """Return verb, options and time. Raises ValueError for what is none, or names another drive."""
+    given = _read(payload, "verb", "drive")
+    options = given.get("options", {})
+    if given["drive"] != drive:
+        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
+    if not isinstance(options, dict):
+        raise ValueError("options is no table")  # noqa: TRY004 (a person's mistake)
+    return str(given["verb"]), options, given["time"]
+
+
+def _read(payload: bytes, *keys: str) -> dict[str, Any]:
+    """Return an object with these keys and a time."""
+    try:
+        given = json.loads(payload)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if not isinstance(given, dict):
+        raise ValueError("it is no JSON object")  # noqa: TRY004 (a person's mistake)
+    for key in (*keys, "time"):
+        if key not in given:
+            raise ValueError(f"{key} is missing")
+    if isinstance(given["time"], bool) or not isinstance(given["time"], int):
+        raise ValueError("time is no whole number of ms")  # noqa: TRY004 (a person's mistake)
+    return given

@@ -1,0 +1,71 @@
+"""MQTT: tells brokers what the drives say, and takes commands from them where the plant file lets it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from multidrop import Batch
+from multidrop.gateway.broker import Broker, parse_broker
+from multidrop.gateway.json_topics import JsonTopics
+from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
+from multidrop.gateway.parts import Feed, Inside
+from multidrop.gateway.sparkplug_node import SparkplugNode
+
+
+def build(settings: MqttSettings, inside: Inside) -> Feed:
+    """Return the part. Raises ImportError without paho."""
+    speakers: list[Any] = [JsonTopics(settings, inside, _utc_ms)]
+    if settings.sparkplug:
+        speakers.append(SparkplugNode(settings, inside, _utc_ms))
+    return Mqtt(settings, inside, speakers)
+
+
+def _utc_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+class Mqtt:
+    """All that speaks by MQTT, each with a connection: a connection has one last will."""
+
+    def __init__(self, settings: MqttSettings, inside: Inside, speakers: list[Any]) -> None:
+        address, login = parse_broker(settings.broker), settings.login(inside.plant)
+        self._every = settings.every_s
+        self._speakers = speakers
+        self._brokers = []
+        for speaker in speakers:
+            name = f"{settings.prefix}-{inside.plant.path.stem}-{speaker.kind}"
+            broker = Broker(address, login, name, speaker)
+            speaker.outbox = broker.outbox
+            self._brokers.append(broker)
+
+    def take(self, batch: Batch) -> None:
+        """Do nothing: the hub has the newest rows."""
+
+    async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
+        """Publish every so many seconds, until cancelled."""
+        for broker in self._brokers:
+            broker.open()
+        while True:
+            for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+                if broker.is_connected:
+                    speaker.publish()
+            await sleep(self._every)
+
+    async def close(self) -> None:
+        """Say goodbye, and let go of the broker."""
+        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+            if broker.is_connected:
+                speaker.leave()
+            await broker.close()
+
+    def numbers(self) -> dict[str, int]:
+        """Return counts since the start: messages that were sent, and that were dropped."""
+        outboxes = [broker.outbox for broker in self._brokers]
+        return {
+            "sent": sum(outbox.sent for outbox in outboxes),
+            "dropped": sum(outbox.dropped for outbox in outboxes),
+            "connected": sum(broker.is_connected for broker in self._brokers),
+        }

@@ -1,0 +1,182 @@
+"""Sparkplug B: payloads of an edge node and its devices, in Protocol Buffers' wire format.
+
+Eclipse Sparkplug specification 3.0.0, sections 6.4 (payloads) and 5 (birth, death, rebirth). Pure: bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from enum import IntEnum
+from typing import NamedTuple
+
+NAMESPACE = "spBv1.0"
+REBIRTH = "Node Control/Rebirth"
+BIRTH_DEATH = "bdSeq"
+SEQUENCES = 256  # seq and bdSeq go from 0 to 255, and again
+
+# Payload's and Metric's fields (section 6.4.1)
+_TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
+_NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_NULL = 1, 2, 3, 4, 7
+_INT, _LONG, _FLOAT, _DOUBLE, _BOOLEAN, _STRING = 10, 11, 12, 13, 14, 15
+
+_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
+MOST_PAYLOAD = 65_536  # bytes of a command
+_MOST_VARINT = 10  # bytes
+
+
+class DataType(IntEnum):
+    """Sparkplug's numbers of the types that are used here (section 6.4.16)."""
+
+    INT64 = 4
+    UINT64 = 8
+    DOUBLE = 10
+    BOOLEAN = 11
+    STRING = 12
+
+
+class Metric(NamedTuple):
+    """One metric: by name and alias in a birth, by alias alone afterwards."""
+
+    datatype: DataType
+    value: float | str | None  # None: null
+    time_ms: int
+    name: str = ""
+    alias: int | None = None
+
+
+class Given(NamedTuple):
+    """A metric of a command, as somebody sent it."""
+
+    name: str  # "": it came by its alias
+    alias: int | None
+    value: float | str | None
+
+
+def payload(time_ms: int, metrics: Iterable[Metric], seq: int | None) -> bytes:
+    """Return a payload; an NDEATH has no `seq`."""
+    parts = [_number(_TIMESTAMP, time_ms), *(_bytes(_METRICS, _metric(metric)) for metric in metrics)]
+    if seq is not None:
+        parts.append(_number(_SEQ, seq))
+    return b"".join(parts)
+
+
+def _metric(metric: Metric) -> bytes:
+    parts = []
+    if metric.name:
+        parts.append(_bytes(_NAME, metric.name.encode()))
+    if metric.alias is not None:
+        parts.append(_number(_ALIAS, metric.alias))
+    parts += [_number(_METRIC_TIME, metric.time_ms), _number(_DATATYPE, metric.datatype)]
+    parts.append(_number(_IS_NULL, 1) if metric.value is None else _value(metric.datatype, metric.value))
+    return b"".join(parts)
+
+
+def _value(datatype: DataType, value: float | str) -> bytes:
+    if datatype is DataType.STRING:
+        return _bytes(_STRING, str(value).encode())
+    if datatype is DataType.DOUBLE:
+        return _key(_DOUBLE, _EIGHT) + struct.pack("<d", float(value))
+    if datatype is DataType.BOOLEAN:
+        return _number(_BOOLEAN, bool(value))
+    return _number(_LONG, int(value) & 0xFFFF_FFFF_FFFF_FFFF)
+
+
+def _key(field: int, wire: int) -> bytes:
+    return _varint(field << 3 | wire)
+
+
+def _number(field: int, value: int) -> bytes:
+    return _key(field, _VARINT) + _varint(value)
+
+
+def _bytes(field: int, value: bytes) -> bytes:
+    return _key(field, _BYTES) + _varint(len(value)) + value
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def read_command(data: bytes) -> tuple[int, list[Given]]:
+    """Return time (UTC, ms; 0 for none) and metrics of an NCMD or a DCMD.
+
+    Raises ValueError for what is no payload.
+    """
+    if len(data) > MOST_PAYLOAD:
+        raise ValueError(f"a payload of {len(data)} bytes")
+    time_ms, given = 0, []
+    for field, value in _fields(data):
+        if field == _TIMESTAMP and isinstance(value, int):
+            time_ms = value
+        elif field == _METRICS and isinstance(value, bytes):
+            given.append(_given(value))
+    return time_ms, given
+
+
+def _given(data: bytes) -> Given:
+    name, alias, value = "", None, None
+    for field, found in _fields(data):
+        if field == _NAME and isinstance(found, bytes):
+            name = _text(found)
+        elif field == _ALIAS and isinstance(found, int):
+            alias = found
+        else:
+            value = _found_value(field, found, value)
+    return Given(name, alias, value)
+
+
+def _found_value(field: int, found: int | bytes, before: float | str | None) -> float | str | None:
+    if field in (_INT, _LONG, _BOOLEAN) and isinstance(found, int):
+        return found
+    if field == _STRING and isinstance(found, bytes):
+        return _text(found)
+    if field in (_FLOAT, _DOUBLE) and isinstance(found, bytes):
+        form = {4: "<f", 8: "<d"}.get(len(found))
+        if form is None:
+            raise ValueError("a float of the wrong size")
+        return float(struct.unpack(form, found)[0])
+    return before
+
+
+def _text(found: bytes) -> str:
+    try:
+        return found.decode()
+    except UnicodeDecodeError:
+        raise ValueError("a text that is not UTF-8") from None
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """Yield each field's number and value: an int of a varint, bytes of all else."""
+    at = 0
+    while at < len(data):
+        key, at = _read_varint(data, at)
+        wire = key & 7
+        if wire == _VARINT:
+            value, at = _read_varint(data, at)
+            yield key >> 3, value
+            continue
+        if wire == _BYTES:
+            length, at = _read_varint(data, at)
+        elif wire in (_EIGHT, _FOUR):
+            length = 8 if wire == _EIGHT else 4
+        else:
+            raise ValueError(f"a field of wire type {wire}")
+        if length > len(data) - at:
+            raise ValueError("a field that is longer than the payload")
+        yield key >> 3, data[at : at + length]
+        at += length
+
+
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for shift, byte in enumerate(data[at : at + _MOST_VARINT]):
+        value |= (byte & 0x7F) << 7 * shift
+        if byte < 0x80:
+            return value & 0xFFFF_FFFF_FFFF_FFFF, at + shift + 1
+    raise ValueError("a number without an end")

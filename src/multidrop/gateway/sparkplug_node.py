@@ -1,0 +1,197 @@
+"""Edge node of Sparkplug B: births, data by exception, deaths, and rebirth when it is asked for."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from multidrop import Register
+from multidrop.gateway.broker import parse_broker
+from multidrop.gateway.commands import Told
+from multidrop.gateway.hub import SILENT
+from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
+from multidrop.gateway.orders import Orders
+from multidrop.gateway.outbox import Publication
+from multidrop.gateway.parts import Inside
+from multidrop.gateway.rights import Caller, Right
+from multidrop.gateway.sparkplug import (
+    BIRTH_DEATH,
+    NAMESPACE,
+    REBIRTH,
+    SEQUENCES,
+    DataType,
+    Given,
+    Metric,
+    payload,
+    read_command,
+)
+
+STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
+_log = logging.getLogger("multidrop.gateway.mqtt")
+Value = float | str | None
+
+
+class SparkplugNode:
+    """An edge node, each of whose devices is a drive; values are sent when they change."""
+
+    kind = "sparkplug"
+
+    def __init__(self, settings: MqttSettings, inside: Inside, utc_ms: Callable[[], int]) -> None:
+        self.outbox: Any = None
+        self._settings = settings
+        self._inside = inside
+        self._hub = inside.hub
+        self._utc_ms = utc_ms
+        self._node = settings.node or inside.plant.path.stem
+        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
+        self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
+        self._birth = -1  # bdSeq
+        self._seq = 0
+        self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
+        self._changed: dict[str, dict[str, Value]] = {}
+        self._aliases: dict[tuple[str, str], int] = {}
+
+    def _topic(self, kind: str, *device: str) -> str:
+        return "/".join((NAMESPACE, self._settings.sparkplug, kind, self._node, *device))
+
+    # ---- a speaker ----
+
+    def will(self) -> Publication:
+        self._birth = (self._birth + 1) % SEQUENCES
+        return Publication(self._topic("NDEATH"), self._death, qos=1)
+
+    def topics(self) -> list[tuple[str, int]]:
+        listened = [(self._topic("NCMD"), 1)]
+        return [*listened, (self._topic("DCMD", "+"), 1)] if self._settings.commands else listened
+
+    def connected(self) -> None:
+        self._said.clear()
+        self._changed.clear()
+        self.outbox.put(Publication(self._topic("NBIRTH"), self._node_birth, qos=0))
+        self.publish()
+
+    def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
+        levels = topic.split("/")
+        try:
+            sent_ms, metrics = read_command(payload)
+        except ValueError as mistake:
+            _log.warning("a command on %s is no Sparkplug payload: %s", topic, mistake)
+            return
+        if levels[2] == "NCMD":
+            if any(given.name == REBIRTH and given.value for given in metrics):
+                self.connected()
+            return
+        for given in metrics:
+            self._order(levels[-1], given, sent_ms, is_retained=is_retained)
+
+    def publish(self) -> None:
+        """Say what changed of each drive, and which came and went."""
+        for drive in self._hub.drives:
+            if self._hub.state(drive) == SILENT:
+                if self._said.pop(drive, None) is not None:
+                    self.outbox.put(Publication(self._topic("DDEATH", drive), self._device_death, qos=0))
+                continue
+            values = self._values(drive)
+            before = self._said.get(drive)
+            self._said[drive] = values
+            if before is None:
+                self._put(drive, "DBIRTH", self._device_birth)
+                continue
+            changed = {name: value for name, value in values.items() if value != before[name]}
+            if changed:
+                self._changed.setdefault(drive, {}).update(changed)
+                self._put(drive, "DDATA", self._data)
+
+    def leave(self) -> None:
+        """Say that the node goes: its will is not sent at a disconnect in good order."""
+        self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
+
+    # ---- payloads, each made when it is sent: their numbers go up by one ----
+
+    def _put(self, drive: str, kind: str, make: Any) -> None:
+        self.outbox.put(Publication(self._topic(kind, drive), lambda: make(drive), qos=0))
+
+    def _next(self) -> int:
+        self._seq = (self._seq + 1) % SEQUENCES
+        return self._seq
+
+    def _death(self) -> bytes:
+        now = self._utc_ms()
+        return payload(now, [Metric(DataType.INT64, self._birth, now, BIRTH_DEATH)], None)
+
+    def _node_birth(self) -> bytes:
+        self._seq, now = 0, self._utc_ms()
+        metrics = [
+            Metric(DataType.INT64, self._birth, now, BIRTH_DEATH),
+            Metric(DataType.BOOLEAN, False, now, REBIRTH),
+        ]
+        return payload(now, metrics, self._seq)
+
+    def _device_birth(self, drive: str) -> bytes:
+        now, values = self._utc_ms(), self._values(drive)
+        self._said[drive] = values
+        self._changed.pop(drive, None)
+        metrics = [
+            Metric(self._datatype(drive, name), value, now, name, self._alias(drive, name))
+            for name, value in values.items()
+        ]
+        if self._settings.commands:
+            metrics.append(Metric(DataType.BOOLEAN, False, now, STOP, self._alias(drive, STOP)))
+        return payload(now, metrics, self._next())
+
+    def _device_death(self) -> bytes:
+        return payload(self._utc_ms(), [], self._next())
+
+    def _data(self, drive: str) -> bytes:
+        now = self._utc_ms()
+        metrics = [
+            Metric(self._datatype(drive, name), value, now, alias=self._alias(drive, name))
+            for name, value in self._changed.pop(drive, {}).items()
+        ]
+        return payload(now, metrics, self._next())
+
+    def _values(self, drive: str) -> dict[str, Value]:
+        found: dict[str, Value] = {STATE: self._hub.state(drive), FAULT: self._hub.fault(drive)}
+        found |= fresh_values(self._hub, drive)
+        for name in self._writable(drive):
+            found.setdefault(name, None)
+        return found
+
+    def _writable(self, drive: str) -> list[str]:
+        if not self._settings.commands:
+            return []
+        listed = self._inside.commands.may.write
+        return [name for name in self._registers(drive) if f"{drive}.{name}" in listed]
+
+    def _registers(self, drive: str) -> dict[str, Register[Any]]:
+        return dict(self._inside.plant.find_drive(drive)[1].registers)
+
+    def _datatype(self, drive: str, name: str) -> DataType:
+        if name in (STATE, FAULT) and name not in self._registers(drive):
+            return DataType.STRING
+        named = self._registers(drive)[name].values is not None
+        return DataType.STRING if named else DataType.DOUBLE
+
+    def _alias(self, drive: str, name: str) -> int:
+        return self._aliases.setdefault((drive, name), len(self._aliases) + 1)
+
+    # ---- commands ----
+
+    def _order(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
+        name = given.name or self._name_of(drive, given.alias)
+        if name == STOP and given.value:
+            self._orders.stop([drive])
+        elif is_retained:
+            self._orders.refuse(drive, name, "the broker had kept it; publish it without retain")
+        elif name not in self._writable(drive) or not isinstance(given.value, (int, float)):
+            self._orders.refuse(drive, name, "it is no register that [serve.may] lists, and a number for it")
+        else:
+            self._orders.write(drive, name, float(given.value), sent_ms)
+
+    def _name_of(self, drive: str, alias: int | None) -> str:
+        known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
+        return known.get(alias or 0, f"alias {alias}")
+
+    def _tell(self, drive: str, what: str, told: Told) -> None:
+        (_log.info if told.is_done else _log.warning)("%s of %s: %s", what, drive, told.text)

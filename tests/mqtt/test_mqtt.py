@@ -1,0 +1,323 @@
+"""MQTT through a real broker, heard and commanded by mosquitto's own clients."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish
+from peers import require_module
+
+from multidrop import InvtCHE, PolledDrive
+from multidrop.gateway.mqtt import MqttSettings, build
+from multidrop.gateway.outbox import MOST_UNDER_WAY
+
+Start = Callable[..., tuple[Any, Running]]
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with mosquitto(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def listener(broker: Broker) -> Iterator[Listener]:
+    listener = Listener(broker)
+    yield listener
+    listener.close()
+
+
+@pytest.fixture
+def start(broker: Broker, tmp_path: Path) -> Iterator[Start]:
+    require_module("paho.mqtt.client")
+    running: list[Running] = []
+
+    def start(**settings: Any) -> tuple[Any, Running]:
+        known = inside(tmp_path)
+        part = build(MqttSettings(broker.address, **settings), known)
+        running.append(Running(part))
+        return known, running[-1]
+
+    yield start
+    for one in running:
+        one.close()
+
+
+def has(topic: str, payload: bytes | None = None) -> Callable[[Heard], bool]:
+    return lambda heard: heard.topic == topic and payload in (None, heard.payload)
+
+
+def json_of(heard: Heard) -> Any:
+    return json.loads(heard.payload)
+
+
+def now_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+def test_a_drive_s_newest_values_are_kept_for_who_comes_later(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
+    later = Listener(broker)
+    said = later.wait_for(has("multidrop/pump-1"))
+    later.close()
+    assert said.is_retained
+    assert json_of(said) == {
+        "time": 7,
+        "state": "runs",
+        "fault": None,
+        "values": {"output_frequency": 49.5, "status": "FORWARD"},
+    }
+
+
+def test_a_value_that_is_not_fresh_is_null_and_a_silent_drive_is_offline(
+    listener: Listener, start: Start
+) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    known.hub.values[("pump-1", "output_frequency")] = None
+    known.hub.states["pump-1"] = "silent"
+    running.step()
+    listener.wait_for(has("multidrop/pump-1/available", b"offline"))
+    said = [heard for heard in listener.all if heard.topic == "multidrop/pump-1"][-1]
+    assert json_of(said)["values"]["output_frequency"] is None
+
+
+def test_the_broker_says_that_the_gateway_is_gone(listener: Listener, start: Start) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    listener.wait_for(has("multidrop/gateway", b"online"))
+
+
+def test_it_says_goodbye(broker: Broker, listener: Listener, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    running.close()
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+
+
+def test_a_broker_that_stands_still_holds_up_nothing(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, running = start()
+    listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
+    broker.signal(signal.SIGSTOP)
+    [connection] = running._part._brokers
+    for round in range(500):
+        known.hub.values[("pump-1", "output_frequency")] = float(round)
+        running.step()
+    assert len(connection.outbox._under_way) <= MOST_UNDER_WAY
+    assert len(connection.outbox._waiting) <= 4
+    broker.signal(signal.SIGCONT)
+    listener.wait_for(
+        lambda heard: (
+            heard.topic == "multidrop/pump-1" and json_of(heard)["values"]["output_frequency"] == 499.0
+        )
+    )
+    assert running._part.numbers()["dropped"] > 0
+
+
+def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
+    start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    broker.kill()
+    broker.start()
+    again = Listener(broker)
+    again.wait_for(has("multidrop/gateway", b"online"))
+    again.wait_for(has("multidrop/pump-1"))
+    again.close()
+
+
+def test_nats_takes_it_too(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with nats(tmp_path) as broker:
+        listener = Listener(broker)
+        running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
+        try:
+            listener.wait_for(has("multidrop/pump-1"))
+        finally:
+            running.close()
+            listener.close()
+
+
+# ---- commands ----
+
+
+def told(listener: Listener, drive: str = "pump-1") -> Any:
+    return json_of(listener.wait_for(has(f"multidrop/{drive}/told")))
+
+
+def write_of(value: object, time_ms: int) -> bytes:
+    return json.dumps({"value": value, "time": time_ms}).encode()
+
+
+def test_a_fresh_write_is_carried_out_once(broker: Broker, listener: Listener, start: Start) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    fresh = write_of(25, now_ms())
+    publish(broker, "multidrop/pump-1/set/setpoint", fresh)
+    assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done"}
+    publish(broker, "multidrop/pump-1/set/setpoint", fresh)
+    assert told(listener)["text"] == "not sent: it came a second time"
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 25)]
+
+
+@pytest.mark.parametrize("age_ms", [60_000, -60_000])
+def test_a_command_that_was_held_up_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, age_ms: int
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms() - age_ms
+    publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
+    assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
+    act = json.dumps({"verb": "start", "drive": "pump-1", "time": sent_ms}).encode()
+    publish(broker, "multidrop/pump-1/act", act)
+    assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
+    assert known.commands.noted == []
+
+
+@pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
+def test_a_command_that_the_broker_keeps_is_not_carried_out(
+    broker: Broker, listener: Listener, start: Start, topic: str
+) -> None:
+    sent = {"value": 25, "verb": "start", "drive": "pump-1", "time": now_ms() + 1000}
+    publish(broker, topic, json.dumps(sent).encode(), "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["text"].startswith("not sent: the broker had kept it")
+    assert known.commands.noted == []
+
+
+def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
+    publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
+    known, _ = start(commands=True)
+    assert told(listener)["what"] == "stop"
+    publish(broker, "multidrop/stop", b"whatever")
+    assert told(listener)["what"] == "stop"
+    publish(broker, f"multidrop/{FAN.name}/stop", b"stop", "-q", "1")
+    assert told(listener, FAN.name)["what"] == "stop"
+    assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
+
+
+def test_a_verb_names_its_drive_again(broker: Broker, listener: Listener, start: Start) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
+    publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
+    assert "it names drive 'pump-1'" in told(listener, FAN.name)["text"]
+    publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
+    assert told(listener)["done"]
+    assert known.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (b"25", "it is no JSON object"),
+        (b'{"value": 25}', "time is missing"),
+        (b'{"time": 25}', "value is missing"),
+        (b'{"value": "25", "time": 1}', "value is '25', and not a number"),
+        (b'{"value": true, "time": 1}', "value is True, and not a number"),
+        (b'{"value": 25, "time": "1"}', "time is no whole number of ms"),
+        (b"\xc3\x28", "codec"),
+        (b"[" * 60_000, "nested too deeply"),
+    ],
+)
+def test_what_is_no_command_is_told(
+    broker: Broker, listener: Listener, start: Start, payload: bytes, why: str
+) -> None:
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/pump-1/set/setpoint", payload)
+    assert why in told(listener)["text"]
+    assert known.commands.noted == []
+
+
+def test_without_the_key_nothing_is_listened_to(broker: Broker, listener: Listener, start: Start) -> None:
+    known, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    publish(broker, "multidrop/stop", b"stop", "-q", "1")
+    listener.wait_for(has("multidrop/stop"))
+    running.step()
+    listener.wait_for(has("multidrop/pump-1"))
+    assert known.commands.noted == []
+
+
+# ---- Home Assistant ----
+
+
+def test_home_assistant_is_told_of_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
+    start(home_assistant=True, commands=True, every="2 s")
+    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
+    found = json_of(said)
+    assert found["availability"] == [{"topic": "multidrop/gateway"}, {"topic": "multidrop/pump-1/available"}]
+    parts = found["cmps"]
+    assert set(parts) == {"state", "output_frequency", "status", "setpoint_set", "stop"}
+    assert len({part["unique_id"] for part in parts.values()}) == len(parts)
+    sensor = parts["output_frequency"]
+    assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
+    assert sensor["expire_after"] == 6
+    assert "unit_of_measurement" not in parts["status"]
+    assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
+
+
+def test_its_command_template_makes_a_fresh_write(broker: Broker, listener: Listener, start: Start) -> None:
+    jinja2 = require_module("jinja2")
+    known, _ = start(home_assistant=True, commands=True)
+    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
+    part = json_of(said)["cmps"]["setpoint_set"]
+    environment = jinja2.Environment()
+    template = environment.from_string(part["command_template"])
+
+    publish(
+        broker, part["command_topic"], template.render(value=12.5, now=lambda: datetime.now(UTC)).encode()
+    )
+    assert told(listener)["done"]
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
+
+
+def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start) -> None:
+    start(home_assistant=True)
+    ids = {listener.wait_for(lambda heard: heard.topic.startswith("homeassistant/")).topic for _ in range(2)}
+    assert len(ids) == 2
+    assert all(topic.isascii() for topic in ids)
+
+
+# ---- settings ----
+
+
+def test_every_mistake_of_the_settings_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="broker = ") as told:
+        MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
+    sentences = str(told.value).splitlines()
+    assert len(sentences) == 5
+    assert (
+        sentences[0] == 'broker = "http://x" is no broker; write broker = "mqtt://broker:1883", or mqtts://'
+    )
+
+
+def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
+    plant = inside(tmp_path).plant
+    odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway"))
+    plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
+    assert MqttSettings(password="secret").check(plant) == [
+        f'password = "secret": there is no file {tmp_path}/secret',
+        *(
+            f"drive {name!r} cannot be a topic: give it a name without + # and /"
+            for name in ("a/b", "gateway")
+        ),
+    ]

@@ -1,0 +1,183 @@
+"""An edge node through a real broker: births, data, deaths and rebirth, as a host sees them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, publish, sparkplug_messages
+from peers import require_module
+
+from multidrop.gateway.mqtt import MqttSettings, build
+
+ROOT = "spBv1.0/works/{}/line"
+
+
+class Host:
+    """A host: it checks that the sequence numbers of a node go up by one."""
+
+    def __init__(self, broker: Broker) -> None:
+        self._listener = Listener(broker, "spBv1.0/#")
+        self._messages = sparkplug_messages()
+        self.seq: int | None = None
+        self.aliases: dict[int, str] = {}
+        self.kinds: list[str] = []
+
+    def wait_for(self, kind: str, device: str = "") -> Any:
+        wanted = ROOT.format(kind) + (f"/{device}" if device else "")
+        return self._decoded(self._listener.wait_for(lambda heard: self._take(heard) == wanted))
+
+    def _decoded(self, heard: Heard) -> Any:
+        return self._messages.Payload.FromString(heard.payload)
+
+    def _take(self, heard: Heard) -> str:
+        kind = heard.topic.split("/")[2]
+        if kind.endswith("CMD"):
+            return heard.topic
+        self.kinds.append(kind)
+        found = self._decoded(heard)
+        if kind == "NBIRTH":
+            self.seq = 0
+            assert found.seq == 0
+        elif kind != "NDEATH":
+            assert self.seq is not None
+            self.seq = (self.seq + 1) % 256
+            assert found.seq == self.seq
+        if kind == "DBIRTH":
+            self.aliases |= {metric.alias: metric.name for metric in found.metrics}
+        return heard.topic
+
+    def values(self, found: Any) -> dict[str, Any]:
+        return {
+            metric.name or self.aliases[metric.alias]: None
+            if metric.is_null
+            else getattr(metric, metric.WhichOneof("value"))
+            for metric in found.metrics
+        }
+
+    def close(self) -> None:
+        self._listener.close()
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    with mosquitto(tmp_path) as broker:
+        yield broker
+
+
+@pytest.fixture
+def host(broker: Broker) -> Iterator[Host]:
+    host = Host(broker)
+    yield host
+    host.close()
+
+
+@pytest.fixture
+def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Running]]:
+    require_module("paho.mqtt.client")
+    known = inside(tmp_path)
+    settings = MqttSettings(broker.address, sparkplug="works", node="line", commands=True)
+    running = Running(build(settings, known))
+    yield known, running
+    running.close()
+
+
+def test_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
+    known, running = node
+    birth = host.values(host.wait_for("NBIRTH"))
+    assert birth == {"bdSeq": 0, "Node Control/Rebirth": False}
+    assert host.values(host.wait_for("DBIRTH", "pump-1")) == {
+        "state": "runs",
+        "fault": None,
+        "output_frequency": 49.5,
+        "status": "FORWARD",
+        "setpoint": None,
+        "Device Control/Stop": False,
+    }
+    host.wait_for("DBIRTH", FAN.name)
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    assert host.values(host.wait_for("DDATA", "pump-1")) == {"output_frequency": 50.0}
+    known.hub.states[FAN.name] = "silent"
+    running.step()
+    host.wait_for("DDEATH", FAN.name)
+    known.hub.states[FAN.name] = "fault"
+    known.hub.faults[FAN.name] = "перегрев"
+    running.step()
+    born = host.values(host.wait_for("DBIRTH", FAN.name))
+    assert (born["state"], born["fault"]) == ("fault", "перегрев")
+
+
+def test_what_did_not_change_is_not_said(host: Host, node: tuple[Any, Running]) -> None:
+    known, running = node
+    host.wait_for("DBIRTH", FAN.name)
+    for _ in range(5):
+        running.step()
+    known.hub.states[FAN.name] = "stands"
+    running.step()
+    host.wait_for("DDATA", FAN.name)
+    assert host.kinds.count("DDATA") == 1
+
+
+def test_sequence_numbers_begin_again_after_255(host: Host, node: tuple[Any, Running]) -> None:
+    known, running = node
+    host.wait_for("DBIRTH", FAN.name)
+    for value in range(300):
+        known.hub.values[("pump-1", "output_frequency")] = float(value)
+        running.step()
+        host.wait_for("DDATA", "pump-1")
+    assert host.seq is not None
+    assert host.seq < 256
+
+
+def command(broker: Broker, topic: str, **metric: Any) -> None:
+    sent = sparkplug_messages().Payload(timestamp=metric.pop("time_ms", time.time_ns() // 1_000_000))
+    sent.metrics.add(**metric)
+    publish(broker, topic, sent.SerializeToString())
+
+
+def test_rebirth(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+    host.wait_for("DBIRTH", FAN.name)
+    command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
+    assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
+    host.wait_for("DBIRTH", "pump-1")
+    host.wait_for("DBIRTH", FAN.name)
+
+
+def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
+    host: Host, node: tuple[Any, Running]
+) -> None:
+    host.wait_for("DBIRTH", FAN.name)
+    node[1].cut(1)
+    assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
+    assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 1
+    host.wait_for("DBIRTH", "pump-1")
+
+
+def test_the_end_is_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    settings = MqttSettings(broker.address, sparkplug="works", node="line")
+    running = Running(build(settings, inside(tmp_path)))
+    host.wait_for("DBIRTH", FAN.name)
+    running.close()
+    assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
+
+
+def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+    known, _ = node
+    host.wait_for("DBIRTH", "pump-1")
+    alias = {name: number for number, name in host.aliases.items()}["setpoint"]
+    host.wait_for("DBIRTH", FAN.name)
+    topic = ROOT.format("DCMD") + "/pump-1"
+    old_ms = time.time_ns() // 1_000_000 - 60_000
+    command(broker, topic, name="setpoint", double_value=10.0, datatype=10, time_ms=old_ms)
+    command(broker, topic, name="status", double_value=1.0, datatype=10)
+    command(broker, topic, alias=alias, double_value=25.0, datatype=10)
+    command(broker, topic, name="Device Control/Stop", boolean_value=True, datatype=11, time_ms=old_ms)
+    ends = time.monotonic() + 30
+    while len(known.commands.noted) < 2 and time.monotonic() < ends:
+        time.sleep(0.01)
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 25.0), ("stop", ["pump-1"])]

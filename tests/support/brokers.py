@@ -1,0 +1,279 @@
+"""MQTT brokers of others, a listener of others, and a plant whose drives say what a test wants."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import os
+import queue
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, NamedTuple
+
+from peers import require_module, require_program
+
+from multidrop import InvtCHE, Plant, PlantLine, Polled, PolledDrive
+from multidrop.gateway.commands import Told
+from multidrop.gateway.hub import Newest
+from multidrop.gateway.parts import Inside
+from multidrop.gateway.rights import Caller, May
+
+PATIENCE_S = 30.0  # for an event that comes at once on an idle machine
+
+
+def free_port() -> int:
+    with closing(socket.socket()) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+class Broker:
+    """A broker's process on a port of its own."""
+
+    def __init__(self, command: Callable[[int], Sequence[str]]) -> None:
+        self.port = free_port()
+        self._command = command
+        self.start()
+
+    @property
+    def address(self) -> str:
+        return f"mqtt://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            self._command(self.port), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        ends = time.monotonic() + PATIENCE_S
+        while True:
+            with closing(socket.socket()) as one:
+                if one.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return
+            assert self.process.poll() is None, "the broker ended at once"
+            assert time.monotonic() < ends, "the broker does not listen"
+            time.sleep(0.02)
+
+    def signal(self, number: int) -> None:
+        os.kill(self.process.pid, number)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def mosquitto(folder: Path) -> Iterator[Broker]:
+    program = require_program("mosquitto")
+
+    def command(port: int) -> list[str]:
+        (folder / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+        return [program, "-c", str(folder / "mosquitto.conf")]
+
+    yield from _running(Broker(command))
+
+
+@contextmanager
+def nats(folder: Path) -> Iterator[Broker]:
+    program = require_program("nats-server")
+
+    def command(port: int) -> list[str]:
+        (folder / "nats.conf").write_text(
+            f'server_name: one\nport: {free_port()}\nhost: "127.0.0.1"\n'
+            f'jetstream {{ store_dir: "{folder}/nats" }}\nmqtt {{ host: "127.0.0.1", port: {port} }}\n'
+        )
+        return [program, "-c", str(folder / "nats.conf")]
+
+    yield from _running(Broker(command))
+
+
+def _running(broker: Broker) -> Iterator[Broker]:
+    try:
+        yield broker
+    finally:
+        broker.kill()
+
+
+class Heard(NamedTuple):
+    topic: str
+    is_retained: bool
+    payload: bytes
+
+
+class Listener:
+    """mosquitto_sub, which hears everything that is published from now on, and what was kept."""
+
+    def __init__(self, broker: Broker, topic: str = "#") -> None:
+        program = require_program("mosquitto_sub")
+        self._process = subprocess.Popen(
+            [program, "-p", str(broker.port), "-t", topic, "-q", "1", "-F", "%t|%r|%x"],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._heard: queue.Queue[Heard] = queue.Queue()
+        self.all: list[Heard] = []
+        self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+        while not self._hears.wait(0.05):  # until the broker has its subscription
+            publish(broker, self._probe, b"probe")
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        with self._process.stdout:
+            self._note(self._process.stdout)
+
+    def _note(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            topic, kept, payload = line.rstrip("\n").rsplit("|", 2)
+            if topic == self._probe:
+                self._hears.set()
+            else:
+                self._heard.put(Heard(topic, kept == "1", bytes.fromhex(payload)))
+
+    def wait_for(self, wanted: Callable[[Heard], object]) -> Heard:
+        """Return the next message that is wanted; those before it are kept in `all`."""
+        ends = time.monotonic() + PATIENCE_S
+        while True:
+            heard = self._heard.get(timeout=max(0.0, ends - time.monotonic()))
+            self.all.append(heard)
+            if wanted(heard):
+                return heard
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._thread.join()
+
+
+def publish(broker: Broker, topic: str, payload: bytes, *options: str) -> None:
+    """Publish by mosquitto_pub."""
+    program = require_program("mosquitto_pub")
+    command = [program, "-p", str(broker.port), "-t", topic, "-s", *options]
+    subprocess.run(command, input=payload, check=True, timeout=PATIENCE_S)
+
+
+def sparkplug_messages() -> ModuleType:
+    """Eclipse's message definitions, as pysparkplug carries them; its own client needs another paho."""
+    require_module("google.protobuf")
+    try:
+        path = distribution("pysparkplug").locate_file("pysparkplug/_protobuf/sparkplug_b_pb2.py")
+    except PackageNotFoundError:
+        return require_module("pysparkplug")
+    spec = importlib.util.spec_from_file_location("sparkplug_b_pb2", str(path))
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+PUMP, FAN = InvtCHE(1, name="pump-1"), InvtCHE(2, name="вентилятор 2")
+
+
+class SaidHub:
+    """A hub that says what a test wants; values are by drive and register."""
+
+    def __init__(self) -> None:
+        self.values: dict[tuple[str, str], float | None] = {
+            ("pump-1", "output_frequency"): 49.5,
+            ("pump-1", "status"): 1.0,
+        }
+        self.states = {PUMP.name: "runs", FAN.name: "runs"}
+        self.faults: dict[str, str | None] = {}
+
+    @property
+    def drives(self) -> Iterator[str]:
+        return iter([PUMP.name, FAN.name])
+
+    def polled(self, drive: str) -> tuple[Any, ...]:
+        return (PUMP.output_frequency, PUMP.status)
+
+    def newest(self, drive: str, register: str) -> Newest | None:
+        value = self.values.get((drive, register))
+        return Newest(7_000_000, 7_000_000, value, "ok" if value is not None else "no reply")
+
+    def is_fresh(self, drive: str, register: str) -> bool:
+        return self.values.get((drive, register)) is not None
+
+    def seen_at(self, drive: str) -> int | None:
+        return 7_000_000
+
+    def state(self, drive: str) -> str:
+        return self.states[drive]
+
+    def fault(self, drive: str) -> str | None:
+        return self.faults.get(drive)
+
+
+class NotedCommands:
+    """Commands that are noted, and done."""
+
+    def __init__(self) -> None:
+        self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
+        self.noted: list[tuple[Any, ...]] = []
+
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+        self.noted.append(("stop", drives))
+        return dict.fromkeys(drives or ["pump-1"], Told(True, "stopped"))
+
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+        self.noted.append(("write", drive, register, value))
+        return Told(True, "done")
+
+    async def act(self, drive: str, verb: str, options: Mapping[str, object], caller: Caller) -> Told:
+        self.noted.append(("act", drive, verb, dict(options)))
+        return Told(True, "done")
+
+
+def inside(folder: Path) -> Any:
+    """Return what a part is given: two drives, a hub and commands of this test."""
+    polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
+    drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, FAN))
+    plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
+    hub: Any = SaidHub()
+    commands: Any = NotedCommands()
+    return Inside(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
+
+
+class Running:
+    """The part in a thread with a loop of its own; `step()` lets it publish once, and returns then."""
+
+    def __init__(self, part: Any) -> None:
+        self._part = part
+        self._loop = asyncio.new_event_loop()
+        self._step = asyncio.Event()
+        self._published = threading.Semaphore(0)
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),))
+        self._thread.start()
+        assert self._published.acquire(timeout=PATIENCE_S)
+
+    async def _live(self) -> None:
+        self._task = asyncio.ensure_future(self._part.run(self._sleep))
+        try:
+            await self._task
+        except asyncio.CancelledError:
+            await self._part.close()
+
+    async def _sleep(self, seconds: float) -> None:
+        self._published.release()
+        await self._step.wait()
+        self._step.clear()
+
+    def step(self) -> None:
+        self._loop.call_soon_threadsafe(self._step.set)
+        assert self._published.acquire(timeout=PATIENCE_S)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join(PATIENCE_S)
+        self._loop.close()
+
+    def cut(self, connection: int) -> None:
+        """Take a connection away, as a machine that loses its power does."""
+        self._part._brokers[connection]._client.socket().shutdown(socket.SHUT_RDWR)
