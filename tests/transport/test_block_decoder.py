@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
 from multidrop.planning.blocks import Block
 from multidrop.transport.block_decoder import BlockDecoder
 
