@@ -45,7 +45,9 @@ class WriteRecords:
             if kept is Kept.UNKNOWN:
                 advice = Advice(f'declare ram = ["{register.name}"]', f"add --ram {register.name}")
                 way = f"if you know that this drive keeps it in RAM, {advice.program}"
-            raise refused(drive, register, f"{why}; {way}", advice)
+            refusal = refused(drive, register, f"{why}; {way}", advice)
+            refusal.is_budget = True
+            raise refusal
 
     def count_later(self, drive: Drive, register: Register[Any]) -> None:
         self._uncounted.append(self._cell(drive, register))
