@@ -139,7 +139,7 @@ class ModbusServer:
     def _read(self, unit: Unit, request: MbapRequest, client: ModbusClient) -> bytes | Awaitable[bytes]:
         addresses = read_range(request)
         function, common = request.function, self.settings.common_addresses
-        if function in (3, 4) and (addresses.start in common or addresses[-1] in common):
+        if function in (3, 4) and addresses.start < common.stop and common.start < addresses.stop:
             words = self._common(unit, addresses)
         else:
             found = unit.words.read(
