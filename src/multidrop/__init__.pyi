@@ -80,6 +80,9 @@ from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer
 from multidrop.recording.format import RecordingReader as RecordingReader
 from multidrop.recording.reading import read as read
+from multidrop.toml_check import Key as Key
+from multidrop.toml_check import TomlPlace as TomlPlace
+from multidrop.toml_check import parse_duration as parse_duration
 from multidrop.transport.statistics import Delays as Delays
 from multidrop.transport.statistics import Diagnostics as Diagnostics
 from multidrop.transport.statistics import LineStatistics as LineStatistics

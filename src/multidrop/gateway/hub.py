@@ -12,6 +12,8 @@ from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReade
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 
+NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present
+
 STALE_NS = 1_000_000_000  # a value is never stale before that,
 STALE_PERIODS = 3  # nor before so many of its periods have passed
 
@@ -46,27 +48,37 @@ class Shown(NamedTuple):
 class _Cell:
     """One register of one drive."""
 
-    __slots__ = ("good", "interval_ns", "newest")
+    __slots__ = ("good", "interval_ns", "least_ns", "newest")
 
-    def __init__(self) -> None:
+    def __init__(self, least_ns: int) -> None:
         self.newest: tuple[int, int, float, int] | None = None  # time, monotonic, value, code of status
         self.good: tuple[int, int, float, int] | None = None
-        self.interval_ns = 0  # between its latest two samples
+        self.least_ns = least_ns  # of its intervals, as planned
+        self.interval_ns = 0  # between its latest two samples, with no miss between them
 
     @property
     def stale_ns(self) -> int:
         """The age from which its value is no longer the present one."""
-        return max(STALE_NS, STALE_PERIODS * self.interval_ns)
+        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
 
 
 class _Watched:
     """One drive of the plant."""
 
-    def __init__(self, polled: PolledDrive) -> None:
+    def __init__(self, polled: PolledDrive, cycle_ns: int) -> None:
         self.polled = polled
+        self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
         self.cells: dict[str, _Cell] = {}
         self.seen: tuple[int, Shown] | None = None  # at which batch
+
+    def cell(self, register: str) -> _Cell:
+        """Return the cell of a register, which is new where it was not known."""
+        if register not in self.cells:
+            every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
+            least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
+            self.cells[register] = _Cell(least_ns)
+        return self.cells[register]
 
 
 class Hub:
@@ -77,7 +89,7 @@ class Hub:
         self.now_ns = 0  # of the monotonic clock: the newest row's
         self.time = 0  # the same row's, UTC in ns
         self.taken = 0  # batches
-        self._cells: dict[int, _Cell | None] = {}  # by both codes; None: a drive that is gone
+        self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
@@ -88,12 +100,15 @@ class Hub:
         self.plant = plant
         self._cells = {}
         self._watched = {}
-        for polled in (polled for line in plant.lines for polled in line.drives):
-            name = polled.drive.name
-            known = before.get(name)
-            same = known is not None and known.polled.drive is polled.drive
-            self._watched[name] = known if known is not None and same else _Watched(polled)
-            self._watched[name].polled = polled
+        planned = plant.metadata()["planned"]
+        for line in plant.lines:
+            cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
+            for polled in line.drives:
+                known = before.get(polled.drive.name)
+                stays = known is not None and known.polled == polled
+                self._watched[polled.drive.name] = (
+                    known if known is not None and stays else _Watched(polled, cycle_ns)
+                )
 
     def take(self, batch: Batch) -> None:
         """Note the newest rows of a batch: about 1 us for each."""
@@ -119,18 +134,18 @@ class Hub:
                 if cell is None:
                     continue
             row = (time, monotonic_ns, value, status)
-            cell.newest = row
             if status == 0:
-                if cell.good is not None:
+                if cell.good is not None and cell.newest is cell.good:
                     cell.interval_ns = monotonic_ns - cell.good[1]
                 cell.good = row
+            cell.newest = row
             if monotonic_ns > self.now_ns:
                 self.now_ns, self.time = monotonic_ns, time
         self.taken += 1
 
     def _cell(self, drive: str, register: str) -> _Cell | None:
         watched = self._watched.get(drive)
-        return watched.cells.setdefault(register, _Cell()) if watched else None
+        return watched.cell(register) if watched else None
 
     # ---- values ----
 
@@ -215,9 +230,9 @@ class Hub:
         return Shown(RUNS if is_turning else UNKNOWN, None)
 
     def _unseen(self, misses: list[tuple[int, int, float, int]], *, is_all: bool) -> Shown:
-        """Tell a silent drive from one that refuses, and from one that was not asked yet."""
+        """Tell a silent drive from one that refuses, and from one that was not asked lately."""
         if not is_all:
-            return Shown(UNKNOWN, None)
+            return Shown(UNKNOWN, NOT_ASKED)
         reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
         if any(reason.startswith(_ANSWERED) for reason in reasons):
             return Shown(UNKNOWN, None)

@@ -7,7 +7,7 @@ import hmac
 import re
 import secrets
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from enum import IntEnum
 from ipaddress import ip_address
 from typing import NamedTuple
@@ -49,12 +49,12 @@ class Token(NamedTuple):
     """One line of the tokens' file: nothing that is there opens anything."""
 
     name: str
-    role: Right
+    right: Right
     sha256: str
 
     @property
     def line(self) -> str:
-        return f"{self.name} {self.role.name.lower()} {self.sha256}"
+        return f"{self.name} {self.right.name.lower()} {self.sha256}"
 
 
 def digest(token: str) -> str:
@@ -62,12 +62,12 @@ def digest(token: str) -> str:
     return hashlib.sha256(token.encode()).hexdigest()
 
 
-def new_token(name: str, role: Right) -> tuple[str, Token]:
+def new_token(name: str, right: Right) -> tuple[str, Token]:
     """Return a fresh token, to be told once, and its line. Raises ValueError for such a name."""
     if not NAME.fullmatch(name):
         raise ValueError(f"{name!r} is no name for a token: letters, digits, . _ @ and - do, 64 at most")
     secret = secrets.token_urlsafe(32)
-    return secret, Token(name, role, digest(secret))
+    return secret, Token(name, right, digest(secret))
 
 
 def read_tokens(text: str) -> tuple[list[Token], list[str]]:
@@ -98,6 +98,10 @@ class Tokens:
     def __len__(self) -> int:
         return len(self._tokens)
 
+    def replace(self, tokens: Iterable[Token]) -> None:
+        """Take the tokens of a file that was read again."""
+        self._tokens = tuple(tokens)
+
     def find(self, secret: str) -> Token | None:
         """Return the token of this secret; it takes as long for a wrong one."""
         given, found = digest(secret), None
@@ -125,15 +129,15 @@ class Tokens:
 class May(NamedTuple):
     """The table [serve.may]: what those may who have no token, and which writes and verbs anybody may."""
 
-    look: str = "anyone"
-    stop: str = "token"
+    look: str = "anyone"  # or "token"
+    on_loopback: Right = Right.LOOK  # without a token
     write: frozenset[str] = frozenset()
     verbs: frozenset[str] = frozenset()
 
     def without_token(self, *, is_loopback: bool) -> Right | None:
-        """Return the role of those without a token; None: not even a look."""
-        if self.stop == "anyone" and is_loopback:
-            return Right.STOP
+        """Return the right of those without a token; None: not even a look."""
+        if is_loopback and self.on_loopback > Right.LOOK:
+            return self.on_loopback
         return Right.LOOK if self.look == "anyone" else None
 
 
@@ -185,11 +189,3 @@ def _split(host: str) -> tuple[str, int | None] | None:
     except ValueError:
         return None
     return (f"[{name}]" if ":" in name else name), port
-
-
-def own_cookie(cookies: Mapping[str, str]) -> str:
-    """Return the token in the page's cookie; "" without one."""
-    return cookies.get(COOKIE, "")
-
-
-COOKIE = "multidrop"
