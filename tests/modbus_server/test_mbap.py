@@ -343,7 +343,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = cast(int, taken.getsockname()[1])
         with (
-            pytest.raises(OSError, match=rf"^\[serve.modbus\] cannot listen on 127.0.0.1:{number}: "),
+            pytest.raises(OSError, match=rf"127.0.0.1:{number} cannot be had: another program listens there"),
             serving(plant, ModbusSettings(listen=f"127.0.0.1:{number}")),
         ):
             pass

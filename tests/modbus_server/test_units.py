@@ -13,7 +13,7 @@ from multidrop.drives import MODELS, InnovertIBD, InvtCHE
 from multidrop.drives.registry import find_model
 from multidrop.gateway.passing import MAIN, ModbusSettings
 from multidrop.gateway.units import StopWrite, Unit, Units
-from multidrop.plant.model import PolledDrive
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
 FAMILIES = Path(__file__).parents[2] / "src" / "multidrop" / "families"
 
@@ -45,8 +45,8 @@ def test_all_clashes_are_told_at_once_with_the_numbers_that_are_free() -> None:
     with pytest.raises(ValueError, match="unit 1 would be") as mistake:
         Units(plant, ModbusSettings())
     first, second, last = str(mistake.value).splitlines()
-    assert first == "[serve.modbus] unit 1 would be pump (line hall) and mill (line yard)"
-    assert second == "[serve.modbus] unit 2 would be fan (line hall) and saw (line yard)"
+    assert first == "unit 1 would be pump (line hall) and mill (line yard)"
+    assert second == "unit 2 would be fan (line hall) and saw (line yard)"
     assert 'such as units = { "mill" = 3 }' in last
     assert last.endswith("free numbers: 3 to 4, 6 to 247")
 
@@ -80,7 +80,7 @@ def test_address_0_is_no_unit() -> None:
         level = reading(0, "m")
 
     with pytest.raises(ValueError, match=r"meter \(line net\) cannot be unit 0, but 1 to 255"):
-        Units(plant_of(("net", Behind(0, name="meter"))), ModbusSettings())
+        Units(plant_of(("net", Behind(0, name="meter")), polled=False), ModbusSettings())
     assert numbers(Units(plant_of(("net", Behind(255, name="meter"))), ModbusSettings())) == {
         (MAIN, 255): "meter"
     }
@@ -156,3 +156,22 @@ def test_declared_addresses_are_registers_texts_and_gaps() -> None:
     assert unit.writable(Carrier.BIT, 3) is Meter.relay
     assert unit.writable(Carrier.WORD, 9) is None
     assert unit.writable(Carrier.WORD, 3) is None
+
+
+def test_what_is_read_as_fast_as_the_line_allows_has_the_planned_cycle_as_its_period() -> None:
+    drives = [InnovertIBD(address, name=f"pump-{address}", baudrate=4800) for address in range(1, 31)]
+    fast = tuple(Polled(register, None) for register in InnovertIBD.readings())
+    line = PlantLine("hall", "/dev/hall", 4800, None, tuple(PolledDrive(drive, fast) for drive in drives))
+    plant = Plant((line,), Path("plant.toml"))
+    found = Units(plant, ModbusSettings()).find(MAIN, 1)
+    assert found is not None
+    periods = {poll.every for poll in found.polled.polls}
+    assert periods == {plant.metadata()["planned"]["hall"]["cycle_ms"] / 1e3}
+    assert min(period or 0 for period in periods) > 1
+
+
+def test_the_settings_are_checked_against_the_plant() -> None:
+    plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
+    first, _ = ModbusSettings().check(plant)
+    assert first == "unit 1 would be pump (line hall) and mill (line yard)"
+    assert ModbusSettings(units={"mill": 2}).check(plant) == []

@@ -127,7 +127,7 @@ class _Place:
 
 
 class DriveWords:
-    """The polled words of one drive, by function code and address."""
+    """The polled words of one drive, by function code and address; each register has its period."""
 
     def __init__(self, polled: PolledDrive) -> None:
         self._at: dict[tuple[int, int], list[tuple[_Place, int]]] = {}

@@ -9,7 +9,7 @@ import asyncio
 import logging
 import struct
 from collections.abc import Awaitable, Callable
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 from multidrop.gateway.modbus_codes import ModbusCode
 
@@ -233,11 +233,10 @@ class ModbusPort:
         self._may_connect = may_connect
         self._server: asyncio.Server | None = None
 
-    async def open(self, host: str, port: int) -> int:
-        """Listen, and return the port's number. Raises OSError where that cannot be had."""
+    async def open(self, listener: Any) -> None:
+        """Let clients come to a listening socket."""
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(lambda: ModbusClient(self), host, port)
-        return int(self._server.sockets[0].getsockname()[1])
+        self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
     def admit(self, client: ModbusClient) -> None:
         """Take a new client in; one that has been idle for long makes place where there is none."""

@@ -13,10 +13,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
 
-from multidrop import BusError, Carrier, Plant, Register
+from multidrop import Batch, BusError, Carrier, Plant, Register
 from multidrop.gateway.commands import Told
 from multidrop.gateway.common_block import STOP, CommonSource, common_words
 from multidrop.gateway.drive_words import Lack
+from multidrop.gateway.listener import listen
 from multidrop.gateway.mbap import SWEEP_S, Answer, MbapRequest, ModbusClient, ModbusPort
 from multidrop.gateway.modbus_codes import Declined, ModbusCode, code_of
 from multidrop.gateway.passing import MAIN, LineShare, ModbusSettings, PassingBusy
@@ -63,27 +64,35 @@ class ModbusServer:
         self._units = Units(plant, settings)
         self._role = Right[settings.may.upper()]
         self._shares: dict[str, LineShare] = {}
+        self._sockets: dict[str, Any] = {}  # that listen, by line
         self._listening: list[ModbusPort] = []
         self._stops: dict[str, set[asyncio.Task[int]]] = {}  # under way, by drive
         self._writes: set[asyncio.Task[int]] = set()
 
     # ---- life ----
 
-    async def start(self) -> None:
-        """Listen on all ports, or on none: raises OSError with the one that cannot be had."""
-        clock = asyncio.get_running_loop().time
+    def listen(self) -> None:
+        """Have all ports, or none: raises OSError with the one that cannot be had."""
         for line, number in {MAIN: self.settings.port, **self.settings.ports}.items():
-            port = ModbusPort(partial(self.serve, line), self.settings.may_connect, clock)
-            self._listening.append(port)
             try:
-                self.ports[line] = await port.open(self.settings.host, number)
-            except OSError as failure:
-                await self.close()
-                where = f"{self.settings.host}:{number}"
-                raise OSError(f"[serve.modbus] cannot listen on {where}: {failure.strerror}") from failure
+                self._sockets[line] = listen(self.settings.host, number)
+            except OSError:
+                self._close_sockets()
+                raise
+            self.ports[line] = self._sockets[line].getsockname()[1]
+
+    async def start(self) -> None:
+        """Let clients come."""
+        if not self._sockets:
+            self.listen()
+        clock = asyncio.get_running_loop().time
+        for line, listener in self._sockets.items():
+            port = ModbusPort(partial(self.serve, line), self.settings.may_connect, clock)
+            await port.open(listener)
+            self._listening.append(port)
 
     async def run(self) -> None:
-        """Tend the clients until cancelled; listen first where `start` was not called."""
+        """Tend the clients until cancelled."""
         if not self._listening:
             await self.start()
         while True:
@@ -91,13 +100,22 @@ class ModbusServer:
             for port in self._listening:
                 port.sweep()
 
+    def take(self, batch: Batch) -> None:
+        """Leave the rows to the hub, which has them already."""
+
+    def _close_sockets(self) -> None:
+        for listener in self._sockets.values():
+            listener.close()
+        self._sockets, self.ports = {}, {}
+
     async def close(self) -> None:
         """Listen no more and cut all connections; stops that are under way go on."""
         for port in self._listening:
             port.close()
         for share in self._shares.values():
             share.close()
-        self._listening, self.ports = [], {}
+        self._listening = []
+        self._close_sockets()
 
     def adopt(self, plant: Plant) -> None:
         """Go on with another plant; raises ValueError, and keeps the old one, where its units clash."""

@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from multidrop import Plant
+
+if TYPE_CHECKING:
+    from multidrop.gateway.modbus_server import ModbusServer
+    from multidrop.gateway.parts import Inside
 
 MAIN = ""  # the TCP port of all lines that have none of their own
 COMMON_LENGTH = 16  # words of the common block
@@ -34,13 +40,23 @@ class ModbusSettings:
     units: Mapping[str, int] = field(default_factory=dict)  # by drive; else its address
     ports: Mapping[str, int] = field(default_factory=dict)  # by line; else that of `listen`
     may: str = "look"  # the role of all clients, which can show no token
-    clients: tuple[str, ...] = ()  # addresses and networks; none: this machine alone
+    clients: Sequence[str] = ()  # addresses and networks; none: this machine alone
     common: int = 0xF000  # address of the common block
 
     def __post_init__(self) -> None:
-        wrong = [f"[serve.modbus] {sentence}" for sentence in self._mistakes()]
+        wrong = [*self._mistakes()]
         if wrong:
             raise ValueError("\n".join(wrong))
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence for each thing that does not fit this plant."""
+        from multidrop.gateway.units import Units  # which needs these settings
+
+        try:
+            Units(plant, self)
+        except ValueError as mistakes:
+            return str(mistakes).splitlines()
+        return []
 
     @property
     def host(self) -> str:
@@ -120,6 +136,15 @@ def _is_network(text: object) -> bool:
     except ValueError:
         return False
     return isinstance(text, str)
+
+
+def build(settings: ModbusSettings, inside: Inside) -> ModbusServer:
+    """Return the server as a part of the gateway, listening. Raises OSError where a port cannot be had."""
+    from multidrop.gateway.modbus_server import ModbusServer  # which needs all else that is here
+
+    server = ModbusServer(inside.plant, inside.hub, inside.commands, settings, inside.ask)
+    server.listen()
+    return server
 
 
 class PassingBusy(Exception):

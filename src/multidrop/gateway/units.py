@@ -5,9 +5,10 @@ from __future__ import annotations
 import difflib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-from multidrop import Carrier, Plant, PolledDrive, Register
+from multidrop import Carrier, Plant, Polled, PolledDrive, Register
 from multidrop.gateway.drive_words import DriveWords, reading_function
 from multidrop.gateway.passing import MAIN, ModbusSettings
 
@@ -120,12 +121,26 @@ class Units:
 
 def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
     found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
+    planned = _cycles(plant)
     for line in plant.lines:
         port = line.name if line.name in settings.ports else MAIN
         for polled in line.drives:
             number = settings.units.get(polled.drive.name, polled.drive.address)
-            found[port][number].append(Unit(line.name, polled))
+            found[port][number].append(Unit(line.name, _with_periods(polled, planned.get(line.name, 0.0))))
     return found
+
+
+def _cycles(plant: Plant) -> dict[str, float]:
+    """Return the planned cycle of each line that polls anything, in s."""
+    lines = tuple(line for line in plant.lines if any(polled.polls for polled in line.drives))
+    planned = replace(plant, lines=lines).metadata()["planned"] if lines else {}
+    return {name: plan["cycle_ms"] / 1e3 for name, plan in planned.items()}
+
+
+def _with_periods(polled: PolledDrive, cycle_s: float) -> PolledDrive:
+    """Return the same with the planned cycle for registers that are read as fast as the line allows."""
+    polls = [Polled(poll.register, cycle_s if poll.every is None else poll.every) for poll in polled.polls]
+    return PolledDrive(polled.drive, tuple(polls))
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
@@ -135,16 +150,16 @@ def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
     for number, found in sorted(units.items()):
         names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
         if not 1 <= number <= LAST_UNIT:
-            yield f"[serve.modbus] {names} cannot be unit {number}{where}, but 1 to {LAST_UNIT}"
+            yield f"{names} cannot be unit {number}{where}, but 1 to {LAST_UNIT}"
             wrong.append(found[-1].drive.name)
         elif len(found) > 1:
-            yield f"[serve.modbus] unit {number}{where} would be {names}"
+            yield f"unit {number}{where} would be {names}"
             wrong.append(found[-1].drive.name)
     if wrong:
         free = [number for number in UNITS if number not in units]
         example = f'units = {{ "{wrong[0]}" = {free[0] if free else 1} }}'
         yield (
-            f"[serve.modbus] units gives a drive a number of its own, such as {example}, and ports gives a "
+            f"units gives a drive a number of its own, such as {example}, and ports gives a "
             f"line a port of its own; free numbers{where}: {_ranges(free)}"
         )
 
@@ -165,7 +180,7 @@ def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
     own = sorted(unit.holding_addresses() & set(settings.common_addresses))
     if own:
         yield (
-            f"[serve.modbus] {unit.drive.name} has registers of its own at {own[0]:04X}H, where the common "
+            f"{unit.drive.name} has registers of its own at {own[0]:04X}H, where the common "
             f"block is: give that another place, such as common = 0xE000"
         )
 
@@ -185,4 +200,4 @@ def _unknown_names(plant: Plant, settings: ModbusSettings) -> Iterator[str]:
                     if near
                     else f"there are {', '.join(known) or 'none'}"
                 )
-                yield f"[serve.modbus] {key}: there is no {kind} {name!r}; {hint}"
+                yield f"{key}: there is no {kind} {name!r}; {hint}"
