@@ -80,8 +80,8 @@ def test_address_0_is_no_unit() -> None:
         level = reading(0, "m")
 
     with pytest.raises(ValueError, match=r"meter \(line net\) cannot be unit 0, but 1 to 255"):
-        Units(plant_of(("net", Behind(0, name="meter")), polled=False), ModbusSettings())
-    assert numbers(Units(plant_of(("net", Behind(255, name="meter"))), ModbusSettings())) == {
+        Units(plant_of(("net", Behind(0, name="meter", framing="tcp"))), ModbusSettings())
+    assert numbers(Units(plant_of(("net", Behind(255, name="meter", framing="tcp"))), ModbusSettings())) == {
         (MAIN, 255): "meter"
     }
 
