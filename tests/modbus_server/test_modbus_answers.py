@@ -443,6 +443,26 @@ def test_a_stop_that_failed_says_so(gateway: Gateway, failure: BusError, expecte
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
+def test_a_stop_that_fails_beyond_all_rules_is_told_too(
+    gateway: Gateway, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def fails() -> Told:
+        raise RuntimeError("a mistake of ours")
+
+    gateway.commands.told = fails
+    assert code(gateway, 1, 6, CHE_CONTROL, 5) == 0x0B
+    assert "a mistake of ours" in caplog.text
+
+
+def test_a_reply_of_another_length_is_none(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def short(*request: object) -> list[int]:
+        return [1]
+
+    gateway.hub.values.clear()
+    monkeypatch.setattr(gateway.server, "_ask", short)
+    assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 2) == 0x0B
+
+
 # ---- the common block ----
 
 

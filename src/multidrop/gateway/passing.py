@@ -14,6 +14,7 @@ from ipaddress import ip_address, ip_network
 from typing import TYPE_CHECKING, Any
 
 from multidrop import Plant
+from multidrop.gateway.rights import is_loopback
 
 if TYPE_CHECKING:
     from multidrop.gateway.modbus_server import ModbusServer
@@ -98,12 +99,14 @@ class ModbusSettings:
 
     def _listening_mistakes(self) -> Iterator[str]:
         host, colon, port = self.listen.rpartition(":")
-        if not colon or not _is_address(host.strip("[]")) or not port.isascii() or not port.isdigit():
+        host = host.strip("[]")
+        is_host = host == "localhost" or _is_address(host)
+        if not colon or not is_host or not port.isascii() or not port.isdigit():
             yield f"listen = {self.listen!r} is not ADDRESS:PORT, such as 127.0.0.1:1502"
             return
         if int(port) > 65535:
             yield f"listen = {self.listen!r}: a port is 1 to 65535"
-        if not ip_address(host.strip("[]")).is_loopback and not self.clients:
+        if not is_loopback(host) and not self.clients:
             yield (
                 f"listen = {self.listen!r} lets other machines in, and Modbus knows no tokens: name "
                 'those that may come, such as clients = ["10.0.0.5", "10.0.1.0/24"]'
