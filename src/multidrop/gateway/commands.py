@@ -95,6 +95,7 @@ class Commands:
     def __init__(self, lines: PolledLines, may: May) -> None:
         self.may = may
         self._lines = lines
+        self.called = 0  # commands that passed all rights, so far
         self._under_way: dict[str, int] = {}  # writes, by line
         self._stops: dict[str, int] = {}  # that were called so far, by drive
 
@@ -111,6 +112,7 @@ class Commands:
         wanted = dict.fromkeys(names if drives is None else drives)
         if caller.role < Right.STOP:
             return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
+        self.called += 1
         told: dict[str, Told] = {}
         waited: list[asyncio.Future[dict[str, Told]]] = []
         for line in plant.lines:
@@ -121,7 +123,9 @@ class Commands:
                 waited.append(_begin_stop(partial(self._stop_line, line.name), caller))
             else:
                 waited += [_begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
-        _log.warning("stop of %s, asked for %s", "all drives" if drives is None else list(wanted), caller.by)
+        _log.warning(
+            "stop of %s, asked for by %s", "all drives" if drives is None else list(wanted), caller.by
+        )
         for name in wanted:
             if name not in names:
                 told[name] = _failed(ValueError(f"there is no drive {name!r}"))
@@ -179,6 +183,7 @@ class Commands:
         if self._under_way.get(line.name, 0) >= MOST_WRITES:
             reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
             return _failed(Refused(reason, rule=BUSY))
+        self.called += 1
         stops = self._stops.get(drive, 0)
 
         def checked() -> Told:

@@ -13,13 +13,13 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop.gateway.events import Events
-from multidrop.gateway.hub import SILENT, Hub
+from multidrop.gateway.hub import FAULT, SILENT, Hub, Known
 from multidrop.gateway.lately import Lately
 
-LEAST_S = 0.1  # between two frames
+LEAST_S = 0.1  # between two frames, on the whole
+EARLY_S = 0.02  # by which one may come sooner after one that was late
 WAIT_S = 20.0  # for which a viewer waits for a frame
 MOST_VIEWERS = 200  # that wait at the same time
-MOST_ALARMS = 50  # in a frame
 LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
 
 
@@ -39,35 +39,44 @@ def frame_of(
         "n": n,
         "revision": revision,
         "time": str(time_ns),
-        "drives": {name: _drive(hub, name) for name in hub.drives},
+        "drives": {
+            polled.drive.name: _drive(hub, polled.drive.name, time_ns)
+            | lately.drive_figures(polled.drive.name)
+            for line in hub.plant.lines
+            for polled in line.drives
+        },
         "lines": {
             line.name: lately.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines
         },
-        "alarms": [alarm._asdict() for alarm in events.newest_first()[:MOST_ALARMS]],
+        "alarms": [alarm._asdict() for alarm in events.shown()],
     }
 
 
-def _drive(hub: Hub, name: str) -> dict[str, Any]:
+def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     state, words = hub.seen(name)
     seen = hub.seen_at(name)
     return {
         "state": state,
-        "fault": hub.fault(name),
+        "fault": words if state == FAULT else None,
         "why": words if state == SILENT else None,
         "seen": None if seen is None else seen // 1_000_000,
-        "values": {register.name: _value(hub, name, register.name) for register in hub.polled(name)},
+        "values": {known.register: _value(known, time_ns) for known in hub.known(name)},
     }
 
 
-def _value(hub: Hub, drive: str, register: str) -> list[Any] | None:
-    """Return the newest value that is known with its own time, and the newest row's status."""
-    newest, good = hub.newest(drive, register), hub.last_good(drive, register)
+def _value(known: Known, time_ns: int) -> list[Any]:
+    """Return value, time and status; of what is not known now null, and then the last value and its time."""
+    newest, good = known.newest, known.good
     if newest is None:
-        return [None, None, "not asked yet"]
-    value = good.value if good is not None else None
-    time = good.time if good is not None else newest.time
-    status = newest.status if newest.status != "ok" or hub.is_fresh(drive, register) else "overdue"
-    return [value if value is not None and isfinite(value) else None, time // 1_000_000, status]
+        return [None, time_ns // 1_000_000, "not asked yet"]
+    last = [] if good is None or good.value is None else [_finite(good.value), good.time // 1_000_000]
+    if newest.value is None:
+        return [None, newest.time // 1_000_000, newest.status, *last]
+    return [*last, "ok"] if known.is_fresh else [None, time_ns // 1_000_000, "overdue", *last]
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
@@ -89,7 +98,8 @@ class Frames:
         self._make = make
         self._clock = clock
         self._newest: Encoded | None = None
-        self._made_at = -LEAST_S
+        self._due = 0.0
+        self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
         self._is_closed = False
         self._waiting: set[asyncio.Future[None]] = set()
@@ -103,15 +113,27 @@ class Frames:
     def note_news(self) -> None:
         """Tell that a frame of now would differ from the newest one."""
         self._has_news = True
-        if self._waiting and self._clock() - self._made_at >= LEAST_S:
+        self._build_when_due()
+
+    def _build_when_due(self) -> None:
+        if self._timer is not None or not self._waiting or not self._has_news:
+            return
+        wait = self._due - self._clock()
+        if wait <= 0:
             self._build()
+        else:
+            self._timer = asyncio.get_running_loop().call_later(wait, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
         """Return a frame other than the n-th, as soon as there is one; None when there is none for long.
 
         Raises OverflowError when too many wait already.
         """
-        if self._has_news and self._clock() - self._made_at >= LEAST_S:
+        if self._has_news and self._clock() >= self._due:
             self._build()
         if self._newest is not None and self._newest.n != n:
             return self._newest
@@ -121,6 +143,7 @@ class Frames:
             return None
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.add(turn)
+        self._build_when_due()
         try:
             await asyncio.wait_for(turn, WAIT_S)
         except TimeoutError:
@@ -138,7 +161,7 @@ class Frames:
         self.made += 1
         plain = json.dumps(self._make(self.made), separators=(",", ":"), allow_nan=False).encode()
         self._newest = Encoded(self.made, plain, gzip.compress(plain, 5, mtime=0))
-        self._made_at = self._clock()
+        self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
         self._has_news = False
         self._wake()
 

@@ -91,7 +91,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     names = tuple(filter(None, (place.attempt(_name, name) for name in given.get("names", ()))))
     tls = _tls(given, folders, place)
     tokens = _tokens(given, folders, place)
-    may = _may(given.get("may", {}), plant, place.within("[serve.may]"))
+    may = _may(given.get("may", {}), plant, place.of_file(plant.path, "[serve.may]"))
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
         place.wrong('look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"')
@@ -104,7 +104,7 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     audit = folders.state / given.get("audit", "audit.jsonl")
     place.attempt(_check_writable, audit)
     parts = {
-        name: _part(PARTS[name], given[name], plant, place.within(f"[serve.{name}]"))
+        name: _part(PARTS[name], given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
         for name in PARTS
         if name in given
     }
@@ -194,7 +194,10 @@ def _check_listed(key: str, entry: object, plant: Plant) -> bool:
         raise ValueError(
             f'{key}: {entry!r} is not drive.{"register" if key == "write" else "verb"}, as "{example}" is'
         )
-    _, drive = plant.find_drive(name)
+    try:
+        _, drive = plant.find_drive(name)
+    except ValueError as unknown:
+        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
     if key == "write":
         register = drive.register(rest)
         if not register.writable:
@@ -263,8 +266,7 @@ def _check_writable(path: Path) -> bool:
         with path.open("ab"):
             pass
     except OSError as failure:
-        where = path if failure.errno is None else f"{path}"
-        raise ValueError(f"audit {where} cannot be written: {failure.strerror}") from failure
+        raise ValueError(f"audit {path} cannot be written: {failure.strerror}") from failure
     if is_new:
         path.unlink(missing_ok=True)
     return True
