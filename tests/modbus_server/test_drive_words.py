@@ -78,6 +78,7 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the least that there is
 @example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # no float64 is this number
 @example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
+@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # nor is its count the core's
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
 @example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # the offset swallows it
