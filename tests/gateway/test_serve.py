@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
@@ -203,15 +204,15 @@ def test_the_demo_is_live_and_everybody_here_may_stop_it(words: tuple[str, ...])
             assert process.stdout is not None
             port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])
 
-            def read(path: str) -> dict[str, object]:
+            def read(path: str) -> dict[str, Any]:
                 with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
-                    found: dict[str, object] = json.loads(get(connection, path))
+                    found: dict[str, Any] = json.loads(get(connection, path))
                     return found
 
             plant = read("/api/plant")
             assert plant["demo"] is True
-            assert plant["may"]["role"] == "write"  # type: ignore[index]
-            until(lambda: all(one["seen"] for one in read("/api/frame")["drives"].values()))  # type: ignore[attr-defined]
+            assert plant["may"]["role"] == "write"
+            until(lambda: all(one["seen"] for one in dict(read("/api/frame")["drives"]).values()))
             process.send_signal(signal.SIGINT)
             assert process.wait(PATIENCE) == 0
         finally:

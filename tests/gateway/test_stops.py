@@ -260,7 +260,8 @@ def test_a_part_that_cannot_begin_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_part_that_this_version_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(parts.PARTS, "mqtt", Part("multidrop.gateway.nosuch", "A", "b", ""))  # type: ignore[arg-type]
+    missing = Part("multidrop.gateway.nosuch", "Settings", "build", "")
+    monkeypatch.setitem(parts.PARTS, "mqtt", missing)  # type: ignore[arg-type]
     plant = written(tmp_path, "[serve.mqtt]\n")
     with pytest.raises(PlantError, match=r"\[serve.mqtt\]: this version of multidrop has no such part"):
         read_settings(plant, {})

@@ -20,7 +20,7 @@ Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
 
 
 class Figures(NamedTuple):
-    """What the gateway knows of itself."""
+    """Figures of the gateway itself."""
 
     version: str
     viewers: int

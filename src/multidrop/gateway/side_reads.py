@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from math import isfinite
 from typing import Any
 
 from multidrop import Bus, BusError, Drive, NoReply, Plant
@@ -90,4 +91,4 @@ class SideReads:
             return [None, self._utc_ms(), UNANSWERED]
         except (BusError, ValueError) as failure:
             return [None, self._utc_ms(), str(failure)]
-        return [float(value), self._utc_ms(), "ok"]
+        return [float(value) if isfinite(value) else None, self._utc_ms(), "ok"]
