@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import cast
 
 import pytest
-from controlled_loop import run_controlled
+from controlled_loop import ControlledLoop, run_controlled
 from hypothesis import given
 from hypothesis import strategies as st
 from modbus_gateway import RawClient, plant_of, request, serving
@@ -184,6 +184,23 @@ def test_a_client_s_flood_lets_others_have_their_turn() -> None:
         await asyncio.sleep(1)
         assert transactions(flooded.written) == list(range(1000))
         assert flooded.is_reading
+
+    run_controlled(main())
+
+
+def test_requests_that_take_long_to_answer_let_others_have_their_turn_sooner() -> None:
+    async def main() -> None:
+        loop = cast(ControlledLoop, asyncio.get_running_loop())
+
+        def long(found: MbapRequest, _: ModbusClient) -> bytes:
+            loop.passing.now += 0.0005
+            return found.reply(b"")
+
+        client, transport = connected(port_of(long))
+        client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
+        assert len(transactions(transport.written)) < 10
+        await asyncio.sleep(1)
+        assert transactions(transport.written) == list(range(100))
 
     run_controlled(main())
 

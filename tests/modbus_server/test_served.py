@@ -113,8 +113,7 @@ def test_a_plant_file_s_drives_are_read_written_and_stopped(tmp_path: Path) -> N
         drive["output_voltage"] = 231
         server = gateway.feeds["modbus"]
         with RawClient(server.ports[""]) as client:
-            until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231])
-            until(lambda: server.answered["cached"] > 0)
+            until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231] and server.answered["cached"])
             assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]  # not polled: asked of the drive
             assert server.answered["passed"] > 0
             assert reply_to(client, 6, SETPOINT, 5000).code is None

@@ -16,7 +16,8 @@ from multidrop.gateway.modbus_codes import ModbusCode
 MOST_DATA = 253  # bytes of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
 
-SLICE = 64  # requests of a client that are answered before others have their turn
+SLICE = 64  # requests of a client that are answered before others have their turn,
+SLICE_S = 0.002  # or so much time
 MOST_CLIENTS = 64  # beside each other, on one TCP port
 MOST_UNDER_WAY = 16  # requests of one client that wait for a line
 IDLE_S = 300.0  # without a request, after which a client is let go
@@ -81,6 +82,7 @@ class ModbusClient(asyncio.Protocol):
         self._buffer = bytearray()
         self._under_way: set[asyncio.Future[bytes]] = set()
         self._is_draining = False
+        self._is_refused = False  # it sent what closes its connection
         self._has_ended = False  # the client sends no more, and may still read
         self._stalled_since: float | None = None
         self.last_request = port.clock()
@@ -138,34 +140,41 @@ class ModbusClient(asyncio.Protocol):
     def _drain(self) -> None:
         """Answer some of the requests that came, and let others have their turn before the next ones."""
         answers: list[bytes] = []
-        self._is_draining = False
+        self._is_draining = self._answer_some(answers)
+        self._write(b"".join(answers))
+        if self._is_draining:
+            self._pause_for_others()
+        elif self._is_refused:
+            self.close()
+        self._close_if_done()
+
+    def _answer_some(self, answers: list[bytes]) -> bool:
+        """Add the answers that are known at once; return True where more requests may be waiting."""
+        begun = self._port.clock()
         for _ in range(SLICE):
-            if self.transport is None:
-                return
-            try:
-                request = take_request(self._buffer)
-            except Garbage as garbage:
-                _log.info("modbus client %s is closed: %s", self.address, garbage)
-                self._write(b"".join(answers))
-                self.close()
-                return
+            request = self._next_request()
             if request is None:
-                break
+                return False
             self.last_request = self._port.clock()
             answer = self._port.serve(request, self)
             if answer is None:
-                self._write(b"".join(answers))
-                self.close()
-                return
+                self._is_refused = True
+                return False
             if isinstance(answer, bytes):
                 answers.append(answer)
             else:
                 self._begin(request, answer)
-        else:
-            self._is_draining = True
-            self._pause_for_others()
-        self._write(b"".join(answers))
-        self._close_if_done()
+            if self.last_request - begun > SLICE_S:
+                break
+        return True
+
+    def _next_request(self) -> MbapRequest | None:
+        try:
+            return take_request(self._buffer)
+        except Garbage as garbage:
+            _log.info("modbus client %s is closed: %s", self.address, garbage)
+            self._is_refused = True
+            return None
 
     def _pause_for_others(self) -> None:
         if self.transport is not None:
