@@ -77,7 +77,7 @@ def plant_text(ports: list[str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iterator[Rig]:
     folder = tmp_path_factory.mktemp("rig")
     (folder / "plant.toml").write_text(plant_text(["/dev/ttyUSB0", "/dev/ttyUSB1"]))
     declared = load_plant(folder / "plant.toml")
