@@ -106,7 +106,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for every drive however busy the machine is; not for tests in which one is silent."""
+    _wait_for_drives(monkeypatch)
 
+
+@pytest.fixture(scope="module")
+def _patient_module() -> Iterator[None]:
+    """Do the same for a line that a module's tests share."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        _wait_for_drives(monkeypatch)
+        yield
+
+
+def _wait_for_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     def peer(*, interval: float, **timeouts: float) -> Peer:
         return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
 

@@ -152,7 +152,10 @@ class Advice(NamedTuple):
 
 
 class Refused(BusError, ValueError):
-    """The library itself did not send it; with the register, the rule, and its place in the manual."""
+    """The library itself did not send it; with the register, the rule, and its place in the manual.
+
+    `is_budget` says that the register's memory wears: the same may be sent at another time.
+    """
 
     def __init__(
         self,
@@ -162,12 +165,14 @@ class Refused(BusError, ValueError):
         rule: str = "",
         place: str = "",
         advice: Advice | None = None,
+        is_budget: bool = False,
     ) -> None:
         super().__init__(sentence)
         self.advice = advice  # its words for a program are part of the sentence
         self.register = register
         self.rule = rule
         self.place = place
+        self.is_budget = is_budget
 
     def for_command_line(self, *, in_plant: bool = False) -> str:
         """Return the sentence with what to type in place of what a program would call or declare."""

@@ -20,6 +20,9 @@ from readers import read
 import multidrop.capture
 import multidrop.drives.registry
 import multidrop.family_file
+import multidrop.gateway.mbap
+import multidrop.gateway.modbus_server
+import multidrop.gateway.pdu
 import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
@@ -33,6 +36,9 @@ MODULES = (
     multidrop.toml_check,
     multidrop.drives.registry,
     multidrop.sim.faults,
+    multidrop.gateway.mbap,
+    multidrop.gateway.modbus_server,
+    multidrop.gateway.pdu,
     tomllib._parser,
 )
 

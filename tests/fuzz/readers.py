@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+from modbus_requests import read_requests
+
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
 from multidrop.drive.register import Access
@@ -200,6 +202,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # the file's suffix,
     "csv": (".csv", read_recording),
     "parquet": (".parquet", read_recording),
     "pcap": (".pcapng", read_capture),
+    "mbap": (".bin", read_requests),
 }
 
 

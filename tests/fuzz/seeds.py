@@ -158,6 +158,23 @@ def captures() -> Iterator[bytes]:
     yield magic + pcap([packet for it in EXCHANGES[:6] for packet in rtac(it)])
 
 
+def requests() -> Iterator[bytes]:
+    """Yield what clients send: reads, writes, stops, others' functions, a broadcast, and no Modbus."""
+    bodies = [
+        *("01 03 30 00 00 02", "01 04 F0 00 00 0B", "02 01 00 00 00 04", "02 02 00 00 00 01"),
+        *("01 06 20 00 13 88", "01 06 10 00 00 05", "01 06 F0 0A 00 01", "02 05 00 01 FF 00"),
+        *("01 10 20 00 00 01 02 13 88", "02 0F 00 01 00 01 01 01", "01 2B 0E 01 00", "00 06 10 00 00 05"),
+    ]
+    frames = [
+        struct.pack(">HHH", number, 0, len(bytes.fromhex(body))) + bytes.fromhex(body)
+        for number, body in enumerate(bodies)
+    ]
+    yield b"\x3f" + b"".join(frames)
+    yield b"\x00" + b"".join(frames[:3]) + b"GET / HTTP/1.1"
+    for frame in frames:
+        yield b"\x0b" + frame
+
+
 SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "frame": frame,
     "line": line,
@@ -173,6 +190,7 @@ SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "csv": lambda: recorded(".csv"),
     "parquet": lambda: recorded(".parquet"),
     "pcap": captures,
+    "mbap": requests,
 }
 
 

@@ -51,6 +51,7 @@ NOT_RUN = {
     ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
     ".venv/bin/python -m sphinx": "is a test of its own, below",
     ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",
+    "mbpoll": "is another program: tests/modbus_server/test_masters.py runs it",
     "tshark": "is another program: tests/capture/test_capture.py runs it",
     "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
     "multidrop plot demo.arrows": "needs the demo's recording",

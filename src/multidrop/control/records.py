@@ -48,7 +48,9 @@ class WriteRecords:
                 written = f"write {declared} below its [[line.drive]]"
                 advice = Advice(f"declare {declared}", f"add --ram {register.name}", written)
                 way = f"if you know that this drive keeps it in RAM, {advice.program}"
-            raise refused(drive, register, f"{why}; {way}", advice)
+            refusal = refused(drive, register, f"{why}; {way}", advice)
+            refusal.is_budget = True
+            raise refusal
 
     def count_later(self, drive: Drive, register: Register[Any]) -> None:
         self._uncounted.append(self._cell(drive, register))

@@ -1,0 +1,87 @@
+"""Common block: what every drive says of itself at the same addresses in the same units, whatever its family.
+
+All numbers of two words have their high word first. A value is there only while it is fresh; what is not
+known has a count of its own, so that it never reads as 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from multidrop import PolledDrive
+from multidrop.gateway.drive_words import NewestRow, fresh_ns, is_fresh
+from multidrop.gateway.passing import COMMON_LENGTH
+
+STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # words from its begin
+
+STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
+NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
+NO_NUMBER = -(1 << 31)  # 8000 0000H: it is not known, or does not fit
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ms
+
+_PER_UNIT = 100
+
+
+class CommonSource(Protocol):
+    """The part of the hub that the block needs."""
+
+    def newest(self, drive: str, register: str) -> NewestRow | None: ...
+    def last_good(self, drive: str, register: str) -> NewestRow | None: ...
+    def state(self, drive: str) -> str: ...
+
+
+def common_words(polled: PolledDrive, hub: CommonSource, now_ns: int) -> list[int]:
+    """Return the words of the block of one drive."""
+    drive = polled.drive
+    state = hub.state(drive.name)
+    words = [0] * COMMON_LENGTH
+    words[STATE] = STATES.get(state, 0)
+    words[FAULT] = _fault(polled, hub, now_ns, state)
+    for at, name, unit in (
+        (FREQUENCY, "output_frequency", "Hz"),
+        (CURRENT, "output_current", "A"),
+        (SETPOINT, drive.setpoint_name, None),
+    ):
+        value = _fresh_value(polled, hub, now_ns, name, unit)
+        words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
+    words[AGE : AGE + 2] = _two_words(_age(polled, hub, now_ns))
+    return words
+
+
+def _fresh_value(
+    polled: PolledDrive, hub: CommonSource, now_ns: int, name: str, unit: str | None
+) -> float | None:
+    """Return the fresh value of a polled register, in this unit or its own; None where there is none."""
+    for poll in polled.polls:
+        register = poll.register
+        if register.name == name and (unit is None or register.unit == unit):
+            row = hub.newest(polled.drive.name, name)
+            if row is not None and is_fresh(row, fresh_ns(poll.every), now_ns):
+                return row.value
+    return None
+
+
+def _fault(polled: PolledDrive, hub: CommonSource, now_ns: int, state: str) -> int:
+    """Return the drive's own number of the fault that it shows."""
+    if state != "fault":
+        return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
+    value = _fresh_value(polled, hub, now_ns, "fault", "")
+    if value is None or value != int(value) or not 0 < value < FAULT_WITHOUT_NUMBER:
+        return FAULT_WITHOUT_NUMBER
+    return int(value)
+
+
+def _age(polled: PolledDrive, hub: CommonSource, now_ns: int) -> int:
+    """Return the ms since the newest value of the drive was asked for."""
+    rows: list[Any] = [hub.last_good(polled.drive.name, poll.register.name) for poll in polled.polls]
+    newest = max((row.monotonic_ns for row in rows if row is not None), default=None)
+    return NEVER if newest is None else min(max(now_ns - newest, 0) // 1_000_000, LONGEST_AGE)
+
+
+def _hundredths(value: float) -> int:
+    count = value * _PER_UNIT
+    return round(count) if abs(count) < 1 << 31 else NO_NUMBER
+
+
+def _two_words(number: int) -> tuple[int, int]:
+    return number >> 16 & 0xFFFF, number & 0xFFFF

@@ -1,0 +1,186 @@
+"""The words of a drive, made again of the values that were polled: exactly its own, or none.
+
+A row has a value in its unit; a Modbus client wants the count in the drive's words. A value is turned back
+only where one count alone has it: the count is packed, read again by the register's own coding, and must be
+this value, while its two neighbours must not be. So these are never made of values: a part of a word, what a
+scale register scales, `I8` and `U32_EITHER`, which leave bits open, and the zero of a float, which has two.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterable
+from enum import Enum
+from typing import Any, Protocol, cast
+
+from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
+
+LEAST_FRESH_NS = 1_000_000_000  # for which a value is the drive's present one, whatever its period
+FRESH_PERIODS = 3
+
+_FLOATS = {NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
+_OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
+_MOST_EXACT = 1 << 53  # beyond it a float64 does not hold every whole number
+_FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
+
+
+def reading_function(table: Table) -> int:
+    """Return the one of Modbus' functions 1 to 4 that reads a table; 0 where none does."""
+    code = table.read or 0
+    return code if code in _FUNCTIONS.get(table.carrier, ()) else 0
+
+
+class NewestRow(Protocol):
+    """The newest row of a register, as the hub has it."""
+
+    @property
+    def monotonic_ns(self) -> int: ...
+    @property
+    def value(self) -> float | None: ...
+
+
+class Lack(Enum):
+    """The reason why a range is not in the cache."""
+
+    UNPOLLED = "not polled, or its words cannot be told from its value"
+    STALE = "polled, and its newest row is a miss or old"
+
+
+def fresh_ns(every: float | None) -> int:
+    """Return for how long a value is the drive's present one, by its period in s."""
+    return max(LEAST_FRESH_NS, round(FRESH_PERIODS * (every or 0.0) * 1e9))
+
+
+def is_fresh(row: NewestRow | None, fresh_ns: int, now_ns: int, since_ns: int = 0) -> bool:
+    """Return True for a row with a value that is not too old, nor from before `since_ns`."""
+    if row is None or row.value is None:
+        return False
+    return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= fresh_ns
+
+
+def exact_data(register: Register[Any], value: float) -> bytes | None:
+    """Return the bytes that the drive sends for this value (coils: one byte, 0 or 1); None where in doubt."""
+    coding = register.coding
+    if register.part is not None or register.scale_register or coding.number_format in _OPEN:
+        return None
+    try:
+        if coding.number_format is NumberFormat.BIT:
+            found = [bit for bit in (0, 1) if coding.value_of(bit) == value]
+            return bytes(found) if len(found) == 1 else None
+        raw = _nearest_count(register, value)
+        if raw is None:
+            return None
+        data = coding.pack(raw)
+        again = register.number_in(data, 0)
+        if again is None or float(again) != value:
+            return None
+        near = _neighbours(raw, coding.number_format)
+        if any(float(coding.value_of(other)) == value for other in near):
+            return None
+    except (ArithmeticError, ValueError, struct.error):  # a number that no count stands for
+        return None
+    return data
+
+
+def _nearest_count(register: Register[Any], value: float) -> float | None:
+    """Return the count whose value is nearest; None where others may have the same."""
+    multiplier, addend, divisor = register.coding.factors
+    count = value if multiplier == divisor and not addend else (value * divisor - addend) / multiplier
+    if register.coding.number_format not in _FLOATS:
+        raw = round(count)
+        return raw if abs(raw * multiplier) + abs(addend) <= _MOST_EXACT else None
+    code, _ = _FLOATS[register.coding.number_format]
+    held: float = struct.unpack(code, struct.pack(code, count))[0]
+    return held if held else None  # a zero has two signs, and its value none
+
+
+def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
+    """Return the counts on both sides, whose values are those most like it."""
+    if number_format not in _FLOATS:
+        return (raw - 1, raw + 1)
+    as_float, as_bits = _FLOATS[number_format]
+    bits = struct.unpack(as_bits, struct.pack(as_float, raw))[0]
+    near = [struct.unpack(as_float, struct.pack(as_bits, other))[0] for other in (bits - 1, bits + 1)]
+    return [other for other in near if math.isfinite(other)]
+
+
+class _Place:
+    """A register at its addresses, and the words of its latest value."""
+
+    __slots__ = ("_data", "_value", "fresh_ns", "register")
+
+    def __init__(self, register: Register[Any], every: float | None) -> None:
+        self.register = register
+        self.fresh_ns = fresh_ns(every)
+        self._value: float | None = None
+        self._data: bytes | None = None
+
+    def word(self, value: float, at: int) -> int | None:
+        """Return the word (coil: bit) that many addresses after its first; None where it is in doubt."""
+        if value != self._value:
+            self._value, self._data = value, exact_data(self.register, value)
+        data = self._data
+        if data is None:
+            return None
+        return data[0] if len(data) == 1 else data[2 * at] << 8 | data[2 * at + 1]
+
+
+class DriveWords:
+    """The polled words of one drive, by function code and address; each register has its period."""
+
+    def __init__(self, polled: PolledDrive) -> None:
+        self._at: dict[tuple[int, int], list[tuple[_Place, int]]] = {}
+        for poll in polled.polls:
+            register = poll.register
+            function = reading_function(register.table)
+            if not function:
+                continue
+            place = _Place(register, poll.every)
+            for at in range(register.words):
+                key = function, register.address + at
+                self._at.setdefault(key, []).append((place, at))
+
+    def read(
+        self,
+        function: int,
+        addresses: range,
+        newest: Callable[[str], NewestRow | None],
+        now_ns: int,
+        since_ns: int = 0,
+    ) -> list[int] | Lack:
+        """Return the words or bits at these addresses, each of a fresh row; else why that cannot be.
+
+        `newest` gives a register's newest row by its name; rows before `since_ns` do not count.
+        """
+        fresh: dict[_Place, NewestRow | None] = {}
+        words: list[int] = []
+        lacks: list[Lack] = []
+        for address in addresses:
+            found = self._at.get((function, address))
+            if found is None:
+                return Lack.UNPOLLED
+            for place, _ in found:
+                if place not in fresh:
+                    row = newest(place.register.name)
+                    fresh[place] = row if is_fresh(row, place.fresh_ns, now_ns, since_ns) else None
+            word = _newest_word([(fresh[place], place, at) for place, at in found])
+            if isinstance(word, Lack):
+                lacks.append(word)
+            else:
+                words.append(word)
+        if lacks:
+            return Lack.UNPOLLED if Lack.UNPOLLED in lacks else Lack.STALE
+        return words
+
+
+def _newest_word(found: list[tuple[NewestRow | None, _Place, int]]) -> int | Lack:
+    """Return the word of the newest row that tells it; several registers may lie at one address."""
+    lack = Lack.STALE
+    rows = [(row, place, at) for row, place, at in found if row is not None and row.value is not None]
+    for row, place, at in sorted(rows, key=lambda one: -one[0].monotonic_ns):
+        word = place.word(cast(float, row.value), at)
+        if word is not None:
+            return word
+        lack = Lack.UNPOLLED
+    return lack

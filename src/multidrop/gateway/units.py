@@ -1,0 +1,203 @@
+"""Units: the unit id and TCP port under which Modbus clients reach each drive. Pure."""
+
+from __future__ import annotations
+
+import difflib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from multidrop import Carrier, Plant, Polled, PolledDrive, Register
+from multidrop.gateway.drive_words import DriveWords, reading_function
+from multidrop.gateway.passing import MAIN, ModbusSettings
+
+UNITS = range(1, 248)  # 0 is a broadcast, and 248 to 255 are reserved
+LAST_UNIT = 255  # some devices have it all the same
+_WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
+_STOPS = ("stop", "coast", "emergency_stop")
+
+
+class StopWrite(NamedTuple):
+    """A write that is one of the drive's own ways to stop: its register and its count."""
+
+    register: str
+    raw: float
+
+
+class Unit:
+    """A drive as Modbus clients see it: what is there to read and to write, by address."""
+
+    def __init__(self, line: str, polled: PolledDrive) -> None:
+        self.line = line
+        self.polled = polled
+        self.drive = polled.drive
+        self.words = DriveWords(polled)
+        self.written_ns = 0  # when a client's last write ended: what was polled before may be old
+        self.stops = frozenset(_stop_writes(polled.drive))
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # 0: by none
+        self._gaps: list[tuple[int, range]] = []
+        self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
+        for register in self.drive.registers.values():
+            self._declare(register)
+        for text in self.drive.texts.values():
+            self._readable[reading_function(text.table)].update(
+                range(text.address, text.address + text.length)
+            )
+        for table, gap in self.drive.readable_gaps.items():
+            self._gaps.append((reading_function(table), gap))
+
+    def __repr__(self) -> str:
+        return f"<Unit {self.drive.name} on {self.line}>"
+
+    def _declare(self, register: Register[Any]) -> None:
+        table, addresses = register.table, range(register.address, register.address + register.words)
+        if register.readable:
+            self._readable[reading_function(table)].update(addresses)
+        if register.writable and table.write in _WRITES.get(table.carrier, ()):
+            self._writable[table.carrier, register.address] = register
+
+    def is_declared(self, function: int, addresses: range) -> bool:
+        """Return True where the family's document has all of these to be read."""
+        own = self._readable[function]
+        gaps = [gap for code, gap in self._gaps if code == function]
+        return all(at in own or any(at in gap for gap in gaps) for at in addresses)
+
+    def writable(self, carrier: Carrier, address: int) -> Register[Any] | None:
+        """Return the register that begins at this address and may be written; None where there is none."""
+        return self._writable.get((carrier, address))
+
+    def holding_addresses(self) -> set[int]:
+        """Return all addresses of words at which the family has something."""
+        written = {
+            at
+            for register in self.drive.registers.values()
+            if register.table.carrier is Carrier.WORD
+            for at in range(register.address, register.address + register.words)
+        }
+        return self._readable[3] | self._readable[4] | written
+
+
+def _stop_writes(drive: Any) -> Iterator[StopWrite]:
+    """Yield the first write of each verb that stops the motor, as the family's own scripts have it."""
+    for name in _STOPS:
+        try:
+            script = getattr(drive, name).script()
+            step = next(script, None)
+            script.close()
+            register, value = getattr(step, "register", None), getattr(step, "value", None)
+            if isinstance(register, Register) and value is not None:
+                yield StopWrite(register.name, register.encode(value))
+        except Exception:  # a family without this verb, or one whose script needs a bus
+            continue
+
+
+class Units:
+    """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
+
+    A line that has a port of its own is reached there alone. Raises ValueError with a sentence for each
+    mistake, in lines, where a unit id would be two drives' or the settings name what is not there.
+    """
+
+    def __init__(self, plant: Plant, settings: ModbusSettings) -> None:
+        self._units: dict[tuple[str, int], Unit] = {}
+        wrong = [*_unknown_names(plant, settings)]
+        for port, found in _by_port(plant, settings).items():
+            wrong += _clashes(port, found)
+            for number, units in found.items():
+                self._units[port, number] = units[0]
+                for unit in units:
+                    wrong += _overlap(unit, settings)
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def find(self, port: str, number: int) -> Unit | None:
+        """Return the unit of this number on a port; None where there is none."""
+        return self._units.get((port, number))
+
+    def __iter__(self) -> Iterator[tuple[str, int, Unit]]:
+        return ((port, number, unit) for (port, number), unit in self._units.items())
+
+
+def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
+    found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
+    planned = _cycles(plant)
+    for line in plant.lines:
+        port = line.name if line.name in settings.ports else MAIN
+        for polled in line.drives:
+            number = settings.units.get(polled.drive.name, polled.drive.address)
+            found[port][number].append(Unit(line.name, _with_periods(polled, planned.get(line.name, 0.0))))
+    return found
+
+
+def _cycles(plant: Plant) -> dict[str, float]:
+    """Return the planned cycle of each line that polls anything, in s."""
+    lines = tuple(line for line in plant.lines if any(polled.polls for polled in line.drives))
+    planned = replace(plant, lines=lines).metadata()["planned"] if lines else {}
+    return {name: plan["cycle_ms"] / 1e3 for name, plan in planned.items()}
+
+
+def _with_periods(polled: PolledDrive, cycle_s: float) -> PolledDrive:
+    """Return the same with the planned cycle for registers that are read as fast as the line allows."""
+    polls = [Polled(poll.register, cycle_s if poll.every is None else poll.every) for poll in polled.polls]
+    return PolledDrive(polled.drive, tuple(polls))
+
+
+def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
+    """Yield a sentence for each number that is two drives' or none's, and one with those that are free."""
+    where = "" if port == MAIN else f" on the port of line {port}"
+    wrong: list[str] = []  # drives
+    for number, found in sorted(units.items()):
+        names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
+        if not 1 <= number <= LAST_UNIT:
+            yield f"{names} cannot be unit {number}{where}, but 1 to {LAST_UNIT}"
+            wrong.append(found[-1].drive.name)
+        elif len(found) > 1:
+            yield f"unit {number}{where} would be {names}"
+            wrong.append(found[-1].drive.name)
+    if wrong:
+        free = [number for number in UNITS if number not in units]
+        example = f'units = {{ "{wrong[0]}" = {free[0] if free else 1} }}'
+        yield (
+            f"units gives a drive a number of its own, such as {example}, and ports gives a "
+            f"line a port of its own; free numbers{where}: {_ranges(free)}"
+        )
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Return numbers as "3 to 20, 22"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ", ".join(" to ".join(str(end) for end in run) for run in runs) or "none"
+
+
+def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
+    """Yield a sentence where the family has registers where the common block is."""
+    own = sorted(unit.holding_addresses() & set(settings.common_addresses))
+    if own:
+        yield (
+            f"{unit.drive.name} has registers of its own at {own[0]:04X}H, where the common "
+            f"block is: give that another place, such as common = 0xE000"
+        )
+
+
+def _unknown_names(plant: Plant, settings: ModbusSettings) -> Iterator[str]:
+    drives = [polled.drive.name for line in plant.lines for polled in line.drives]
+    lines = [line.name for line in plant.lines]
+    for key, kind, given, known in (
+        ("units", "drive", settings.units, drives),
+        ("ports", "line", settings.ports, lines),
+    ):
+        for name in given:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=2)
+                hint = (
+                    f"did you mean {' or '.join(near)}?"
+                    if near
+                    else f"there are {', '.join(known) or 'none'}"
+                )
+                yield f"{key}: there is no {kind} {name!r}; {hint}"

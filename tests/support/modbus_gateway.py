@@ -1,0 +1,228 @@
+"""A Modbus server in a thread, with rows and commands that a test gives it, and a client of plain sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from multidrop.drive import Drive
+from multidrop.gateway.commands import Told
+from multidrop.gateway.modbus_server import ModbusServer
+from multidrop.gateway.passing import MAIN, ModbusSettings
+from multidrop.gateway.rights import Caller
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+
+PATIENCE = 30.0  # s, for what must come
+
+
+class FakeRow(NamedTuple):
+    monotonic_ns: int
+    value: float | None
+
+
+class FakeHub:
+    """Rows by drive and register, each as old as the test says; without one it was never asked."""
+
+    def __init__(self) -> None:
+        self.values: dict[tuple[str, str], float | None] = {}
+        self.ages: dict[tuple[str, str], float] = {}  # s
+        self.states: dict[str, str] = {}
+
+    def newest(self, drive: str, register: str) -> FakeRow | None:
+        key = drive, register
+        if key not in self.values:
+            return None
+        age = round(self.ages.get(key, 0.0) * 1e9)
+        return FakeRow(time.monotonic_ns() - age, self.values[key])
+
+    def last_good(self, drive: str, register: str) -> FakeRow | None:
+        row = self.newest(drive, register)
+        return row if row is not None and row.value is not None else None
+
+    def state(self, drive: str) -> str:
+        return self.states.get(drive, "unknown")
+
+
+DONE = Told(True, "done")
+
+
+class FakeCommands:
+    """Notes what it is told to do, and says of it what the test wants."""
+
+    def __init__(self) -> None:
+        self.told: Told | Callable[[], Awaitable[Told]] = DONE
+        self.written: list[tuple[str, str, float, Caller]] = []
+        self.stopped: list[tuple[Sequence[str] | None, Caller]] = []
+
+    async def _end(self) -> Told:
+        return self.told if isinstance(self.told, Told) else await self.told()
+
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+        self.stopped.append((drives, caller))
+        return dict.fromkeys(drives or (), await self._end())
+
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+        self.written.append((drive, register, value, caller))
+        return await self._end()
+
+
+class FakeLine:
+    """Answers what is asked past the cache: each address with itself, or as the test says."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, int, int, int]] = []
+        self.failure: Exception | None = None
+        self.seconds = 0.0
+
+    async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
+        self.asked.append((drive, function, start, count))
+        await asyncio.sleep(self.seconds)
+        if self.failure is not None:
+            raise self.failure
+        return [(start + at) & (1 if function < 3 else 0xFFFF) for at in range(count)]
+
+
+def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
+    """A plant of drives, each with the name of its line, all of whose readable registers are polled."""
+    lines: dict[str, list[PolledDrive]] = {}
+    for line, drive in drives:
+        registers = [register for register in drive.registers.values() if register.readable and polled]
+        lines.setdefault(line, []).append(
+            PolledDrive(drive, tuple(Polled(register, 0.1) for register in registers))
+        )
+    made = [PlantLine(name, f"/dev/{name}", None, None, tuple(found)) for name, found in lines.items()]
+    return Plant(tuple(made), Path("plant.toml"))
+
+
+@contextmanager
+def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
+    """Run a server, made in its own loop, in a thread until the block is left."""
+    ready: list[ModbusServer] = []
+    failures: list[BaseException] = []
+    begun = threading.Event()
+    loop = asyncio.new_event_loop()
+
+    async def main() -> None:
+        server = make()
+        await server.start()
+        ready.append(server)
+        begun.set()
+        try:
+            await server.run()
+        finally:
+            await server.close()
+
+    async def guarded() -> None:
+        try:
+            await main()
+        except asyncio.CancelledError:
+            pass
+        except BaseException as failure:
+            failures.append(failure)
+        finally:
+            begun.set()
+
+    task = loop.create_task(guarded())
+    thread = threading.Thread(target=lambda: loop.run_until_complete(task))
+    thread.start()
+    try:
+        assert begun.wait(PATIENCE)
+        if failures:
+            raise failures[0]
+        yield ready[0]
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+        loop.run_until_complete(loop.shutdown_asyncgens())
+        for left in asyncio.all_tasks(loop):
+            left.cancel()
+            loop.run_until_complete(asyncio.gather(left, return_exceptions=True))
+        loop.close()
+
+
+class Gateway(NamedTuple):
+    """A server with all that a test gives it."""
+
+    server: ModbusServer
+    hub: FakeHub
+    commands: FakeCommands
+    line: FakeLine
+
+    def client(self, port: str = MAIN) -> RawClient:
+        return RawClient(self.server.ports[port])
+
+
+@contextmanager
+def serving(plant: Plant, settings: ModbusSettings) -> Iterator[Gateway]:
+    """A server of this plant over fakes."""
+    hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
+    with in_thread(lambda: ModbusServer(plant, hub, commands, settings, line.ask)) as server:
+        yield Gateway(server, hub, commands, line)
+
+
+def request(transaction: int, unit: int, function: int, *words: int, data: bytes = b"") -> bytes:
+    """The frame of a request, packed as the messaging guide prints it."""
+    body = struct.pack(f">BB{len(words)}H", unit, function, *words) + data
+    return struct.pack(">HHH", transaction, 0, len(body)) + body
+
+
+class RawReply(NamedTuple):
+    transaction: int
+    unit: int
+    function: int
+    data: bytes
+
+    @property
+    def code(self) -> int | None:
+        """The exception's code; None for a good reply."""
+        return self.data[0] if self.function & 0x80 else None
+
+    @property
+    def words(self) -> list[int]:
+        return list(struct.unpack(f">{(len(self.data) - 1) // 2}H", self.data[1:]))
+
+
+class RawClient:
+    """A client of Modbus TCP that sends any bytes."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE)
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._stream = self.socket.makefile("rb")
+
+    def __enter__(self) -> RawClient:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stream.close()
+        self.socket.close()
+
+    def send(self, data: bytes) -> None:
+        self.socket.sendall(data)
+
+    def receive(self) -> RawReply | None:
+        """The next reply; None where the connection is closed."""
+        try:
+            header = self._stream.read(8)
+            if len(header) < 8:
+                return None
+            transaction, protocol, length, unit, function = struct.unpack(">HHHBB", header)
+            assert protocol == 0
+            return RawReply(transaction, unit, function, self._stream.read(length - 2))
+        except ConnectionResetError:
+            return None
+
+    def ask(self, unit: int, function: int, *words: int, data: bytes = b"") -> RawReply:
+        """The reply to one request."""
+        self.send(request(7, unit, function, *words, data=data))
+        reply = self.receive()
+        assert reply is not None
+        assert (reply.transaction, reply.unit, reply.function & 0x7F) == (7, unit, function)
+        return reply
