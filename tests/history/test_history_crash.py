@@ -70,9 +70,10 @@ def test_kills_at_any_moment(tmp_path: Path, kills: int) -> None:
     written: dict[str, int] = {}
     for run in range(kills):
         written[f"run-{run}"] = killed_recorder(tmp_path, run, dice)
-        with History(tmp_path) as history:
-            total = check(history, written)
-            assert total_of_tens(history, run + 1) == total
+        if run < 15 or run % 10 == 0 or run == kills - 1:
+            with History(tmp_path) as history:
+                total = check(history, written)
+                assert total_of_tens(history, run + 1) == total
     assert sum(written.values()) > 100 * kills
     for _ in range(100):  # a child that was left may still be at it
         compact([str(tmp_path), "--below", "99999999"])

@@ -19,7 +19,7 @@ from multidrop.history.writer import HistoryWriter
 
 STEP = SECOND // 100
 RUN = 9 * 3600 * SECOND
-ROWS = 100  # of a batch
+ROWS = 30  # of a batch
 
 
 def main(folder: Path, run: int) -> None:

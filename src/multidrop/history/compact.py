@@ -40,8 +40,6 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
     arguments = parser.parse_args(words)
-    with suppress(OSError):  # forbidden: then at the priority that we have
-        os.nice(19)
     folder: Path = arguments.folder
     try:
         lock = FileLock(folder / ".compact.lock")
@@ -178,5 +176,12 @@ def _merge(folder: Path, run: list[HistoryFile]) -> None:
         file.path.unlink(missing_ok=True)
 
 
+def be_low() -> None:
+    """Give way to everything else, where that is allowed."""
+    with suppress(OSError):
+        os.nice(19)
+
+
 if __name__ == "__main__":
+    be_low()
     raise SystemExit(main())

@@ -13,8 +13,7 @@ from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
 from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
-from multidrop.recording.arrow_ipc import IpcMessage
-from multidrop.recording.arrows_tail import ArrowsTail
+from multidrop.recording.arrows_tail import ArrowsTail, BatchPlace
 
 Series = tuple[str, str]  # drive and register
 Ten = list[float]  # values, misses, their sum, least, most
@@ -24,7 +23,7 @@ Tens = dict[int, Ten]  # by number since 1970
 class IndexedBatch(NamedTuple):
     """A batch's place, and the times in it."""
 
-    message: IpcMessage
+    place: BatchPlace
     least: int
     most: int
 
@@ -73,10 +72,10 @@ class GrowingSegment:
         """Take in what came since the last look."""
         with self._changing:
             try:
-                for columns, message in self._tail.new() if self.damage is None else ():
+                for columns, place in self._tail.new() if self.damage is None else ():
                     if len(columns.time):
                         self._add(columns)
-                        self._batches.append(IndexedBatch(message, min(columns.time), max(columns.time)))
+                        self._batches.append(IndexedBatch(place, min(columns.time), max(columns.time)))
             except ValueError as damage:
                 self.damage = str(damage)
 
@@ -114,7 +113,7 @@ class GrowingSegment:
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
         """Return a batch's rows of these series, or of all, from `begin` to before `end`."""
-        columns = self._tail.again(batch.message)
+        columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))
 

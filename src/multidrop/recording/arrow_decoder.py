@@ -65,10 +65,16 @@ class BatchDecoder:
         ]
         return RecordedRows(assemble(rows, *columns))
 
-    def columns(self, header: FlatTable, body: memoryview) -> RecordedColumns:
+    @property
+    def known(self) -> dict[int, Names]:
+        """The dictionaries that have come so far; it stays as it is when others come."""
+        return self._names
+
+    def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
         """Return the columns of a batch without spelling their names out; codes are checked.
 
-        Raises as `decode`, and for a file of before, whose names have no codes.
+        `names_of` is what was `known` when it came. Raises as `decode`, and for a file of before, whose names
+        have no codes.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
@@ -82,7 +88,7 @@ class BatchDecoder:
             if column.name == b"value":
                 valid = bits or None
             if identity is not None:
-                codes, known = wide_codes(data, rows, column.code_bits // 8), self._names.get(identity)
+                codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
                 if known is None or (rows and max(codes) >= len(known)):
                     raise ValueError("there are rows before the names of their codes")
                 found.append(codes)
@@ -133,7 +139,8 @@ class BatchDecoder:
                 raise ValueError("its lengths do not fit together")
             names.append(str(text[begin:end], "utf-8"))
         before = self._names.get(number) if header.number(2, "<?") else None
-        self._names[number] = Names([*(before.listed if before else ()), *names])
+        learnt = Names([*(before.listed if before else ()), *names])
+        self._names = {**self._names, number: learnt}
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:

@@ -8,16 +8,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from multidrop.core import Names
 from multidrop.recording.arrow_decoder import BatchDecoder, RecordedColumns
 from multidrop.recording.arrow_ipc import RECORD_BATCH, IpcMessage, messages
 from multidrop.recording.arrows import ArrowsReader
+
+
+class BatchPlace(NamedTuple):
+    """A batch's place in the file, and the names that its codes stand for."""
+
+    message: IpcMessage
+    names: dict[int, Names]
 
 
 class RecordedBatch(NamedTuple):
     """A batch, and where it is."""
 
     columns: RecordedColumns
-    message: IpcMessage
+    place: BatchPlace
 
 
 class ArrowsTail:
@@ -56,16 +64,17 @@ class ArrowsTail:
                 if message.kind != RECORD_BATCH:  # again with its batch: a full disk may have cut both off
                     self._decoder.decode(message, message.header, body)
                     continue
-                batch = RecordedBatch(self._decoder.columns(message.header, body), message)
+                place = BatchPlace(message, self._decoder.known)
+                batch = RecordedBatch(self._decoder.columns(message.header, body, place.names), place)
             except (struct.error, RuntimeError, ValueError) as error:
                 raise ValueError(f"{self.path} is damaged: {error}") from error
             self._end = message.end
             yield batch
 
-    def again(self, message: IpcMessage) -> RecordedColumns:
+    def again(self, place: BatchPlace) -> RecordedColumns:
         """Return a batch that `new` gave before. Raises ValueError."""
-        assert message.header
-        return self._decoder.columns(message.header, self._body(message))
+        assert place.message.header
+        return self._decoder.columns(place.message.header, self._body(place.message), place.names)
 
     def _body(self, message: IpcMessage) -> memoryview:
         return memoryview(os.pread(self._file.fileno(), message.end - message.body, message.body))
