@@ -86,10 +86,13 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     """Return what follows a where clause so that it gives these series, and the values for it."""
     if series is None:
         return "", {}
-    values = {
-        f"{kind}{at}": name for at, pair in enumerate(series) for kind, name in zip("dr", pair, strict=True)
-    }
-    drives = ", ".join(f"$d{at}" for at in range(len(series)))
-    pairs = ", ".join(f"($d{at}, $r{at})" for at in range(len(series)))
-    # The first condition is for the statistics of a file, which know drives and no pairs.
-    return f" and drive in ({drives}) and (drive, register) in ({pairs})", values
+    drives, registers = ({pair[at]: None for pair in series} for at in (0, 1))
+    values = {f"d{at}": name for at, name in enumerate(drives)}
+    values |= {f"r{at}": name for at, name in enumerate(registers)}
+    marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
+    others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
+    condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
+    if len(drives) * len(registers) > len(series):  # slower, and seldom needed
+        pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
+        condition += f" and (drive, register) in ({pairs})"
+    return condition, values
