@@ -85,7 +85,7 @@ def test_batches_of_two_pollers(tmp_path: Path, writers: Callable[..., HistoryWr
 
 
 def test_it_keeps_no_memory_of_the_core(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
-    """What `take` holds is a copy: the core may use a batch's memory again."""
+    """It takes a copy: the core may use a batch's memory again."""
     writer = writers(tmp_path)
     one = some(0)
     expected = list(one)

@@ -88,7 +88,7 @@ class Historian:
 
     @property
     def state(self) -> HistoryState:
-        """How it goes: rows written, rows lost, and what is wrong now."""
+        """Rows written, rows lost, and what is wrong now."""
         return self._writer.state()
 
     # ---- questions; times are UTC in ms ----

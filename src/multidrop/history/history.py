@@ -33,7 +33,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class History:
-    """What `multidrop serve` or `HistoryWriter` keeps in a folder, or a recording in segments: `run.arrows`.
+    """The rows that `multidrop serve` or `HistoryWriter` keeps in a folder; or segments: `run.arrows`.
 
     It may be written meanwhile, by any process: every row is there once, about 0.3 s after it was polled. A
     series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a datetime

@@ -1,4 +1,4 @@
-"""What DuckDB is asked of the Parquet files of a history."""
+"""Queries of DuckDB for the Parquet files of a history."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Replaced(Exception):
 
 
 class Sources:
-    """What is open of a folder; any thread may use it."""
+    """All that is open of a folder; any thread may use it."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -30,7 +30,7 @@ _log = logging.getLogger("multidrop.history")
 
 
 class HistoryState(NamedTuple):
-    """How the recording goes: rows written and lost so far, and what is wrong now, or None."""
+    """The state of a recording: rows written and lost so far, and what is wrong now, or None."""
 
     rows: int
     dropped: int
