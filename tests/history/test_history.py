@@ -236,6 +236,27 @@ def test_a_recording_in_segments_of_poll(tmp_path: Path) -> None:
         assert rows_in(history) == rows
 
 
+def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(3)]
+    record(tmp_path, rows)
+    path, dice = tmp_path / "rows.00000002.arrows", random.Random(9)
+    whole = path.read_bytes()
+    damaged = 0
+    for _ in range(examples(400)):
+        data = bytearray(whole)
+        for _ in range(dice.choice((1, 1, 8))):
+            data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        path.write_bytes(data)
+        with History(tmp_path) as history:
+            found = rows_in(history)
+            assert found[:120] == rows[0]
+            assert found[-120:] == rows[2]
+            history.buckets(SERIES, NOON, NOON + DAY, 700)
+            history.buckets(SERIES, NOON, NOON + 300 * SECOND, 700)
+            damaged += bool(history.damage)
+    assert damaged
+
+
 def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(2)]
