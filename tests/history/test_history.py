@@ -257,6 +257,18 @@ def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
     assert damaged
 
 
+def test_an_end_that_is_no_batch_is_told_where_the_segment_is_closed(tmp_path: Path) -> None:
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
+    record(tmp_path, rows)
+    for number in (2, 1):  # the newest may still be written
+        path = tmp_path / f"rows.0000000{number}.arrows"
+        path.write_bytes(path.read_bytes() + b"\0" * 7)
+        with History(tmp_path) as history:
+            assert rows_in(history) == flat(rows)
+            told = [] if number == 2 else [f"the last 7 bytes of {path} are no whole batch"]
+            assert history.damage == told
+
+
 def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(2)]

@@ -121,6 +121,18 @@ def test_half_a_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> None:
     assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # it refuses half a batch
 
 
+def test_more_than_a_batch_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segments_module, "MOST_CUT", 100)
+    path = tmp_path / "run.arrows"
+    with SegmentWriter(path, ABOUT, every=60) as writer:
+        writer.write(rows(0))
+    (_, segment), *_ = segments_of(path)
+    segment.write_bytes(segment.read_bytes() + bytes(101))
+    size = segment.stat().st_size
+    SegmentWriter(path, ABOUT, every=60).close()
+    assert segment.stat().st_size == size
+
+
 def test_a_full_disk_is_told_and_the_segment_goes_on_afterwards(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         writer.write(rows(0))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any, TypeVar
 
 from multidrop.history.database import connect
@@ -63,6 +65,11 @@ class Sources:
                 segment = self._held(number, found.segments[number])
             if segment and number < max(found.segments):  # it is closed: nothing will come to it
                 self._bounds[number] = segment.bounds
+                if segment.left_out:
+                    left_out = (
+                        f"the last {segment.left_out} bytes of {found.segments[number]} are no whole batch"
+                    )
+                    self.damage.setdefault(number, left_out)
         try:
             yield segment
         finally:
@@ -95,7 +102,7 @@ class Sources:
         """Return a cursor of DuckDB, to be closed. Raises ImportError."""
         with self._changing:
             if self._database is None:
-                self._database = connect(MEMORY)
+                self._database = connect(MEMORY, Path(gettempdir()) / f"multidrop-history-{os.getpid()}")
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:

@@ -19,6 +19,8 @@ from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.recording.retention import StoredFile, outlived
 from multidrop.transport import clock
 
+MOST_CUT = 1 << 24  # bytes: a longer end is no truncated batch, but damage, and kept for somebody to mend
+
 
 def segments_of(path: Path) -> list[tuple[int, Path]]:
     """Return the segments of the recording `path` by number, the oldest first."""
@@ -129,5 +131,5 @@ def _cut_truncated(path: Path) -> None:
     """Cut off what a killed writer left of its last batch: other libraries refuse such a file."""
     with suppress(OSError, ValueError):  # no recording at all: it stays as it is
         truncated = ArrowsReader(path).truncated
-        if truncated:
+        if 0 < truncated <= MOST_CUT:
             os.truncate(path, path.stat().st_size - truncated)
