@@ -83,6 +83,18 @@ def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
             assert (least, mean, most, last) == (None, None, None, None)
 
 
+def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
+    begins = [NOON + 1200 * SECOND * number for number in range(5)]
+    record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
+    compact(tmp_path, 6)
+    tens = listing(tmp_path).tens
+    assert [(file.first, file.last) for file in tens] == [(1, 3), (4, 4), (5, 5)]
+    record(tmp_path, [random_rows(9, NOON + DAY, 20)], after=5)
+    compact(tmp_path, 7)
+    assert [(file.first, file.last) for file in listing(tmp_path).tens] == [(1, 5), (6, 6)]
+    assert len(parquet_files(tmp_path / "tens")) == 2
+
+
 def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
     rows = segments()
     record(tmp_path, rows)

@@ -34,7 +34,7 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
         assert child.stdout is not None
         assert child.stdout.readline()  # it is recording
         with History(folder) as history:  # a reader while it records
-            check(history, {})
+            check(history, {}, NOON + run * RUN)
         time.sleep(dice.uniform(0, 1.2))
         if dice.random() < 0.5:
             child.kill()  # the process that compacts goes on
@@ -44,10 +44,10 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
     return int(said[-1]) if said else 0
 
 
-def check(history: History, written: dict[str, int]) -> int:
-    """Compare each run with its count; return the number of all rows."""
+def check(history: History, written: dict[str, int], begin: int | None = None) -> int:
+    """Compare each run, or those since `begin`, with its count; return the number of all rows."""
     runs: dict[str, list[int]] = defaultdict(list)
-    for rows in history.read():
+    for rows in history.read(None, begin):
         for row in rows:
             runs[row.drive].append(row.monotonic_ns // STEP)
     for run, numbers in runs.items():
@@ -70,7 +70,10 @@ def test_kills_at_any_moment(tmp_path: Path, kills: int) -> None:
     written: dict[str, int] = {}
     for run in range(kills):
         written[f"run-{run}"] = killed_recorder(tmp_path, run, dice)
-        if run < 15 or run % 10 == 0 or run == kills - 1:
+        with History(tmp_path) as history:
+            name = f"run-{run}"
+            assert check(history, {name: written[name]}, NOON + run * RUN) >= written[name]
+        if run < 15 or run % 20 == 0 or run == kills - 1:
             with History(tmp_path) as history:
                 total = check(history, written)
                 assert total_of_tens(history, run + 1) == total

@@ -66,10 +66,10 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
     return rows
 
 
-def record(folder: Path, segments: Sequence[Sequence[Row]], piece: int = 40) -> None:
+def record(folder: Path, segments: Sequence[Sequence[Row]], piece: int = 40, after: int = 0) -> None:
     """Write a segment of each list of rows."""
     folder.mkdir(exist_ok=True)
-    with SegmentWriter(folder / "rows.arrows", METADATA, every=1e9) as writer:
+    with SegmentWriter(folder / "rows.arrows", METADATA, every=1e9, after=after) as writer:
         for rows in segments:
             for at in range(0, len(rows), piece):
                 writer.write(from_rows(rows[at : at + piece]))

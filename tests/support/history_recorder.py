@@ -25,7 +25,7 @@ ROWS = 30  # of a batch
 def main(folder: Path, run: int) -> None:
     writer_module.WRITING_S = 0.01
     names = Names([f"run-{run}"])
-    writer = HistoryWriter(folder, METADATA, rotate=0.15)
+    writer = HistoryWriter(folder, METADATA, rotate=0.25)
     for number in count():
         writer.take(batch(names, 0, range(number * ROWS, (number + 1) * ROWS), NOON + run * RUN, STEP))
         print(writer.state().rows, flush=True)

@@ -53,16 +53,17 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int) -> None:
-    """Make Parquet of the segments below this number, and one file of the tens of each day that is over."""
+    """Make Parquet of segments below this number, and one file of the tens of an hour or day that is over."""
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
     clean(folder)
     for number, path in segments_of(folder / STEM):
         if number < below:
             _compact_segment(folder, number, path)
-    tens = widest(parquet_files(folder / "tens"))
-    for run in finished_days(tens, _without_tens(folder, tens)):
-        _merge(folder, run)
+    for seconds in (3600, 86400):
+        tens = widest(parquet_files(folder / "tens"))
+        for run in finished(tens, seconds, _without_tens(folder, tens)):
+            _merge(folder, run)
 
 
 def clean(folder: Path) -> None:
@@ -154,12 +155,12 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
     return found - {number for file in tens for number in range(file.first, file.last + 1)}
 
 
-def finished_days(tens: list[HistoryFile], missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the files to merge: runs of one day, behind which there is another day.
+def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
+    """Return the files to merge: runs of one hour or day, behind which there is another one.
 
     No segment whose tens are missing may have a number among theirs: the merged file would hide it.
     """
-    runs = [list(run) for _, run in groupby(tens, key=lambda file: file.day)]
+    runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
         run
         for run in runs[:-1]

@@ -33,10 +33,6 @@ class HistoryFile(NamedTuple):
         """Tell whether rows from `begin` to `end`, in ns, may be in it."""
         return self.begin * SECOND_NS < end and begin <= self.end * SECOND_NS
 
-    @property
-    def day(self) -> int:
-        return self.begin // 86400
-
 
 def file_name(first: int, last: int, least_ns: int, most_ns: int) -> str:
     """Return the name of the Parquet file of these segments, and of times from `least_ns` to `most_ns`."""
