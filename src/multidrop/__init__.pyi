@@ -64,6 +64,11 @@ from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
 from multidrop.family_file.loader import FamilyError as FamilyError
 from multidrop.family_file.loader import load_family as load_family
+from multidrop.history.buckets import Buckets as Buckets
+from multidrop.history.history import History as History
+from multidrop.history.history import HistoryRows as HistoryRows
+from multidrop.history.writer import HistoryState as HistoryState
+from multidrop.history.writer import HistoryWriter as HistoryWriter
 from multidrop.plant.loader import PlantError as PlantError
 from multidrop.plant.loader import load_plant as load_plant
 from multidrop.plant.model import Plant as Plant
@@ -80,6 +85,9 @@ from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer
 from multidrop.recording.format import RecordingReader as RecordingReader
 from multidrop.recording.reading import read as read
+from multidrop.recording.retention import parse_age as parse_age
+from multidrop.recording.retention import parse_size as parse_size
+from multidrop.recording.segments import SegmentWriter as SegmentWriter
 from multidrop.toml_check import Key as Key
 from multidrop.toml_check import TomlPlace as TomlPlace
 from multidrop.toml_check import parse_duration as parse_duration

@@ -58,6 +58,36 @@ def test_simulate_brings_the_faults_of_its_file(tmp_path: Path) -> None:
             bus.read(bus.attach(Toy, 1), Toy.output_current)
 
 
+def test_poll_in_segments(plant: Path, tmp_path: Path) -> None:
+    counted = 0
+    words = ["--seconds", 3, "--out", tmp_path / "run.arrows", "--rotate", "1 s", "--json"]
+    for _ in range(2):  # a restart goes on
+        done = multidrop("poll", plant, *words)
+        assert (done.returncode, done.stderr) == (0, "")
+        summary = json.loads(done.stdout)
+        counted += summary["samples"] + summary["misses"]
+    names = sorted(path.name for path in tmp_path.glob("*.arrows"))
+    assert names == [f"run.{number:08d}.arrows" for number in range(1, len(names) + 1)]
+    assert len(names) >= 4
+    assert sum(len(recorded(tmp_path / name)) for name in names) == counted
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--keep", "1 h"], '--keep and --most remove whole files: say --rotate too, such as --rotate "1 h"'),
+        (["--rotate", "1 h"], "--rotate needs a recording whose name ends in .arrows: say --out run.arrows"),
+        (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a recording whose name ends in .arrows"),
+        (["--rotate", "soon"], "'soon' is not a time from 1 s to 100 years"),
+        (["--most", "big"], "'big' is not a size from 1 kB on"),
+    ],
+)
+def test_options_of_segments_that_do_not_fit(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+    status, out, told = run("poll", plant, *words)
+    assert (status, out) == (2, "")
+    assert sentence in told
+
+
 LATE_OR_SILENT = {str(it) for it in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
 
 

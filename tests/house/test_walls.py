@@ -30,12 +30,12 @@ FLOORS = [
     {"polling"},
     {"poller"},
     {"recording", "sim", "scan", "importers"},
-    {"capture", "report"},
+    {"capture", "report", "history"},
     {"gateway"},
     {"cli"},
     {"__init__", "__main__"},
 ]
-TOUCHING_THE_SYSTEM = {"transport", "recording", "sim", "cli"}
+TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "cli"}
 FILES_TOUCHING_THE_SYSTEM = {
     "core/fork.py",
     "control/eeprom_ledger.py",

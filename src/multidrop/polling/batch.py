@@ -133,6 +133,10 @@ class Batch(Rows):
         names = (self._drives.listed, self._registers.listed, _STATUSES.listed)
         return BatchColumns(time, sent, uncertainty, drive, register, value, status, valid, *names)
 
+    def parts(self) -> tuple[Columns, Names, Names]:
+        """Return the core's columns, and the names of drives and registers, for what copies them."""
+        return self._columns, self._drives, self._registers
+
     def _may_have(self) -> Collection[str]:
         registers, drives = self._registers.listed, self._drives.listed
         return [f"{drive}.{register}" for drive in drives for register in registers]

@@ -7,17 +7,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop.core import Names, spell
 from multidrop.core.narrow import wide_codes, widen
 from multidrop.polling.batch import assemble
 from multidrop.recording.arrow_ipc import DICTIONARY_BATCH, RECORD_BATCH, FlatTable, IpcMessage
-from multidrop.recording.arrow_schema import SINGLE, UTF8, FileColumn
+from multidrop.recording.arrow_schema import FLOAT, SINGLE, UTF8, FileColumn
 from multidrop.recording.rows import RecordedRows
 
 MOST_SPELLED = 1 << 28  # bytes of one column's names in a batch: a few may make a small file a huge table
 Buffers = tuple[Any, ...]
+
+
+class RecordedColumns(NamedTuple):
+    """Columns of a recorded batch: numbers for each row, and codes for places in the names."""
+
+    time: memoryview
+    monotonic_ns: memoryview
+    uncertainty_ns: memoryview  # 0 for a miss
+    drive: memoryview
+    register: memoryview
+    value: memoryview  # without meaning for a miss
+    status: memoryview
+    valid: bytes | None  # a bit for each row, 0 for a miss; None: there is none
+    drives: tuple[str, ...]
+    registers: tuple[str, ...]
+    statuses: tuple[str, ...]
 
 
 class BatchDecoder:
@@ -48,6 +64,44 @@ class BatchDecoder:
             for column, identity in self._columns
         ]
         return RecordedRows(assemble(rows, *columns))
+
+    @property
+    def known(self) -> dict[int, Names]:
+        """The dictionaries that have come so far; it stays as it is when others come."""
+        return self._names
+
+    def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
+        """Return the columns of a batch without spelling their names out; codes are checked.
+
+        `names_of` is what was `known` when it came. Raises as `decode`, and for a file of before, whose names
+        have no codes.
+        """
+        rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
+        left = iter(buffers)
+        found: list[Any] = []
+        names: list[tuple[str, ...]] = []
+        valid: bytes | None = None
+        for column, identity in self._columns:
+            bits, data, *_ = islice(left, column.buffers)
+            if len(bits) and not column.nullable:
+                _check_filled(column, bits, rows)
+            if column.name == b"value":
+                valid = bits or None
+            if identity is not None:
+                codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
+                if known is None or (rows and max(codes) >= len(known)):
+                    raise ValueError("there are rows before the names of their codes")
+                found.append(codes)
+                names.append(known.listed)
+            elif column.detail == SINGLE:
+                found.append(widen(data, bits or None, rows).cast("B").cast("q"))
+            elif column.kind == UTF8 or len(data) < 8 * rows:
+                raise ValueError("its lengths do not fit together")
+            else:
+                found.append(memoryview(data[: 8 * rows]).cast("d" if column.kind == FLOAT else "q"))
+        if valid is not None and len(valid) * 8 < rows:
+            raise ValueError("its lengths do not fit together")
+        return RecordedColumns._make([*found, valid, *names])
 
     def _decoded(
         self, column: FileColumn, identity: int | None, rows: int, bits: bytes, *data: Any
@@ -85,7 +139,8 @@ class BatchDecoder:
                 raise ValueError("its lengths do not fit together")
             names.append(str(text[begin:end], "utf-8"))
         before = self._names.get(number) if header.number(2, "<?") else None
-        self._names[number] = Names([*(before.listed if before else ()), *names])
+        learnt = Names([*(before.listed if before else ()), *names])
+        self._names = {**self._names, number: learnt}
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:

@@ -77,9 +77,9 @@ class IpcMessage:
     end: int
 
 
-def messages(file: BinaryIO, size: int) -> Iterator[IpcMessage]:
-    """Yield the messages in the first `size` bytes, up to the first that is truncated or invalid."""
-    end = 0
+def messages(file: BinaryIO, size: int, begin: int = 0) -> Iterator[IpcMessage]:
+    """Yield the messages from `begin` to `size`, up to the first that is truncated or invalid."""
+    end = begin
     while message := _message(file, end, size):
         yield message
         end = message.end

@@ -75,6 +75,11 @@ class ArrowsReader(RecordingReader):
                     yield batch
                     rows += len(batch)
 
+    @property
+    def columns(self) -> list[tuple[FileColumn, int | None]]:
+        """The columns of the file, each with its dictionary's id."""
+        return self._columns
+
     def _read_schema(self, message: IpcMessage) -> Metadata:
         try:
             head = message.header if message.kind == SCHEMA else None

@@ -43,7 +43,7 @@ class CsvWriter(AppendingWriter):
             raise
 
     def write(self, batch: Rows) -> None:
-        self._append("".join(map(_line, batch)).encode())
+        self._append(lines_of(batch))
         self.rows += len(batch)
 
     @property
@@ -122,6 +122,11 @@ def _parse(cells: list[str]) -> Row:
         float(value) if value else None,
         _unquote(status),
     )
+
+
+def lines_of(rows: Rows) -> bytes:
+    """Return the rows as lines of text."""
+    return "".join(map(_line, rows)).encode()
 
 
 def _line(row: Row) -> str:

@@ -14,11 +14,12 @@ from typing import Any
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
 from multidrop.cli.poll.comparison import compare, comparison_text
 from multidrop.cli.poll.live_table import LiveTable
+from multidrop.cli.poll.rotation import add_rotation_arguments, rotation_of
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import check_capture, refuse_overwriting
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.plants import add_plant_argument, add_port_option, plant_of
-from multidrop.cli.support.polling import polling_session
+from multidrop.cli.support.polling import Rotation, polling_session
 from multidrop.cli.support.signals import Interruption
 from multidrop.cli.support.values import aligned
 from multidrop.plant.model import Plant
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
     add_port_option(parser)
     add_polling_arguments(parser, out=None, seconds=None)
+    add_rotation_arguments(parser)
 
 
 def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, seconds: float | None) -> None:
@@ -58,12 +60,13 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if arguments.out:
+    rotation = rotation_of(arguments)
+    if arguments.out and not rotation:
         refuse_overwriting(arguments.out)
-    return follow(plant_of(arguments.plant, arguments), arguments)
+    return follow(plant_of(arguments.plant, arguments), arguments, rotation)
 
 
-def follow(plant: Plant, arguments: argparse.Namespace) -> int:
+def follow(plant: Plant, arguments: argparse.Namespace, rotation: Rotation | None = None) -> int:
     """Poll the plant as the polling arguments say, and print the summary."""
     if arguments.capture:
         check_capture(arguments.capture)
@@ -72,7 +75,10 @@ def follow(plant: Plant, arguments: argparse.Namespace) -> int:
     show = not arguments.json and sys.stdout.isatty()
     table = LiveTable(plant, sys.stdout) if show else None
     consumers = [table.add] if table else []
-    with polling_session(plant, arguments.out, *consumers) as session, ExitStack() as stack:
+    with (
+        polling_session(plant, arguments.out, *consumers, rotation=rotation) as session,
+        ExitStack() as stack,
+    ):
         taps = _Taps(session.poller, arguments, stack)
         with session.poller:
             for _ in _ticks(arguments.seconds, session.interruption):

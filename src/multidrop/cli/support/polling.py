@@ -12,6 +12,8 @@ from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows
 from multidrop.recording import open_writer
+from multidrop.recording.format import Metadata, RecordingWriter
+from multidrop.recording.segments import SegmentWriter
 
 
 class PollingSession(NamedTuple):
@@ -20,9 +22,26 @@ class PollingSession(NamedTuple):
     hand_out: Callable[[], None]  # hands the rows that have come to the recording and the consumers
 
 
+class Rotation(NamedTuple):
+    """A recording in segments: how long each is, in s, and how much of them is kept."""
+
+    every: float
+    keep: float | None = None  # s
+    most: int | None = None  # bytes
+
+
+def _open(out: Path, metadata: Metadata, rotation: Rotation | None) -> RecordingWriter:
+    if rotation is None:
+        return open_writer(out, metadata)
+    return SegmentWriter(out, metadata, every=rotation.every, keep=rotation.keep, most=rotation.most)
+
+
 @contextmanager
 def polling_session(
-    plant: Plant, out: Path | None, *consumers: Callable[[Rows], None]
+    plant: Plant,
+    out: Path | None,
+    *consumers: Callable[[Rows], None],
+    rotation: Rotation | None = None,
 ) -> Iterator[PollingSession]:
     """Open the plant's ports, and then its recording; close both when the block is left."""
     takers = list(consumers)
@@ -30,7 +49,7 @@ def polling_session(
         interruption = stack.enter_context(noting_signals())
         poller = stack.enter_context(closing(Poller(plant)))  # first: without ports there is no recording
         if out:
-            takers.append(stack.enter_context(open_writer(out, plant.metadata())).write)
+            takers.append(stack.enter_context(_open(out, plant.metadata(), rotation)).write)
 
         def hand_out() -> None:
             while batch := poller.take():

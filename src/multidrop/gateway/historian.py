@@ -1,0 +1,131 @@
+"""The historian: a feed that records all rows, and may fail without anybody else's failing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
+
+from multidrop import Batch, Buckets, History, HistoryState, HistoryWriter, Plant, parse_age, parse_size
+
+MS_NS = 1_000_000
+PIECE = 1 << 16  # bytes of an export
+
+
+@dataclass(frozen=True)
+class HistorySettings:
+    """The table `[serve.history]`. Raises ValueError with all that is wrong in it, a line each."""
+
+    folder: str = "history"
+    keep: str = "30 days"
+    most: str = "20 GB"
+    rotate: str = "10 min"
+
+    def __post_init__(self) -> None:
+        mistakes = []
+        for key, parse in (("keep", parse_age), ("most", parse_size), ("rotate", parse_age)):
+            try:
+                parse(getattr(self, key))
+            except ValueError as mistake:
+                mistakes.append(f"{key} = {mistake}")
+        if mistakes:
+            raise ValueError("\n".join(mistakes))
+
+
+class Surroundings(Protocol):
+    """The part of the gateway that the historian needs."""
+
+    @property
+    def plant(self) -> Plant: ...
+    @property
+    def folder(self) -> Path: ...
+
+
+def build(settings: HistorySettings, inside: Surroundings) -> Historian:
+    """Return the historian of a gateway; a relative folder is beside its plant file."""
+    return Historian(inside.plant, inside.folder / settings.folder, settings)
+
+
+class Historian:
+    """Records what it takes, and answers questions of the page about it.
+
+    Raises as HistoryWriter does, when it begins.
+    """
+
+    def __init__(self, plant: Plant, folder: Path, settings: HistorySettings) -> None:
+        self._writer = HistoryWriter(
+            folder,
+            plant.metadata(),
+            rotate=parse_age(settings.rotate),
+            keep=parse_age(settings.keep),
+            most=parse_size(settings.most),
+        )
+        self.history = History(folder)
+        self._over = asyncio.Event()
+
+    # ---- a feed ----
+
+    def take(self, batch: Batch) -> None:
+        """Copy the rows, within microseconds; another thread writes them."""
+        self._writer.take(batch)
+
+    async def run(self) -> None:
+        """Wait until it is closed: it lives on a thread of its own."""
+        await self._over.wait()
+
+    async def close(self) -> None:
+        """Write what waits; a disk that does not answer is waited for 10 s at most."""
+        await asyncio.to_thread(self._writer.close)
+        self.history.close()
+        self._over.set()
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant file: the next segment has its metadata."""
+        self._writer.begin(plant.metadata())
+
+    @property
+    def state(self) -> HistoryState:
+        """Rows written, rows lost, and what is wrong now."""
+        return self._writer.state()
+
+    # ---- questions; times are UTC in ms ----
+
+    async def series(self, names: Sequence[str], begin: int, end: int, points: int) -> dict[str, Any]:
+        """Return the buckets of each series as JSON. Raises ValueError, OSError and ImportError."""
+        range_ns = begin * MS_NS, end * MS_NS
+        found = await asyncio.to_thread(self.history.buckets, names, *range_ns, points)
+        step = next(iter(found.values())).step
+        return {"step_ms": step / MS_NS, "series": {name: _as_json(made) for name, made in found.items()}}
+
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        """Return a file of these series, or of all, piece by piece: "csv" or "parquet".
+
+        Raises as `series`, at once where the series or the times are wrong.
+        """
+        kinds: dict[str, Callable[..., Iterator[bytes]]] = {"csv": self.history.csv, "parquet": self._parquet}
+        if kind not in kinds:
+            raise ValueError(f"format = {kind!r} is neither csv nor parquet")
+        of = names or None, begin * MS_NS, end * MS_NS
+        self.history.read(*of)  # a mistake is told before the first piece
+        return kinds[kind](*of)
+
+    def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:
+        with TemporaryDirectory(prefix=".export-", dir=self.history.folder) as directory:
+            path = Path(directory) / "export.parquet"
+            self.history.export(path, names, begin, end)
+            with path.open("rb") as file:
+                while piece := file.read(PIECE):
+                    yield piece
+
+
+def _as_json(made: Buckets) -> dict[str, Any]:
+    return {
+        "time": [time // MS_NS for time in made.times],
+        "least": made.least,
+        "mean": made.mean,
+        "most": made.most,
+        "missed": made.missed,
+    }

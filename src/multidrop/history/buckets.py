@@ -1,0 +1,118 @@
+"""Buckets: least, mean and most of a register in each of many equal times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+
+from multidrop.history.folder import SECOND_NS, TEN_NS
+
+STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
+MOST_POINTS = 100_000
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """A register in equal times, one entry each in every list.
+
+    A bucket begins at `begin + number * step`, in ns. Where it has no value, `least`, `mean` and `most` are
+    None: `missed` says whether it was asked in vain (above 0), or not at all (0).
+    """
+
+    begin: int  # UTC in ns
+    step: int  # in ns
+    n: list[int]  # values
+    missed: list[int]  # misses
+    least: list[float | None]
+    mean: list[float | None]
+    most: list[float | None]
+
+    def __len__(self) -> int:
+        return len(self.n)
+
+    @property
+    def times(self) -> list[int]:
+        """The beginning of each bucket, UTC in ns."""
+        return [self.begin + number * self.step for number in range(len(self))]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Times of equal length that cover a range."""
+
+    begin: int  # in ns
+    step: int
+    points: int
+
+    @property
+    def end(self) -> int:
+        return self.begin + self.step * self.points
+
+    @property
+    def is_of_tens(self) -> bool:
+        """True where every edge is one of ten seconds."""
+        return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
+
+
+def grid_of(begin: int, end: int, points: int) -> Grid:
+    """Return at most `points` times that cover the range; from 10 s on, of whole tens, hours or days.
+
+    A range that begins within a bucket is covered from that bucket's beginning. Raises ValueError for a
+    range without length, or another number of points than 1 to 100000.
+    """
+    if not 1 <= points <= MOST_POINTS:
+        raise ValueError(f"points = {points} is not a number from 1 to {MOST_POINTS}")
+    if begin >= end:
+        raise ValueError(f"the range ends at {end} ns, and begins not before it, at {begin} ns")
+    least = -(-(end - begin) // points)
+    if least <= TEN_NS // 2:
+        return Grid(begin, least, -(-(end - begin) // least))
+    for step in _handy_steps(least):
+        first = begin // step * step
+        needed = -(-(end - first) // step)
+        if needed <= max(points, 2):  # a range of one bucket may lie across an edge
+            return Grid(first, step, needed)
+    raise AssertionError("steps grow for ever")
+
+
+def _handy_steps(least: int) -> Iterator[int]:
+    """Yield steps of tens of seconds, hours or days that are no less."""
+    yield from (seconds * SECOND_NS for seconds in STEPS_S if seconds * SECOND_NS >= least)
+    yield from (days * 86400 * SECOND_NS for days in count(max(2, least // (86400 * SECOND_NS))))
+
+
+class Accumulator:
+    """Gathers one register's values in the buckets of a grid."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._n, self._missed = [0] * grid.points, [0] * grid.points
+        self._sum = [0.0] * grid.points
+        self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
+
+    def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
+        """Add what is known of so many values and misses of a bucket; the numbers matter where n > 0."""
+        self._missed[bucket] += missed
+        if n:
+            self._n[bucket] += n
+            self._sum[bucket] += total
+            self._least[bucket] = min(self._least[bucket], least)
+            self._most[bucket] = max(self._most[bucket], most)
+
+    def buckets(self) -> Buckets:
+        has = self._n
+        return Buckets(
+            self._grid.begin,
+            self._grid.step,
+            self._n,
+            self._missed,
+            _where(has, self._least),
+            _where(has, [total / n if n else 0.0 for total, n in zip(self._sum, has, strict=True)]),
+            _where(has, self._most),
+        )
+
+
+def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
+    return [value if n else None for n, value in zip(has, values, strict=True)]

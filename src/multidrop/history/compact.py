@@ -1,0 +1,188 @@
+"""Compact closed segments: `python -m multidrop.history.compact FOLDER --below NUMBER`, a process of its own.
+
+It may be killed at any moment and started again: what it makes gets its name when it is whole and on the
+disk, and only then is what it replaces removed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from multidrop.history.database import connect, copy_out, files_of, insert
+from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
+from multidrop.polling.batch import Rows
+from multidrop.recording.arrows import ArrowsReader
+from multidrop.recording.file_lock import FileLock
+from multidrop.recording.segments import segments_of
+
+MEMORY = "100MB"  # of DuckDB; the process takes about 80 MB more
+ROWS = "select * from recorded order by drive, time"
+TENS = """
+select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, count(value) as n,
+    count(*) - count(value) as missed, min(value) as least, avg(value) as mean, max(value) as most,
+    arg_max(value, monotonic_ns) as last
+from recorded group by all order by drive, register, time
+"""
+MERGED = "select * from {} order by drive, register, time"
+
+
+def main(words: list[str] | None = None) -> int:
+    """Compact what can be; return 0, also where another process is at it already."""
+    parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
+    arguments = parser.parse_args(words)
+    folder: Path = arguments.folder
+    try:
+        lock = FileLock(folder / ".compact.lock")
+    except BlockingIOError:
+        return 0
+    try:
+        compact(folder, arguments.below)
+    finally:
+        lock.close()
+    return 0
+
+
+def compact(folder: Path, below: int) -> None:
+    """Make Parquet of segments below this number, and one file of the tens of an hour or day that is over."""
+    for name in ("rows", "tens", "damaged"):
+        (folder / name).mkdir(exist_ok=True)
+    clean(folder)
+    for number, path in segments_of(folder / STEM):
+        if number < below:
+            _compact_segment(folder, number, path)
+    for seconds in (3600, 86400):
+        tens = widest(parquet_files(folder / "tens"))
+        for run in finished(tens, seconds, _without_tens(folder, tens)):
+            _merge(folder, run)
+
+
+def clean(folder: Path) -> None:
+    """Remove what a killed process left: files without their name, and those that others replace."""
+    for directory in (folder / "rows", folder / "tens"):
+        for path in directory.glob(".*.part"):
+            path.unlink()
+    shutil.rmtree(folder / ".spill", ignore_errors=True)
+    have = {file.first for file in parquet_files(folder / "rows")}
+    for number, path in segments_of(folder / STEM):
+        if number in have:
+            _put_away(folder, path, not _is_whole(path))
+    tens = parquet_files(folder / "tens")
+    for file in set(tens) - set(widest(tens)):
+        file.path.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path) -> bool:
+    with suppress(OSError, ValueError):
+        reader = ArrowsReader(path)
+        return not reader.truncated and sum(map(len, reader)) >= 0
+    return False
+
+
+def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
+    """Remove a segment, but keep one of which only a part could be read: somebody may mend it."""
+    with suppress(FileNotFoundError):  # too old, and removed meanwhile
+        if is_damaged and path.stat().st_size:
+            path.replace(folder / "damaged" / path.name)
+        else:
+            path.unlink()
+
+
+def _compact_segment(folder: Path, number: int, path: Path) -> None:
+    damage: list[str] = []
+    with connect(MEMORY, folder / ".spill") as database:
+        metadata = {}
+        try:
+            reader = ArrowsReader(path)
+            metadata = dict(reader.metadata)
+            if reader.truncated:
+                damage.append(f"the last {reader.truncated} bytes of {path} are no whole batch")
+        except FileNotFoundError:  # too old, and removed meanwhile
+            return
+        except ValueError as error:
+            damage.append(str(error))
+        else:
+            insert(database, _readable(reader, damage))
+            bounds = "select min(epoch_ns(time)), max(epoch_ns(time)), count(*) from recorded"
+            least, most, rows = database.execute(bounds).fetchone()
+            if rows:
+                name = file_name(number, number, least, most)
+                _write(database, TENS, folder / "tens" / name)
+                _write(database, ROWS, folder / "rows" / name, metadata)
+    for sentence in damage:
+        print(sentence, file=sys.stderr)
+    _put_away(folder, path, bool(damage))
+
+
+def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
+    """Yield the rows up to the first that is damaged, and note that."""
+    try:
+        yield from reader
+    except ValueError as error:
+        damage.append(str(error))
+
+
+def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | None = None) -> None:
+    """Write a Parquet file, which has its name once it is on the disk."""
+    part = path.with_name(f".{path.name}.part")
+    copy_out(database, query, part, metadata)
+    _on_disk(part)
+    part.replace(path)
+    _on_disk(path.parent)
+
+
+def _on_disk(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
+    """Return the numbers of segments whose rows are in no file of tens."""
+    found = {number for number, _ in segments_of(folder / STEM)}
+    found |= {file.first for file in parquet_files(folder / "rows")}
+    return found - {number for file in tens for number in range(file.first, file.last + 1)}
+
+
+def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
+    """Return the files to merge: runs of one hour or day, behind which there is another one.
+
+    No segment whose tens are missing may have a number among theirs: the merged file would hide it.
+    """
+    runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
+    return [
+        run
+        for run in runs[:-1]
+        if len(run) > 1 and not any(run[0].first <= number <= run[-1].last for number in missing)
+    ]
+
+
+def _merge(folder: Path, run: list[HistoryFile]) -> None:
+    begin, end = min(file.begin for file in run), max(file.end for file in run)
+    name = file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9)
+    with connect(MEMORY, folder / ".spill") as database:
+        _write(database, MERGED.format(files_of(file.path for file in run)), folder / "tens" / name)
+    for file in run:
+        file.path.unlink(missing_ok=True)
+
+
+def be_low() -> None:
+    """Give way to everything else, where that is allowed."""
+    with suppress(OSError):
+        os.nice(19)
+
+
+if __name__ == "__main__":
+    be_low()
+    raise SystemExit(main())

@@ -1,0 +1,107 @@
+"""DuckDB, as the history uses it: bounded memory, one thread, rows that go in and come out as Arrow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from multidrop.polling.batch import Rows, assemble, schema
+from multidrop.recording.format import METADATA_KEY, Metadata
+from multidrop.recording.rows import RecordedRows
+
+MOST_INSERTED = 60_000  # rows at a time: names are spelled out for them, 70 bytes a row
+TABLE = (
+    "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
+    " drive varchar, register varchar, value double, status varchar)"
+)
+FORM = "format parquet, compression zstd"
+
+
+class MissingDuckDB(ImportError):
+    """DuckDB is not installed, and what was asked for needs it."""
+
+
+def connect(memory: str, spill: Path | None = None) -> Any:
+    """Return a connection to an empty database in memory. Raises MissingDuckDB."""
+    try:
+        import duckdb
+    except ImportError as failure:
+        raise MissingDuckDB(
+            "compacted history needs duckdb, which is not installed: pip install 'multidrop[history]'"
+        ) from failure
+    settings: dict[str, Any] = {"memory_limit": memory, "threads": 1, "autoinstall_known_extensions": False}
+    if spill:
+        settings["temp_directory"] = str(spill)
+    return duckdb.connect(config=settings)
+
+
+class ArrowStream:
+    """Batches as DuckDB takes them; it asks anew for each query."""
+
+    def __init__(self, batches: Iterable[Rows]) -> None:
+        self._arrays = [rows.arrow() for rows in batches]
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        from nanoarrow.c_array_stream import CArrayStream
+
+        return CArrayStream.from_c_arrays(self._arrays, schema()).__arrow_c_stream__()
+
+
+def insert(database: Any, batches: Iterable[Rows]) -> None:
+    """Put rows into the table `recorded`, which is made here."""
+    database.execute(TABLE)
+    waiting: list[Rows] = []
+    for rows in batches:
+        waiting.append(rows)
+        if sum(map(len, waiting)) >= MOST_INSERTED:
+            _insert(database, waiting)
+    _insert(database, waiting)
+
+
+def _insert(database: Any, waiting: list[Rows]) -> None:
+    if waiting:
+        database.register("arrived", ArrowStream(waiting))
+        database.execute("insert into recorded from arrived")
+        database.unregister("arrived")
+        waiting.clear()
+
+
+def copy_out(
+    database: Any,
+    query: str,
+    path: Path,
+    metadata: Metadata | None = None,
+    values: Mapping[str, Any] | None = None,
+) -> int:
+    """Write what the query gives into a Parquet file; return the number of rows."""
+    form = FORM
+    if metadata is not None:
+        form += f", kv_metadata {{{METADATA_KEY}: {quoted(json.dumps(metadata, ensure_ascii=False))}}}"
+    copied = database.execute(f"copy ({query}) to {quoted(str(path))} ({form})", dict(values or {}))
+    return int(copied.fetchone()[0])
+
+
+def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Rows]:
+    """Yield the rows that a query for the columns of a recording gives."""
+    import nanoarrow
+
+    for array in nanoarrow.c_array_stream(database.sql(query, params=dict(values))):
+        columns = [
+            (
+                bytes(child.buffer(0)) if child.null_count else None,
+                *(bytes(child.buffer(number)) for number in range(1, child.n_buffers)),  # DuckDB's own go
+            )
+            for child in array.view().children
+        ]
+        yield RecordedRows(assemble(array.length, *columns))
+
+
+def quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def files_of(paths: Iterable[Path]) -> str:
+    """Return a table of these Parquet files."""
+    return f"read_parquet([{', '.join(quoted(str(path)) for path in paths)}])"

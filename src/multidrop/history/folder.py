@@ -1,0 +1,110 @@
+"""The files of a history: their names, and which of them hold a row."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+from multidrop.recording.retention import StoredFile
+from multidrop.recording.segments import segments_of
+
+SECOND_NS = 1_000_000_000
+TEN_NS = 10 * SECOND_NS
+STEM = "rows.arrows"
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_FORM = "%Y%m%dT%H%M%SZ"
+_NAME = re.compile(r"(\d{8,})(?:-(\d{8,}))?\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parquet")
+
+
+class HistoryFile(NamedTuple):
+    """A Parquet file: the first and the last segment in it, and UTC in s around its times."""
+
+    path: Path
+    first: int
+    last: int
+    begin: int
+    end: int
+
+    def may_have(self, begin: int, end: int) -> bool:
+        """Tell whether rows from `begin` to `end`, in ns, may be in it."""
+        return self.begin * SECOND_NS < end and begin <= self.end * SECOND_NS
+
+
+def file_name(first: int, last: int, least_ns: int, most_ns: int) -> str:
+    """Return the name of the Parquet file of these segments, and of times from `least_ns` to `most_ns`."""
+    numbers = f"{first:08d}" if first == last else f"{first:08d}-{last:08d}"
+    begin, end = least_ns // SECOND_NS, -(-most_ns // SECOND_NS)
+    return f"{numbers}.{_text(begin)}-{_text(end)}.parquet"
+
+
+def _text(second: int) -> str:
+    return f"{_EPOCH + timedelta(seconds=second):{_FORM}}"
+
+
+def _second(text: str) -> int:
+    return (datetime.strptime(text, _FORM).replace(tzinfo=UTC) - _EPOCH) // timedelta(seconds=1)
+
+
+def parquet_files(directory: Path) -> list[HistoryFile]:
+    """Return the Parquet files there, the oldest first; none where there is no such directory."""
+    found = []
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for path in directory.iterdir():
+            if match := _NAME.fullmatch(path.name):
+                first, last, begin, end = match.groups()
+                with suppress(ValueError):  # no date
+                    file = HistoryFile(path, int(first), int(last or first), _second(begin), _second(end))
+                    found.append(file)
+    return sorted(found, key=lambda file: (file.first, -file.last))
+
+
+def widest(files: list[HistoryFile]) -> list[HistoryFile]:
+    """Return the files that are in no other one's range; they are in order."""
+    found: list[HistoryFile] = []
+    for file in files:
+        if not found or file.first > found[-1].last:
+            found.append(file)
+    return found
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The files that hold the history now, each row in one of them."""
+
+    segments: dict[int, Path] = field(default_factory=dict)  # that are not in `rows`
+    rows: dict[int, HistoryFile] = field(default_factory=dict)
+    tens: list[HistoryFile] = field(default_factory=list)
+
+    @property
+    def newest(self) -> int:
+        """The highest number that was given; 0 for an empty history."""
+        return max([0, *self.segments, *self.rows, *(file.last for file in self.tens)])
+
+
+def listing(folder: Path) -> Listing:
+    """List a history, or a recording in segments such as run.arrows. Raises OSError where there is none."""
+    if folder.suffix == ".arrows":
+        return Listing(dict(segments_of(folder)))
+    segments = dict(segments_of(folder / STEM))  # first: what is removed next is in what is listed next
+    rows = {file.first: file for file in parquet_files(folder / "rows")}
+    tens = widest(parquet_files(folder / "tens"))
+    left = {number: path for number, path in segments.items() if number not in rows}
+    return Listing(left, rows, tens)
+
+
+def stored_files(folder: Path) -> list[StoredFile]:
+    """Return all files of a history that may be removed when they are too old."""
+    found = []
+    for directory in (folder, folder / "damaged"):
+        with suppress(OSError):
+            for number, path in segments_of(directory / STEM):
+                about = path.stat()
+                found.append(StoredFile(path, number, about.st_mtime, about.st_size))
+    for file in (*parquet_files(folder / "rows"), *parquet_files(folder / "tens")):
+        with suppress(OSError):
+            found.append(StoredFile(file.path, file.last, file.end, file.path.stat().st_size))
+    return found

@@ -1,0 +1,174 @@
+"""A segment that is not compacted yet: each batch is looked at once, and tens are reckoned of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from itertools import repeat
+from pathlib import Path
+from typing import NamedTuple
+
+from multidrop.history.buckets import Accumulator, Grid
+from multidrop.history.folder import TEN_NS
+from multidrop.polling.batch import Row
+from multidrop.recording.arrow_decoder import RecordedColumns
+from multidrop.recording.arrows_tail import ArrowsTail, BatchPlace
+
+Series = tuple[str, str]  # drive and register
+Ten = list[float]  # values, misses, their sum, least, most
+Tens = dict[int, Ten]  # by number since 1970
+
+
+class IndexedBatch(NamedTuple):
+    """A batch's place, and the times in it."""
+
+    place: BatchPlace
+    least: int
+    most: int
+
+
+class GrowingSegment:
+    """A segment that is read as far as it is there; `damage` says why no more of it can be read.
+
+    Raises as ArrowsTail does.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._tail = ArrowsTail(path)
+        self._holders = 1
+        self._changing = threading.RLock()
+        self._batches: list[IndexedBatch] = []
+        self._tens: dict[Series, Tens] = {}
+        self._by_code: dict[int, Tens] = {}
+        self._names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+        self.metadata = self._tail.metadata
+        self.damage: str | None = None
+
+    def hold(self) -> None:
+        """Keep it open until one more `let_go`."""
+        with self._changing:
+            self._holders += 1
+
+    def let_go(self) -> None:
+        """Close it, when nobody holds it any more."""
+        with self._changing:
+            self._holders -= 1
+            if not self._holders:
+                self._tail.close()
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """The least and the greatest time in it, in ns; (0, 0) where there are no rows."""
+        least = min((batch.least for batch in self._batches), default=0)
+        return least, max((batch.most for batch in self._batches), default=0)
+
+    @property
+    def left_out(self) -> int:
+        """Bytes at the end that are no whole batch."""
+        return self._tail.left_out
+
+    def look(self) -> None:
+        """Take in what came since the last look."""
+        with self._changing:
+            try:
+                for columns, place in self._tail.new() if self.damage is None else ():
+                    if len(columns.time):
+                        self._add(columns)
+                        self._batches.append(IndexedBatch(place, min(columns.time), max(columns.time)))
+            except ValueError as damage:
+                self.damage = str(damage)
+
+    def _add(self, columns: RecordedColumns) -> None:
+        if self._names != (columns.drives, columns.registers):
+            self._names = columns.drives, columns.registers
+            self._by_code.clear()
+        by_code = self._by_code
+        for time, drive, register, value, valid in zip(
+            columns.time, columns.drive, columns.register, columns.value, _valid(columns), strict=False
+        ):
+            code = drive << 16 | register
+            tens = by_code.get(code)
+            if tens is None:
+                series = columns.drives[drive], columns.registers[register]
+                tens = by_code[code] = self._tens.setdefault(series, {})
+            ten = tens.get(time // TEN_NS)
+            if ten is None:
+                ten = tens[time // TEN_NS] = [0, 0, 0.0, float("inf"), float("-inf")]
+            if valid:
+                ten[0] += 1
+                ten[2] += value
+                if value < ten[3]:
+                    ten[3] = value
+                if value > ten[4]:
+                    ten[4] = value
+            else:
+                ten[1] += 1
+
+    def batches(self, begin: int, end: int) -> list[IndexedBatch]:
+        """Return the batches that may have rows from `begin` to before `end`, in ns."""
+        return [batch for batch in self._batches if batch.least < end and begin <= batch.most]
+
+    def rows_of(
+        self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
+    ) -> list[Row]:
+        """Return a batch's rows of these series, or of all, from `begin` to before `end`."""
+        columns = self._tail.again(batch.place)
+        wanted = None if series is None else _codes(columns.drives, columns.registers, series)
+        return list(_rows(columns, wanted, begin, end))
+
+    def gather(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
+        """Add the series' rows to the buckets of the grid."""
+        with self._changing:
+            if grid.is_of_tens:
+                self._gather_tens(found, grid)
+            else:
+                self._gather_rows(found, grid)
+
+    def _gather_rows(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
+        for batch in self.batches(grid.begin, grid.end):
+            for row in self.rows_of(batch, frozenset(found), grid.begin, grid.end):
+                bucket, value = (row.time - grid.begin) // grid.step, row.value
+                into = found[row.drive, row.register]
+                if value is None:
+                    into.add(bucket, 0, 1, 0.0, 0.0, 0.0)
+                else:
+                    into.add(bucket, 1, 0, value, value, value)
+
+    def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
+        for series, into in found.items():
+            for number, (n, missed, *sums) in self._tens.get(series, {}).items():
+                if grid.begin <= number * TEN_NS < grid.end:
+                    into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
+
+
+def _valid(columns: RecordedColumns) -> Iterator[bool]:
+    if columns.valid is None:
+        return repeat(True)
+    return (bool(byte >> bit & 1) for byte in columns.valid for bit in range(8))
+
+
+@lru_cache(maxsize=64)
+def _codes(drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]) -> frozenset[int]:
+    return frozenset(
+        drive << 16 | register
+        for drive, name in enumerate(drives)
+        for register, other in enumerate(registers)
+        if (name, other) in series
+    )
+
+
+def _rows(columns: RecordedColumns, wanted: frozenset[int] | None, begin: int, end: int) -> Iterator[Row]:
+    for at, (time, drive, register, valid) in enumerate(
+        zip(columns.time, columns.drive, columns.register, _valid(columns), strict=False)
+    ):
+        if (wanted is None or drive << 16 | register in wanted) and begin <= time < end:
+            yield Row(
+                time,
+                columns.monotonic_ns[at],
+                columns.uncertainty_ns[at] if valid else None,
+                columns.drives[drive],
+                columns.registers[register],
+                columns.value[at] if valid else None,
+                columns.statuses[columns.status[at]],
+            )

@@ -1,0 +1,257 @@
+"""History: months of rows from a folder that may still grow."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from multidrop.history.buckets import Accumulator, Buckets, Grid, grid_of
+from multidrop.history.database import MissingDuckDB
+from multidrop.history.folder import Listing, listing
+from multidrop.history.growing import Series
+from multidrop.history.queries import (
+    OF_ROWS,
+    OF_TENS,
+    gather_files,
+    metadata_of,
+    rows_of_file,
+    write_parquet,
+)
+from multidrop.history.sources import ALWAYS, MOST_TRIES, Replaced, Sources
+from multidrop.polling.batch import Rows
+from multidrop.recording import open_writer
+from multidrop.recording.append_file import new_file
+from multidrop.recording.csv import HEADER, lines_of
+from multidrop.recording.format import Metadata, RecordingReader
+from multidrop.recording.rows import from_rows
+
+Moment = int | datetime
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class History:
+    """The rows that `multidrop serve` or `HistoryWriter` keeps in a folder; or segments: `run.arrows`.
+
+    It may be written meanwhile, by any process: every row is there once, about 0.3 s after it was polled. A
+    series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a datetime
+    with a time zone.
+
+    Segments are read by the library itself; Parquet files need duckdb (`pip install 'multidrop[history]'`):
+    where there are some and it is missing, methods raise ImportError. They raise ValueError for a series or
+    range that is none, and OSError. Any thread may call them.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self.folder = Path(folder)
+        listing(self.folder)  # a wrong name is told at once
+        self._sources = Sources(self.folder)
+
+    def __repr__(self) -> str:
+        return f"<History {self.folder}>"
+
+    def __enter__(self) -> History:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give files and memory back. The history may be used again."""
+        self._sources.close()
+
+    @property
+    def damage(self) -> list[str]:
+        """Sentences about segments of which a part could not be read, so far."""
+        return list(self._sources.damage.values())
+
+    def metadata(self) -> Metadata:
+        """Return the metadata of the newest segment; empty where there is none."""
+        return self._sources.again(self._newest_metadata)
+
+    def _newest_metadata(self, found: Listing) -> Metadata:
+        number = max([*found.segments, *found.rows], default=0)
+        if number in found.rows:
+            return metadata_of(self._sources, found.rows[number])
+        if number in found.segments:
+            with self._sources.segment(number, found, *ALWAYS) as segment:
+                return segment.metadata if segment else {}
+        return {}
+
+    # ---- rows ----
+
+    def read(
+        self,
+        series: str | Iterable[str] | None = None,
+        begin: Moment | None = None,
+        end: Moment | None = None,
+    ) -> HistoryRows:
+        """Return all rows, or those of these series, from `begin` to before `end`; None is no limit.
+
+        They come in the order of recording. What it returns is a recording like `multidrop.read` gives:
+        `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        """
+        first = ALWAYS[0] if begin is None else _ns(begin)
+        return HistoryRows(self, _parsed(series), first, ALWAYS[1] if end is None else _ns(end))
+
+    def rows_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Iterator[Rows]:
+        """Yield the rows of `read` for parsed series and times in ns."""
+        found = self._sources.listing()
+        for number in sorted({*found.segments, *found.rows}):
+            for _ in range(MOST_TRIES):
+                try:
+                    yield from self._rows_of_segment(number, found, series, begin, end)
+                    break
+                except Replaced:  # before the first of its rows: now they are elsewhere
+                    found = self._sources.listing()
+            else:
+                raise self._sources.too_often()
+
+    def _rows_of_segment(
+        self, number: int, found: Listing, series: Sequence[Series] | None, begin: int, end: int
+    ) -> Iterator[Rows]:
+        file = found.rows.get(number)
+        if file and file.may_have(begin, end):
+            yield from rows_of_file(self._sources, file, series, begin, end)
+        elif number in found.segments:
+            wanted = None if series is None else frozenset(series)
+            with self._sources.segment(number, found, begin, end) as segment:
+                for batch in segment.batches(begin, end) if segment else ():
+                    if segment and (rows := segment.rows_of(batch, wanted, begin, end)):
+                        yield from_rows(rows)
+
+    # ---- buckets ----
+
+    def buckets(
+        self, series: str | Iterable[str], begin: Moment, end: Moment | None = None, points: int = 800
+    ) -> dict[str, Buckets]:
+        """Return least, mean and most of each series in at most `points` equal times that cover the range.
+
+        `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`. From
+        10 s on the times are whole tens of seconds, minutes, hours or days of UTC, so that the first may
+        begin before `begin` and the last end after `end`.
+        """
+        names = _parsed(series)
+        if not names:
+            raise ValueError("buckets takes one series or more, such as 'pump-1.output_frequency'")
+        grid = grid_of(_ns(begin), time.time_ns() if end is None else _ns(end), points)
+
+        def gathered(found: Listing) -> dict[Series, Accumulator]:
+            into = {name: Accumulator(grid) for name in names}
+            self._gather(found, into, grid)
+            return into
+
+        return {".".join(name): made.buckets() for name, made in self._sources.again(gathered).items()}
+
+    def _gather(self, found: Listing, into: dict[Series, Accumulator], grid: Grid) -> None:
+        tens = found.tens if grid.is_of_tens else []
+        reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
+        rows = [file for number, file in found.rows.items() if number not in reckoned]
+        for files, sums in ((tens, OF_TENS), (rows, OF_ROWS)):
+            files = [file for file in files if file.may_have(grid.begin, grid.end)]
+            if files:
+                gather_files(self._sources, files, sums, into, grid)
+        for number in sorted(set(found.segments) - reckoned):
+            with self._sources.segment(number, found, grid.begin, grid.end) as segment:
+                if segment:
+                    segment.gather(into, grid)
+
+    # ---- export ----
+
+    def csv(
+        self,
+        series: str | Iterable[str] | None = None,
+        begin: Moment | None = None,
+        end: Moment | None = None,
+    ) -> Iterator[bytes]:
+        """Yield the rows of `read` as the text of a .csv recording, piece by piece."""
+        rows = self.read(series, begin, end)
+        return (piece for batches in ([HEADER.encode()], map(lines_of, rows)) for piece in batches)
+
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        series: str | Iterable[str] | None = None,
+        begin: Moment | None = None,
+        end: Moment | None = None,
+    ) -> int:
+        """Write the rows of `read` into a new .csv, .parquet or .arrows file; return their number.
+
+        Parquet is written by duckdb, or else by pyarrow, and by duckdb not in order. Raises as `open_writer`
+        does. What goes wrong leaves no file.
+        """
+        rows, target = self.read(series, begin, end), Path(path)
+        if target.suffix.lower() == ".parquet":
+            try:
+                return self._export_parquet(rows, target)
+            except MissingDuckDB:
+                pass
+        writer = open_writer(target, rows.metadata)
+        try:
+            with writer:
+                for batch in rows:
+                    writer.write(batch)
+        except BaseException:  # Ctrl-C as well: half of it would pass for the whole
+            writer.discard()
+            raise
+        return writer.rows
+
+    def _export_parquet(self, rows: HistoryRows, target: Path) -> int:
+        def write(found: Listing) -> int:
+            files = [file for file in found.rows.values() if file.may_have(rows.begin, rows.end)]
+            batches = (
+                batch
+                for number in sorted(found.segments)
+                for batch in self._rows_of_segment(number, found, rows.series, rows.begin, rows.end)
+            )
+            of = rows.series, (rows.begin, rows.end), rows.metadata
+            return write_parquet(self._sources, target, batches, files, *of)
+
+        self._sources.cursor().close()  # without DuckDB there is no file yet
+        new_file(target).close()
+        try:
+            return self._sources.again(write)
+        except BaseException:
+            target.unlink(missing_ok=True)
+            raise
+
+
+class HistoryRows(RecordingReader):
+    """Rows of a history, read anew each time; may be iterated over more than once."""
+
+    truncated = 0
+
+    def __init__(self, history: History, series: Sequence[Series] | None, begin: int, end: int) -> None:
+        super().__init__(history.folder)
+        self._history = history
+        self.series, self.begin, self.end = series, begin, end
+        self.metadata = history.metadata()
+
+    def __iter__(self) -> Iterator[Rows]:
+        return self._history.rows_of(self.series, self.begin, self.end)
+
+
+def _parsed(series: str | Iterable[str] | None) -> list[Series] | None:
+    if series is None:
+        return None
+    found = []
+    for name in [series] if isinstance(series, str) else series:
+        drive, point, register = name.rpartition(".")
+        if not (drive and point and register):
+            raise ValueError(
+                f"{name!r} is no series: write a drive and a register, such as 'pump-1.motor_speed'"
+            )
+        found.append((drive, register))
+    return list(dict.fromkeys(found))
+
+
+def _ns(moment: Moment) -> int:
+    if isinstance(moment, datetime):
+        if moment.tzinfo is None:
+            raise ValueError(f"{moment} has no time zone: write datetime(..., tzinfo=UTC)")
+        return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+    if isinstance(moment, bool) or not isinstance(moment, int):
+        raise TypeError(f"a moment is UTC in ns or a datetime with a time zone, not {moment!r}")
+    return moment

@@ -1,0 +1,98 @@
+"""Queries of DuckDB for the Parquet files of a history."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from multidrop.history.buckets import Accumulator, Grid
+from multidrop.history.database import copy_out, files_of, insert, quoted, rows_of
+from multidrop.history.folder import HistoryFile
+from multidrop.history.growing import Series
+from multidrop.history.sources import Sources, while_there
+from multidrop.polling.batch import Rows
+from multidrop.recording.format import METADATA_KEY, Metadata
+
+COLUMNS = "time, monotonic_ns, uncertainty_ns, drive, register, value, status"
+_IN_RANGE = "epoch_ns(time) >= $begin and epoch_ns(time) < $end"
+_ROWS = f"select {COLUMNS} from {{}} where {_IN_RANGE}{{}} order by monotonic_ns"
+_EXPORT = f"select {COLUMNS} from recorded union all by name select {COLUMNS} from {{}} where {_IN_RANGE}{{}}"
+_BUCKETS = f"""
+select drive, register, (epoch_ns(time) - $begin) // $step, {{sums}}
+from {{files}} where {_IN_RANGE}{{condition}} group by all
+"""
+OF_ROWS = "count(value), count(*) - count(value), sum(value), min(value), max(value)"
+OF_TENS = "sum(n)::bigint, sum(missed)::bigint, sum(mean * n), min(least), max(most)"
+
+
+def rows_of_file(
+    sources: Sources, file: HistoryFile, series: Sequence[Series] | None, begin: int, end: int
+) -> Iterator[Rows]:
+    """Yield the rows of these series, or of all, in the order of their requests. Raises Replaced, at once."""
+    condition, values = _condition(series)
+    with sources.cursor() as cursor, while_there([file]):
+        # It is sorted, so all of it was read before the first rows come: none are given out twice.
+        query = _ROWS.format(files_of([file.path]), condition)
+        yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
+
+
+def gather_files(
+    sources: Sources, files: Sequence[HistoryFile], sums: str, into: Mapping[Series, Accumulator], grid: Grid
+) -> None:
+    """Add the rows, or the tens, of these files to the buckets. Raises Replaced."""
+    condition, values = _condition(list(into))
+    values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
+    query = _BUCKETS.format(sums=sums, files=files_of(file.path for file in files), condition=condition)
+    with sources.cursor() as cursor, while_there(files):
+        found = cursor.execute(query, values).fetchall()
+    for drive, register, bucket, n, missed, *numbers in found:
+        into[drive, register].add(bucket, n, missed, *numbers)
+
+
+def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
+    """Return the metadata that a file's segment had. Raises Replaced."""
+    query = (
+        f"select decode(value) from parquet_kv_metadata({quoted(str(file.path))}) where decode(key) = $key"
+    )
+    with sources.cursor() as cursor, while_there([file]):
+        found = cursor.execute(query, {"key": METADATA_KEY}).fetchone()
+    metadata: Metadata = json.loads(found[0]) if found else {}
+    return metadata
+
+
+def write_parquet(
+    sources: Sources,
+    target: Path,
+    batches: Iterable[Rows],
+    files: Sequence[HistoryFile],
+    series: Sequence[Series] | None,
+    range_ns: tuple[int, int],
+    metadata: Metadata,
+) -> int:
+    """Write these batches and the files' rows of these series and times; return how many. Raises Replaced."""
+    condition, values = _condition(series)
+    values |= dict(zip(("begin", "end"), range_ns, strict=True))
+    with sources.cursor() as cursor, while_there(files):
+        insert(cursor, batches)
+        query = f"select {COLUMNS} from recorded"
+        if files:
+            query = _EXPORT.format(files_of(file.path for file in files), condition)
+        return copy_out(cursor, query, target, metadata, values if files else {})
+
+
+def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
+    """Return what follows a where clause so that it gives these series, and the values for it."""
+    if series is None:
+        return "", {}
+    drives, registers = ({pair[at]: None for pair in series} for at in (0, 1))
+    values = {f"d{at}": name for at, name in enumerate(drives)}
+    values |= {f"r{at}": name for at, name in enumerate(registers)}
+    marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
+    others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
+    condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
+    if len(drives) * len(registers) > len(series):  # slower, and seldom needed
+        pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
+        condition += f" and (drive, register) in ({pairs})"
+    return condition, values

@@ -1,0 +1,129 @@
+"""The files of a history while they are replaced: segments that are open here, and DuckDB."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any, TypeVar
+
+from multidrop.history.database import connect
+from multidrop.history.folder import HistoryFile, Listing, listing
+from multidrop.history.growing import GrowingSegment
+
+T = TypeVar("T")
+ALWAYS = -(2**63), 2**63 - 1  # ns
+MEMORY = "200MB"  # of DuckDB
+MOST_TRIES = 5  # for files that are replaced
+MOST_GROWING = 4  # segments of which what was learnt is kept
+
+
+class Replaced(Exception):
+    """A file that was listed is gone: its rows are in another one, or were too old."""
+
+
+class Sources:
+    """All that is open of a folder; any thread may use it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.damage: dict[int, str] = {}  # sentences by segment
+        self._growing: dict[int, GrowingSegment] = {}
+        self._bounds: dict[int, tuple[int, int]] = {}  # of times in closed segments
+        self._changing = threading.Lock()
+        self._database: Any = None
+
+    def close(self) -> None:
+        with self._changing:
+            while self._growing:
+                self._growing.popitem()[1].let_go()
+            if self._database is not None:
+                self._database.close()
+                self._database = None
+
+    def listing(self) -> Listing:
+        """List the files that hold the history now, and let go of those that do not any more."""
+        found = listing(self.folder)
+        with self._changing:
+            for number in set(self._growing) - set(found.segments):
+                self._growing.pop(number).let_go()
+        return found
+
+    @contextmanager
+    def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
+        """Give a segment as far as it is there, open until the block is left.
+
+        None where nothing of it is in this range, or can be read. Raises Replaced.
+        """
+        segment: GrowingSegment | None = None
+        with self._changing:
+            least, most = self._bounds.get(number, ALWAYS)
+            if least < end and begin <= most:
+                segment = self._held(number, found.segments[number])
+            if segment and number < max(found.segments):  # it is closed: nothing will come to it
+                self._bounds[number] = segment.bounds
+                if segment.left_out:
+                    left_out = (
+                        f"the last {segment.left_out} bytes of {found.segments[number]} are no whole batch"
+                    )
+                    self.damage.setdefault(number, left_out)
+        try:
+            yield segment
+        finally:
+            if segment:
+                segment.let_go()
+
+    def _held(self, number: int, path: Path) -> GrowingSegment | None:
+        """Return a segment that is to be let go of. What was learnt of the newest ones is kept."""
+        segment = self._growing.get(number)
+        if segment is None:
+            try:
+                segment = GrowingSegment(path)
+            except FileNotFoundError:
+                raise Replaced from None
+            except ValueError as error:  # it has no head: the machine lost power, or it begins just now
+                if path.exists() and path.stat().st_size:
+                    self.damage[number] = str(error)
+                return None
+            self._growing[number] = segment
+        self.damage.pop(number, None)
+        segment.look()
+        segment.hold()
+        if segment.damage:
+            self.damage[number] = segment.damage
+        for older in sorted(self._growing)[:-MOST_GROWING]:
+            self._growing.pop(older).let_go()
+        return segment
+
+    def cursor(self) -> Any:
+        """Return a cursor of DuckDB, to be closed. Raises ImportError."""
+        with self._changing:
+            if self._database is None:
+                self._database = connect(MEMORY, Path(gettempdir()) / f"multidrop-history-{os.getpid()}")
+            return self._database.cursor()
+
+    def again(self, act: Callable[[Listing], T]) -> T:
+        """Return act(listing), done anew while files are replaced under it."""
+        for _ in range(MOST_TRIES):
+            try:
+                return act(self.listing())
+            except Replaced:
+                continue
+        raise self.too_often()
+
+    def too_often(self) -> OSError:
+        return OSError(f"{self.folder}: files were replaced {MOST_TRIES} times while they were read")
+
+
+@contextmanager
+def while_there(files: Sequence[HistoryFile]) -> Iterator[None]:
+    """Raise Replaced where the block fails because one of the files is gone."""
+    try:
+        yield
+    except Exception as failure:
+        if all(file.path.exists() for file in files):
+            raise
+        raise Replaced from failure

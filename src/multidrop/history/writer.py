@@ -1,0 +1,219 @@
+"""HistoryWriter: rows into a folder, on a thread of its own, whatever the disk does."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from multidrop.history.folder import STEM, listing, stored_files
+from multidrop.polling.batch import Batch
+from multidrop.polling.gathered import GatheredRows, gather
+from multidrop.recording.format import Metadata
+from multidrop.recording.retention import outlived
+from multidrop.recording.segments import SegmentWriter, segments_of
+from multidrop.transport import clock
+
+MOST_WAITING = 250_000  # rows, for a disk that is slow: 12 MB
+WRITING_S = 0.2  # between writes
+TENDING_S = 60.0  # between looks at what is too old
+ENDING_S = 10.0  # for which `close` waits for the disk
+
+_log = logging.getLogger("multidrop.history")
+
+
+class HistoryState(NamedTuple):
+    """The state of a recording: rows written and lost so far, and what is wrong now, or None."""
+
+    rows: int
+    dropped: int
+    trouble: str | None
+
+
+class HistoryWriter:
+    """Records batches into the history in a folder, which is made: `poller.on_batch(writer.take)`.
+
+    A new segment begins every `rotate` s. Where duckdb is installed, a process of low priority compacts
+    closed ones. What is older than `keep` s is removed, and the oldest while all takes above `most` bytes.
+
+    A disk that is full or fails holds nobody up: rows are dropped and counted in `state()`, which says why,
+    and each second it is tried again. Raises ValueError while another process records there, OSError where
+    that is impossible, and TypeError for metadata that JSON cannot hold.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        metadata: Metadata,
+        *,
+        rotate: float = 600.0,
+        keep: float | None = None,
+        most: int | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._keep, self._most = keep, most
+        newest = max([listing(self.folder).newest, *self._damaged()])
+        self._segments = SegmentWriter(self.folder / STEM, metadata, every=rotate, after=newest)
+        self._compactor = Compactor(self.folder)
+        self._waiting: list[GatheredRows] = []
+        self._waiting_rows = 0
+        self._metadata: Metadata | None = None  # to begin a segment with
+        self._changing = threading.Lock()
+        self._dropped = 0
+        self._trouble: str | None = None
+        self._again_ns = 0
+        self._tended_ns: int | None = None
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="multidrop history", daemon=True)
+        self._thread.start()
+
+    def _damaged(self) -> list[int]:
+        with suppress(OSError):
+            return [number for number, _ in segments_of(self.folder / "damaged" / STEM)]
+        return []
+
+    def take(self, batch: Batch) -> None:
+        """Copy the rows for the thread to write; within microseconds, and never raising for the disk."""
+        with self._changing:
+            if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
+                self._dropped += len(batch)
+                return
+            gather(self._waiting, batch)
+            self._waiting_rows += len(batch)
+
+    def begin(self, metadata: Metadata) -> None:
+        """Begin a segment with this metadata: the plant changed."""
+        with self._changing:
+            self._metadata = metadata
+
+    def state(self) -> HistoryState:
+        """Return how it goes."""
+        return HistoryState(self._segments.rows, self._dropped, self._trouble)
+
+    def close(self) -> None:
+        """Write what waits, and end; a disk that does not answer is waited for 10 s at most."""
+        self._over.set()
+        self._thread.join(ENDING_S)
+
+    # ---- the thread ----
+
+    def _run(self) -> None:
+        while not self._over.wait(WRITING_S):
+            try:
+                self._write_waiting()
+                self._tend()
+            except Exception:  # a mistake of ours must not end the recording
+                _log.exception("the history's thread goes on after a failure")
+        self._write_waiting()
+        self._compactor.end()
+        with suppress(OSError):
+            self._segments.close()
+
+    def _write_waiting(self) -> None:
+        with self._changing:
+            waiting, self._waiting, self._waiting_rows = self._waiting, [], 0
+            metadata, self._metadata = self._metadata, None
+        if metadata is not None:
+            self._rotate(metadata)
+        for gathered in waiting:
+            self._write(gathered.batch())
+
+    def _write(self, batch: Batch) -> None:
+        if self._trouble and clock.now_ns() < self._again_ns:
+            self._drop(batch)
+            return
+        try:
+            self._segments.write(batch)
+        except Exception as failure:  # whatever it is, polling must go on
+            self._drop(batch)
+            self._again_ns = clock.now_ns() + 10**9
+            if not self._trouble:
+                _log.error("nothing is recorded: %s", failure)
+            self._trouble = str(failure)
+            self._rotate()
+            self._tended_ns = None  # room may be made
+            return
+        if self._trouble:
+            _log.warning("rows are recorded again; %d were lost so far", self._dropped)
+            self._trouble = None
+
+    def _drop(self, batch: Batch) -> None:
+        with self._changing:
+            self._dropped += len(batch)
+
+    def _rotate(self, metadata: Metadata | None = None) -> None:
+        try:
+            self._segments.rotate(metadata)
+        except OSError as failure:
+            _log.error("a segment was not ended well: %s", failure)
+
+    def _tend(self) -> None:
+        """Remove what is too old, and have closed segments compacted."""
+        self._compactor.tend(self._segments.open_number)
+        now = clock.now_ns()
+        if self._tended_ns is not None and now - self._tended_ns < TENDING_S * 1e9:
+            return
+        self._tended_ns = now
+        try:
+            for file in outlived(stored_files(self.folder), time.time(), self._keep, self._most):
+                if file.number < self._segments.open_number:
+                    file.path.unlink(missing_ok=True)
+        except OSError as failure:
+            _log.error("what is too old cannot be removed: %s", failure)
+
+
+class Compactor:
+    """A child process that compacts closed segments, begun again when there are new ones."""
+
+    PAUSE_S = 60.0  # after a failure
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._child: subprocess.Popen[str] | None = None
+        self._done = 0  # all segments below were compacted
+        self._not_before_ns = 0
+        self.is_possible = importlib.util.find_spec("duckdb") is not None
+
+    def tend(self, below: int) -> None:
+        """Note how the last child ended; begin one where segments below this number are not compacted yet."""
+        if self._child and self._child.poll() is not None:
+            self._note(self._child)
+            self._child = None
+        if self._child or not self.is_possible or below <= self._done or clock.now_ns() < self._not_before_ns:
+            return
+        words = [sys.executable, "-m", "multidrop.history.compact", str(self._folder), "--below", str(below)]
+        try:
+            self._child = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            )
+            self._below = below
+        except OSError as failure:
+            self._pause(f"cannot be begun: {failure}")
+
+    def _note(self, child: subprocess.Popen[str]) -> None:
+        said = child.communicate()[1].strip()
+        if child.returncode:
+            self._pause(f"ended with {child.returncode}: {said.splitlines()[-1] if said else 'no word'}")
+            return
+        if said:
+            _log.warning("%s", said)
+        self._done = self._below
+
+    def _pause(self, sentence: str) -> None:
+        _log.error("compaction %s; it is tried again in a minute", sentence)
+        self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
+
+    def end(self) -> None:
+        """Kill the child: it may be killed at any moment."""
+        if self._child:
+            self._child.kill()
+            self._child.communicate()
+            self._child = None

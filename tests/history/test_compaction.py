@@ -1,0 +1,257 @@
+"""Compaction: broken off at each of its steps, killed, and done again."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+
+from multidrop import read
+from multidrop.history import compact as compact_module
+from multidrop.history.compact import compact, main
+from multidrop.history.folder import listing, parquet_files
+from multidrop.history.history import History
+from multidrop.polling.batch import Row
+from multidrop.recording.file_lock import FileLock
+
+duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+SERIES = "pump-1.speed"
+
+
+def segments() -> list[list[Row]]:
+    """Two segments each on two days, and one on the next."""
+    begins = (NOON, NOON + 600 * SECOND, NOON + DAY, NOON + DAY + 600 * SECOND, NOON + 2 * DAY)
+    return [random_rows(seed, begin, 120) for seed, begin in enumerate(begins)]
+
+
+def check(folder: Path, rows: list[Row]) -> None:
+    """Compare all that can be asked with the rows."""
+    with History(folder) as history:
+        assert sorted(rows_in(history)) == sorted(rows)
+        for points in (6, 4000):
+            found = history.buckets(SERIES, NOON, NOON + 3 * DAY, points)[SERIES]
+            mine = [row for row in rows if f"{row.drive}.{row.register}" == SERIES]
+            assert sum(found.n) + sum(found.missed) == len(mine)
+            assert max(most for most in found.most if most is not None) == max(
+                row.value or -99 for row in mine
+            )
+        check_buckets(history.buckets(SERIES, NOON, NOON + 700 * SECOND, 50)[SERIES], rows, SERIES)
+
+
+def test_a_parquet_file_has_the_rows_of_its_segment_by_drive_and_time(tmp_path: Path) -> None:
+    rows = random_rows(1, NOON, 500)
+    record(tmp_path, [rows, random_rows(2, NOON + DAY, 5)])
+    compact(tmp_path, 2)
+    (file,) = parquet_files(tmp_path / "rows")
+    assert [path.name for path in tmp_path.glob("*.arrows")] == ["rows.00000002.arrows"]
+    recording = read(file.path)  # by pyarrow: it is a recording like any
+    assert recording.metadata == METADATA
+    found = [row for batch in recording for row in batch]
+    assert found == sorted(rows, key=lambda row: (row.drive, row.time))
+    assert file.begin * SECOND <= rows[0].time <= rows[-1].time <= file.end * SECOND
+
+
+def test_tens_are_what_plain_python_reckons(tmp_path: Path) -> None:
+    rows = random_rows(1, NOON, 500)
+    record(tmp_path, [rows])
+    compact(tmp_path, 2)
+    (file,) = parquet_files(tmp_path / "tens")
+    query = f"select epoch_ns(time), drive, register, n, missed, least, mean, most, last from '{file.path}'"
+    found = {tuple(row[:3]): row[3:] for row in duckdb.sql(query).fetchall()}
+    expected: dict[tuple[object, ...], list[Row]] = {}
+    for row in rows:
+        key = row.time // (10 * SECOND) * 10 * SECOND, row.drive, row.register
+        expected.setdefault(key, []).append(row)
+    assert found.keys() == expected.keys()
+    for key, some in expected.items():
+        values = [row.value for row in some if row.value is not None]
+        n, missed, least, mean, most, last = found[key]
+        assert (n, missed) == (len(values), len(some) - len(values))
+        if values:
+            assert (least, most, last) == (min(values), max(values), values[-1])
+            assert mean == pytest.approx(sum(values) / len(values))
+        else:
+            assert (least, mean, most, last) == (None, None, None, None)
+
+
+def test_hours_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
+    begins = [NOON + 1200 * SECOND * number for number in range(5)]
+    record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
+    compact(tmp_path, 6)
+    tens = listing(tmp_path).tens
+    assert [(file.first, file.last) for file in tens] == [(1, 3), (4, 4), (5, 5)]
+    record(tmp_path, [random_rows(9, NOON + DAY, 20)], after=5)
+    compact(tmp_path, 7)
+    assert [(file.first, file.last) for file in listing(tmp_path).tens] == [(1, 5), (6, 6)]
+    assert len(parquet_files(tmp_path / "tens")) == 2
+
+
+def test_days_that_are_over_become_one_file_of_tens(tmp_path: Path) -> None:
+    rows = segments()
+    record(tmp_path, rows)
+    compact(tmp_path, 6)
+    tens = parquet_files(tmp_path / "tens")
+    assert [(file.first, file.last) for file in tens] == [(1, 2), (3, 4), (5, 5)]
+    assert len(parquet_files(tmp_path / "rows")) == 5
+    check(tmp_path, [row for some in rows for row in some])
+
+
+class BrokenOff(BaseException):
+    """The process ends here."""
+
+
+class Breaker:
+    """Lets so many calls happen, and ends the process before the next."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def around(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            if self.left == 0:
+                raise BrokenOff
+            self.left -= 1
+            return function(*arguments, **named)
+
+        return call
+
+
+def test_broken_off_before_each_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = segments()
+    expected = [row for some in rows for row in some]
+    for calls in range(200):
+        folder = tmp_path / str(calls)
+        record(folder, rows)
+        breaker = Breaker(calls)
+        with monkeypatch.context() as patched:
+            for name in ("replace", "unlink", "mkdir"):
+                patched.setattr(Path, name, breaker.around(getattr(Path, name)))
+            for name in ("copy_out", "insert", "_on_disk"):
+                patched.setattr(compact_module, name, breaker.around(getattr(compact_module, name)))
+            try:
+                compact(folder, 6)
+                is_over = True
+            except BrokenOff:
+                is_over = False
+        check(folder, expected)
+        compact(folder, 6)
+        check(folder, expected)
+        assert not [*folder.rglob("*.part"), *folder.glob("*.arrows")]
+        assert len(parquet_files(folder / "tens")) == 3
+        if is_over:
+            break
+    assert 40 < calls < 200
+
+
+@pytest.mark.slow
+def test_killed_in_the_middle(tmp_path: Path) -> None:
+    rows = segments()
+    record(tmp_path, rows)
+    expected = [row for some in rows for row in some]
+    words = [sys.executable, "-m", "multidrop.history.compact", str(tmp_path), "--below", "6"]
+    dice, delay = random.Random(1), 0.2
+    for _ in range(40):
+        with subprocess.Popen(words) as child:
+            time.sleep(dice.uniform(0, delay))
+            child.send_signal(signal.SIGKILL)
+            ended = child.wait()
+        check(tmp_path, expected)
+        if ended == 0:
+            break
+        delay *= 1.3  # a busy machine needs longer
+    assert ended == 0
+    assert not listing(tmp_path).segments
+
+
+def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
+    record(tmp_path, segments())
+    lock = FileLock(tmp_path / ".compact.lock")
+    assert main([str(tmp_path), "--below", "6"]) == 0
+    assert len(listing(tmp_path).segments) == 5
+    lock.close()
+    assert main([str(tmp_path), "--below", "6"]) == 0
+    assert len(listing(tmp_path).segments) == 0
+
+
+def test_a_damaged_segment_is_read_as_far_as_it_can_be_and_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = segments()
+    record(tmp_path, rows)
+    path = tmp_path / "rows.00000002.arrows"
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"no reply")  # of the first batch's dictionary: the last one that was written
+    data[at] = 0xFF
+    path.write_bytes(data)
+    whole = _readable(path)
+    assert len(whole) < len(rows[1])
+    with History(tmp_path) as history:
+        before = rows_in(history)
+        assert len(history.damage) == 1
+        assert "is damaged" in history.damage[0]
+    assert sorted(before) == sorted([row for some in (rows[0], *rows[2:]) for row in some] + whole)
+    compact(tmp_path, 6)
+    assert str(path) in capsys.readouterr().err
+    assert (tmp_path / "damaged" / path.name).read_bytes() == data
+    with History(tmp_path) as history:
+        assert sorted(rows_in(history)) == sorted(before)
+
+
+def _readable(path: Path) -> list[Row]:
+    found: list[Row] = []
+    try:
+        for batch in read(path):
+            found += batch
+    except ValueError:
+        pass
+    return found
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xff\xff\xff", b"\0" * 5000])
+def test_a_segment_without_a_head(tmp_path: Path, content: bytes) -> None:
+    """A machine that lost power may leave a file of nothing, or of zeros."""
+    rows = segments()
+    record(tmp_path, rows)
+    (tmp_path / "rows.00000002.arrows").write_bytes(content)
+    left = [row for some in (rows[0], *rows[2:]) for row in some]
+    with History(tmp_path) as history:
+        assert sorted(rows_in(history)) == sorted(left)
+        assert len(history.damage) == bool(content)
+    compact(tmp_path, 6)
+    assert len([*(tmp_path / "damaged").iterdir()]) == bool(content)
+    with History(tmp_path) as history:
+        assert sorted(rows_in(history)) == sorted(left)
+
+
+def test_a_full_disk_leaves_the_segment(tmp_path: Path) -> None:
+    rows = segments()
+    record(tmp_path, rows)
+    words = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900));"
+    words += f"from multidrop.history.compact import main; main([{str(tmp_path)!r}, '--below', '6'])"
+    ended = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
+    assert ended.returncode
+    assert len(listing(tmp_path).segments) == 5
+    check(tmp_path, [row for some in rows for row in some])
+    compact(tmp_path, 6)
+    check(tmp_path, [row for some in rows for row in some])
+
+
+def test_it_asks_for_the_lowest_priority_and_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def forbidden(step: int) -> int:
+        asked.append(step)
+        raise PermissionError
+
+    monkeypatch.setattr(os, "nice", forbidden)
+    compact_module.be_low()
+    assert asked == [19]

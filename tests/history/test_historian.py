@@ -1,0 +1,64 @@
+"""The gateway's historian: settings, the feed, and what it answers."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from histories import NOON, SECOND, batch
+
+from multidrop import Plant, open_reader
+from multidrop.core.columns import Names
+from multidrop.gateway.historian import HistorySettings, build
+
+MS = 1_000_000
+
+
+def test_all_mistakes_of_its_table_at_once() -> None:
+    with pytest.raises(ValueError, match="is not a") as failure:
+        HistorySettings(keep="for ever", most="20", rotate="0 s")
+    lines = str(failure.value).splitlines()
+    assert [line.split(" = ")[0] for line in lines] == ["keep", "most", "rotate"]
+    assert "'for ever' is not a time from 1 s to 100 years" in lines[0]
+    assert "'20' is not a size from 1 kB on" in lines[1]
+    HistorySettings()
+
+
+def test_it_records_and_answers(tmp_path: Path) -> None:
+    async def live() -> None:
+        inside = SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=tmp_path)
+        historian = build(HistorySettings(folder="kept"), inside)
+        running = asyncio.create_task(historian.run())
+        taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
+        historian.take(taken)
+        for _ in range(600):
+            if historian.state.rows:
+                break
+            await asyncio.sleep(0.1)
+        assert historian.state == (100, 0, None)
+        begin, end = NOON // MS, NOON // MS + 100_000
+        found = await historian.series(["pump-1.speed", "fan.speed"], begin, end, 10)
+        assert found["step_ms"] == 10_000
+        pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
+        assert pump["time"] == [begin + 10_000 * number for number in range(10)]
+        assert pump["least"] == [10.0 * number for number in range(10)]  # each tenth is a miss
+        assert pump["most"] == [10.0 * number + 8 for number in range(10)]
+        assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
+        assert fan["mean"] == [None] * 10
+        for kind in ("csv", "parquet"):
+            path = tmp_path / f"got.{kind}"
+            path.write_bytes(b"".join(historian.export(["pump-1.speed"], begin, end, kind)))
+            assert [row for rows in open_reader(path) for row in rows] == list(taken)
+        with pytest.raises(ValueError, match="is no series"):
+            historian.export(["pump"], begin, end, "csv")
+        with pytest.raises(ValueError, match="neither csv nor parquet"):
+            historian.export([], begin, end, "xlsx")
+        await historian.close()
+        await asyncio.wait_for(running, 60)
+
+    asyncio.run(live())
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir() if path.name[0] != ".") == [
+        "rows.00000001.arrows"
+    ]

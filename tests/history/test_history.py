@@ -1,0 +1,292 @@
+"""History: what it reads is what was recorded, and its buckets are what plain Python reckons."""
+
+from __future__ import annotations
+
+import random
+import sys
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from examples import examples
+from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+
+from multidrop import History, open_reader
+from multidrop.history.buckets import grid_of
+from multidrop.history.compact import compact
+from multidrop.polling.batch import Row
+from multidrop.recording.rows import from_rows
+from multidrop.recording.segments import SegmentWriter
+
+SERIES = [f"pump-{number}.{register}" for number in range(3) for register in ("speed", "current")]
+COMPACTED = pytest.mark.parametrize("compacted", [0, 2, 4], ids="{} compacted".format)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[list[Row]]:
+    """Four segments: two behind each other, one after a gap, and one after the clock was set back."""
+    begins = (NOON, NOON + 80 * SECOND, NOON + 300 * SECOND, NOON + 60 * SECOND)
+    made = [random_rows(seed, begin, 400) for seed, begin in enumerate(begins)]
+    return [
+        [row._replace(monotonic_ns=number * DAY + row.monotonic_ns) for row in some]
+        for number, some in enumerate(made)
+    ]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, rows: list[list[Row]], compacted: int) -> Path:
+    record(tmp_path, rows)
+    if compacted:
+        pytest.importorskip("duckdb", reason="needs duckdb")
+        compact(tmp_path, compacted + 1)
+    return tmp_path
+
+
+def flat(rows: list[list[Row]]) -> list[Row]:
+    return [row for some in rows for row in some]
+
+
+@COMPACTED
+def test_all_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
+    with History(folder) as history:
+        found = history.read()
+        assert found.metadata == METADATA
+        assert [row for batch in found for row in batch] == flat(rows)
+        assert [row for batch in found for row in batch] == flat(rows)  # and again
+        assert history.damage == []
+
+
+@COMPACTED
+def test_a_series_in_a_range(folder: Path, rows: list[list[Row]]) -> None:
+    dice = random.Random(5)
+    times = [row.time for row in flat(rows)]
+    with History(folder) as history:
+        for _ in range(examples(20)):
+            begin, end = sorted(dice.sample(times, 2))
+            names = dice.sample(SERIES, dice.randrange(1, 4))
+            wanted = [
+                row
+                for row in flat(rows)
+                if begin <= row.time < end and f"{row.drive}.{row.register}" in names
+            ]
+            assert rows_in(history, names, begin, end) == wanted
+
+
+@COMPACTED
+def test_buckets_are_what_plain_python_reckons(folder: Path, rows: list[list[Row]]) -> None:
+    dice = random.Random(6)
+    times = [row.time for row in flat(rows)]
+    with History(folder) as history:
+        for _ in range(examples(20)):
+            begin, end = sorted(dice.sample(times, 2))
+            points = dice.choice((1, 3, 17, 40, 800))
+            found = history.buckets(SERIES, begin, end, points)
+            assert list(found) == SERIES
+            for series, buckets in found.items():
+                assert len(buckets) <= max(points, 2)
+                assert buckets.begin <= begin
+                assert buckets.begin + buckets.step * len(buckets) >= end
+                check_buckets(buckets, flat(rows), series)
+
+
+@COMPACTED
+def test_gaps_are_gaps(folder: Path) -> None:
+    with History(folder) as history:
+        found = history.buckets("pump-1.speed", NOON - 600 * SECOND, NOON + DAY, 10_000)["pump-1.speed"]
+        nothing = history.buckets("pump-9.speed", NOON, NOON + DAY, 10)["pump-9.speed"]
+    assert found.step == 10 * SECOND
+    assert found.n[:60] == found.missed[:60] == [0] * 60
+    assert found.least[:60] == found.mean[:60] == found.most[:60] == [None] * 60
+    assert set(found.n[60:70]) != {0}
+    assert set(nothing.mean) == {None}
+
+
+@COMPACTED
+def test_an_export_is_what_is_read(folder: Path, rows: list[list[Row]]) -> None:
+    begin, end = NOON + 20 * SECOND, NOON + 320 * SECOND
+    wanted = [row for row in flat(rows) if begin <= row.time < end and row.drive == "pump-1"]
+    names = ["pump-1.speed", "pump-1.current"]
+    with History(folder) as history:
+        for name in ("a.csv", "a.arrows", "a.parquet"):
+            assert history.export(folder / name, names, begin, end) == len(wanted)
+            reader = open_reader(folder / name)
+            assert sorted(row for batch in reader for row in batch) == sorted(wanted)
+            assert reader.metadata == METADATA
+            with pytest.raises(ValueError, match="is there already"):
+                history.export(folder / name, names, begin, end)
+        text = b"".join(history.csv(names, begin, end))
+    assert text == (folder / "a.csv").read_bytes()
+
+
+@COMPACTED
+def test_a_table(folder: Path, rows: list[list[Row]]) -> None:
+    pytest.importorskip("pandas", reason="needs pandas")
+    with History(folder) as history:
+        frame = history.read("pump-2.current").to_pandas()
+    mine = [row for row in flat(rows) if (row.drive, row.register) == ("pump-2", "current")]
+    assert frame.status.tolist() == [row.status for row in mine]
+    assert frame.value.dropna().tolist() == [row.value for row in mine if row.value is not None]
+
+
+def test_moments(tmp_path: Path) -> None:
+    rows = random_rows(1, NOON, 300)
+    record(tmp_path, [rows])
+    moment = datetime(2026, 11, 21, 12, 0, 20, tzinfo=UTC)
+    with History(tmp_path) as history:
+        wanted = [row for row in rows if row.time >= NOON + 20 * SECOND]
+        assert rows_in(history, None, moment) == wanted
+        assert rows_in(history, None, moment.astimezone(timezone(timedelta(hours=3)))) == wanted
+        with pytest.raises(ValueError, match="has no time zone"):
+            history.read(None, moment.replace(tzinfo=None))
+        with pytest.raises(TypeError, match="a moment is UTC in ns or a datetime"):
+            history.read(None, 1.5)  # type: ignore[arg-type]
+
+
+def test_mistakes(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        History(tmp_path / "none")
+    with History(tmp_path) as history:
+        assert rows_in(history) == []
+        for name in ("pump-1", "", ".speed", "pump-1."):
+            with pytest.raises(ValueError, match="is no series: write a drive and a register, such as"):
+                history.buckets(name, NOON, NOON + DAY)
+        with pytest.raises(ValueError, match="buckets takes one series or more"):
+            history.buckets([], NOON, NOON + DAY)
+        with pytest.raises(ValueError, match="begins not before it"):
+            history.buckets("a.b", NOON, NOON)
+        with pytest.raises(ValueError, match="points = 0 is not a number from 1 to 100000"):
+            history.buckets("a.b", NOON, NOON + DAY, 0)
+
+
+def test_a_grid_covers_its_range() -> None:
+    dice = random.Random(7)
+    for _ in range(examples(4000)):
+        begin = NOON + dice.randrange(DAY)
+        end = begin + round(10 ** dice.uniform(0, 18))
+        points = round(10 ** dice.uniform(0, 5))
+        grid = grid_of(begin, end, points)
+        assert grid.begin <= begin
+        assert grid.end >= end
+        assert grid.points <= max(points, 2)
+        assert grid.begin + grid.step > begin
+        assert grid.end - grid.step < end
+        assert grid.step < 10 * SECOND or grid.is_of_tens
+
+
+# ---- while it records ----
+
+
+def test_a_reader_sees_what_comes_and_each_row_once(tmp_path: Path) -> None:
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    rows: list[Row] = []
+    with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
+        for number in range(30):
+            some = random_rows(number, NOON + number * 20 * SECOND, 50)
+            writer.write(from_rows(some))
+            rows += some
+            assert rows_in(history) == rows
+            check_buckets(
+                history.buckets("pump-0.speed", NOON, NOON + 600 * SECOND, 60)["pump-0.speed"],
+                rows,
+                "pump-0.speed",
+            )
+            if number % 4 == 3:
+                writer.rotate()
+            if number % 8 == 5:
+                compact(tmp_path, writer.open_number)
+
+
+def test_files_that_are_replaced_under_a_reader(tmp_path: Path) -> None:
+    """Compacted between its listing and its reading: each row comes once all the same."""
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(4)]
+    record(tmp_path, rows)
+    with History(tmp_path) as history:
+        found = iter(history.read())
+        first = list(next(found))
+        compact(tmp_path, 4)  # the first is open, the others are only listed
+        assert first + [row for batch in found for row in batch] == flat(rows)
+    with History(tmp_path) as history:
+        found = iter(history.read())
+        first = list(next(found))
+        for path in tmp_path.glob("rows/00000003.*"):
+            path.unlink()  # too old
+        left = first + [row for batch in found for row in batch]
+    assert left == flat([*rows[:2], rows[3]])
+
+
+def test_names_that_come_later(tmp_path: Path) -> None:
+    rows = random_rows(1, NOON, 60)
+    later = [row._replace(drive="насос, «новый»", register="torque") for row in random_rows(2, NOON, 60)]
+    record(tmp_path, [[*rows, *later], later])
+    with History(tmp_path) as history:
+        for _ in range(2):
+            assert rows_in(history, "насос, «новый».torque") == [*later, *later]
+            pytest.importorskip("duckdb", reason="needs duckdb")
+            compact(tmp_path, 2)
+
+
+def test_a_recording_in_segments_of_poll(tmp_path: Path) -> None:
+    rows = random_rows(1, NOON, 100)
+    with SegmentWriter(tmp_path / "run.arrows", METADATA, every=1e9) as writer:
+        for at in (0, 50):
+            writer.write(from_rows(rows[at : at + 50]))
+            writer.rotate()
+    with History(tmp_path / "run.arrows") as history:
+        assert rows_in(history) == rows
+
+
+def test_damage_anywhere_hides_no_other_segment(tmp_path: Path) -> None:
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(3)]
+    record(tmp_path, rows)
+    path, dice = tmp_path / "rows.00000002.arrows", random.Random(9)
+    whole = path.read_bytes()
+    damaged = 0
+    for _ in range(examples(400)):
+        data = bytearray(whole)
+        for _ in range(dice.choice((1, 1, 8))):
+            data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        path.write_bytes(data)
+        with History(tmp_path) as history:
+            found = rows_in(history)
+            assert found[:120] == rows[0]
+            assert found[-120:] == rows[2]
+            history.buckets(SERIES, NOON, NOON + DAY, 700)
+            history.buckets(SERIES, NOON, NOON + 300 * SECOND, 700)
+            damaged += bool(history.damage)
+    assert damaged
+
+
+def test_an_end_that_is_no_batch_is_told_where_the_segment_is_closed(tmp_path: Path) -> None:
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
+    record(tmp_path, rows)
+    for number in (2, 1):  # the newest may still be written
+        path = tmp_path / f"rows.0000000{number}.arrows"
+        path.write_bytes(path.read_bytes() + b"\0" * 7)
+        with History(tmp_path) as history:
+            assert rows_in(history) == flat(rows)
+            told = [] if number == 2 else [f"the last 7 bytes of {path} are no whole batch"]
+            assert history.damage == told
+
+
+def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(2)]
+    record(tmp_path, rows)
+    with monkeypatch.context() as patched:
+        patched.setitem(sys.modules, "duckdb", None)
+        with History(tmp_path) as history:
+            assert rows_in(history) == flat(rows)
+            check_buckets(
+                history.buckets("pump-0.speed", NOON, NOON + 99 * SECOND)["pump-0.speed"],
+                flat(rows),
+                "pump-0.speed",
+            )
+            assert history.export(tmp_path / "a.parquet") == 400  # by pyarrow
+    compact(tmp_path, 2)
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    with History(tmp_path) as history:
+        assert history.metadata() == METADATA
+        for ask in (lambda: rows_in(history), lambda: history.buckets("pump-0.speed", NOON, NOON + DAY)):
+            with pytest.raises(ImportError, match=r"needs duckdb.*pip install 'multidrop\[history\]'"):
+                ask()

@@ -1,0 +1,94 @@
+"""Histories for tests: made of segments, and reckoned with by plain Python."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Sequence
+from math import isclose
+from pathlib import Path
+
+from completions import add_miss, add_rows, new_completion
+
+from multidrop.core import Columns, Field, NumberFormat, RowLayout, Status
+from multidrop.core.columns import Names
+from multidrop.history.buckets import Buckets
+from multidrop.history.history import History
+from multidrop.polling.batch import Batch, Row
+from multidrop.recording.rows import from_rows
+from multidrop.recording.segments import SegmentWriter
+
+SECOND = 1_000_000_000
+DAY = 86400 * SECOND
+NOON = 1_795_262_400 * SECOND  # 2026-11-21 12:00 UTC
+METADATA = {"plant": "завод.toml", "drives": {"pump-1": {"registers": {"speed": {"unit": "rpm"}}}}}
+
+
+def batch(names: Names, drive: int, numbers: Iterable[int], begin: int, step: int) -> Batch:
+    """Make a row of each number in the core's memory, as a poll does; each tenth is a miss.
+
+    It was sent at `number * step` of the monotonic clock, which is `begin` later as UTC.
+    """
+    numbers = list(numbers)
+    columns = Columns(len(numbers))
+    layout = RowLayout(drive, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
+    for number in numbers:
+        if number % 10 == 9:
+            assert add_miss(columns, layout, Status.NO_REPLY, number * step, begin)
+        else:
+            found = new_completion(result=7, sent_ns=number * step, first_ns=number * step + 5)
+            found.reply.data_len = 2
+            found.reply.data[0:2] = list((number & 0xFFFF).to_bytes(2, "big"))
+            assert add_rows(columns, layout, found, begin)
+    return Batch(columns, names, _SPEED)
+
+
+_SPEED = Names(["speed"])
+
+
+def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> list[Row]:
+    """Make rows of six series at uneven times; each seventh or so is a miss."""
+    dice = random.Random(seed)
+    rows, time = [], begin
+    for _ in range(count):
+        time += dice.randrange(2 * step)
+        is_miss = dice.random() < 0.15
+        rows.append(
+            Row(
+                time,
+                time - NOON + 10 * DAY,
+                None if is_miss else 1 << dice.randrange(10, 24),  # exact as a float of 24 bits
+                f"pump-{dice.randrange(3)}",
+                ("speed", "current")[dice.randrange(2)],
+                None if is_miss else dice.uniform(-50, 50),
+                "no reply" if is_miss else "ok",
+            )
+        )
+    return rows
+
+
+def record(folder: Path, segments: Sequence[Sequence[Row]], piece: int = 40, after: int = 0) -> None:
+    """Write a segment of each list of rows."""
+    folder.mkdir(exist_ok=True)
+    with SegmentWriter(folder / "rows.arrows", METADATA, every=1e9, after=after) as writer:
+        for rows in segments:
+            for at in range(0, len(rows), piece):
+                writer.write(from_rows(rows[at : at + piece]))
+            writer.rotate()
+
+
+def rows_in(history: History, *of: object) -> list[Row]:
+    return [row for rows in history.read(*of) for row in rows]  # type: ignore[arg-type]
+
+
+def check_buckets(found: Buckets, rows: Iterable[Row], series: str) -> None:
+    """Compare with what plain Python makes of the rows."""
+    mine = [row for row in rows if f"{row.drive}.{row.register}" == series]
+    for number, begin in enumerate(found.times):
+        here = [row.value for row in mine if begin <= row.time < begin + found.step]
+        values = [value for value in here if value is not None]
+        assert (found.n[number], found.missed[number]) == (len(values), len(here) - len(values))
+        if values:
+            assert (found.least[number], found.most[number]) == (min(values), max(values))
+            assert isclose(found.mean[number] or 0.0, sum(values) / len(values), rel_tol=1e-9, abs_tol=1e-9)
+        else:
+            assert (found.least[number], found.mean[number], found.most[number]) == (None, None, None)
