@@ -1,0 +1,115 @@
+// All registers of the chosen drive: value, unit, place in the manual, and a way to write where it may be.
+
+import { change } from "./actions.js";
+import * as clock from "./clock.js";
+import { make, put } from "./dom.js";
+import { mayWrite, reading, store } from "./store.js";
+import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
+
+let name = null,
+  rows = [],
+  others = {};
+
+// Make the table for a drive.
+export function build(spec) {
+  name = spec.name;
+  others = {};
+  rows = spec.registers.map(register => ({
+    register,
+    value: makeValue(),
+    age: make("td", { class: "age" }),
+  }));
+  return make(
+    "section",
+    { "aria-label": "Registers" },
+    make("h3", {}, "Registers"),
+    make(
+      "table",
+      { class: "registers" },
+      make(
+        "thead",
+        {},
+        make(
+          "tr",
+          {},
+          ["Register", "Value", "Age"].map(h => make("th", { scope: "col" }, h)),
+        ),
+      ),
+      make("tbody", {}, rows.map(row)),
+    ),
+  );
+}
+
+function row({ register, value, age }) {
+  return make(
+    "tr",
+    {},
+    make("th", { scope: "row" }, words(register.name), make("small", {}, about(register))),
+    make(
+      "td",
+      {},
+      value.whole,
+      mayWrite(name, register.name)
+        ? make(
+            "button",
+            {
+              type: "button",
+              class: "change",
+              "aria-label": `Change ${words(register.name)}`,
+              onclick: () => change(name, register),
+            },
+            "Change",
+          )
+        : null,
+    ),
+    age,
+  );
+}
+
+// Return the register's place in the manual, and what may be asked of it.
+function about({ place, access, least, most, step, period_s: period, ...register }) {
+  const isLimited = typeof least === "number" && typeof most === "number";
+  return [
+    place,
+    access === "reading" ? null : access,
+    isLimited ? withUnit(`${least} to ${most}`, register) + (step ? ` by ${step}` : "") : null,
+    period ? `every ${clock.lasting(period * 1000)}` : null,
+  ]
+    .filter(Boolean)
+    .join(" · ");
+}
+
+// Take the newest values of registers that are not polled: {register: [value, ms, status]}.
+export function takeOthers(values) {
+  others = values ?? {};
+}
+
+// Return the reading of a register, polled or not. One that is not polled is as old as it is: it is told so.
+export function known(drive, register, t) {
+  const polled = reading(drive, register, t),
+    other = drive === name ? others[register] : undefined;
+  if (polled || !other) return polled;
+  return {
+    value: other[2] === "ok" ? other[0] : null,
+    ms: other[1],
+    status: other[2],
+    age: t - other[1],
+    isOld: true,
+  };
+}
+
+export function draw(t) {
+  for (const { register, value, age } of rows) {
+    const found = known(name, register.name, t);
+    showValue(value, found, store.drives.get(name).registers.get(register.name), false);
+    put(
+      age,
+      found === null || found.value === null
+        ? (found?.status ?? "not read")
+        : found.isOld
+          ? clock.when(found.ms)
+          : clock.lasting(found.age),
+    );
+    if (age.textContent === "") put(age, UNKNOWN);
+  }
+}

@@ -1,0 +1,110 @@
+// The plant and its newest values, as the gateway sends them, and a short past of each for plots.
+// A value is never without its time, and never new where it is not.
+
+import { Ring } from "./ring.js";
+
+const SAMPLES = 2e6; // of all registers together
+const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
+export const LIVE_MS = 1500; // a frame comes each second at least
+
+export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map(), lines: new Map() };
+const watchers = [];
+
+// Call `what` when there is another plant.
+export function onPlant(what) {
+  watchers.push(what);
+  if (store.plant) what();
+}
+
+// Take a plant description. Pasts go on where drive and register still exist.
+export function takePlant(plant) {
+  const before = store.drives;
+  store.plant = plant;
+  store.drives = new Map();
+  store.lines = new Map(plant.lines.map(line => [line.name, line]));
+  for (const line of plant.lines) {
+    for (const spec of line.drives) {
+      const registers = new Map(spec.registers.map(r => [r.name, r]));
+      const old = before.get(spec.name);
+      store.drives.set(spec.name, {
+        spec,
+        line,
+        registers,
+        good: old?.good ?? new Map(),
+        pasts: old?.pasts ?? new Map(),
+      });
+    }
+  }
+  for (const watcher of watchers) watcher();
+}
+
+// Take a frame: keep each value that is newer than the one before.
+export function takeFrame(frame) {
+  store.frame = frame;
+  store.time = Number(BigInt(frame.time) / 1000000n);
+  for (const [name, drive] of store.drives) {
+    const values = frame.drives[name]?.values ?? {};
+    for (const [register, row] of Object.entries(values)) keep(drive, register, row);
+  }
+}
+
+function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
+  const isGood = status === "ok" && value !== null;
+  if (isGood) drive.good.set(register, { value, ms });
+  else if (lastMs > (drive.good.get(register)?.ms ?? 0))
+    drive.good.set(register, { value: lastValue, ms: lastMs });
+  if (!drive.pasts.has(register)) drive.pasts.set(register, new Ring(most()));
+  drive.pasts.get(register).add(ms, isGood ? value : NaN);
+}
+
+function most() {
+  let registers = 0;
+  for (const drive of store.drives.values()) registers += Math.max(1, drive.pasts.size);
+  return Math.max(120, Math.min(6000, Math.floor(SAMPLES / registers)));
+}
+
+// Return what is known of a register now, or null where nothing ever was:
+// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when its newest request
+// failed, when it is later than three periods, or when the frame itself is.
+export function reading(name, register, now) {
+  const drive = store.drives.get(name),
+    row = store.frame?.drives[name]?.values?.[register];
+  const good = drive?.good.get(register);
+  if (!good)
+    return row ? { value: null, ms: row[1], status: row[2], age: now - row[1], isOld: true } : null;
+  const status = row ? row[2] : "no more polled";
+  const age = (isLive(now) ? store.time : now) - good.ms;
+  return {
+    value: good.value,
+    ms: good.ms,
+    status,
+    age,
+    isOld: status !== "ok" || age > limit(drive, register) || !isLive(now),
+  };
+}
+
+function limit(drive, register) {
+  const period = drive.registers.get(register)?.period_s;
+  return period ? Math.max(3000 * period, 1000) : UNPLANNED_LIMIT_MS;
+}
+
+export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
+
+// Return the age of the drive's newest good reply in ms, or null where there never was one.
+export function driveAge(name, now) {
+  const seen = store.frame?.drives[name]?.seen ?? null;
+  return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
+}
+
+export const state = name => store.frame?.drives[name]?.state ?? "unknown";
+
+// Return the register that has this part in the drive, "frequency" for one, or null.
+export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
+
+// Return the alarms that last, newest first.
+export const lasting = () => (store.frame?.alarms ?? []).filter(alarm => alarm.ended === null);
+
+// Return whether the page's user may do this here: a register or a verb of a drive.
+export const mayWrite = (drive, register) =>
+  store.plant?.may?.write?.includes(`${drive}.${register}`) ?? false;
+export const mayAct = (drive, verb) => store.plant?.may?.verbs?.includes(`${drive}.${verb}`) ?? false;
