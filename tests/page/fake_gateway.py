@@ -116,7 +116,7 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
         def tell(self, value: object, status: int = 200) -> None:
             self.answer(status, json.dumps(value).encode())
 
-        def do_GET(self) -> None:  # noqa: N802
+        def do_GET(self) -> None:
             url = urlsplit(self.path)
             asked = parse_qs(url.query)
             if url.path == "/" or url.path.startswith("/page/"):
@@ -146,7 +146,7 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
                 time.sleep(0.01)
             return self.answer(200, gateway.encoded())
 
-        def do_POST(self) -> None:  # noqa: N802
+        def do_POST(self) -> None:
             body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             if self.path == "/api/token":
                 right = body["token"] == gateway.token
@@ -188,7 +188,10 @@ def plant(handler: Any, gateway: FakeGateway, _: object) -> None:
 def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
     start = int(gateway.began // 60 * 60 - 3540) * 1000
     noisy = [
-        {"time": start + 60000 * m, "asked": 1480, "misses": {"no reply": 14 if m > 40 else 0, "bad CRC": m % 7 // 5}}
+        {
+            "time": start + 60000 * m, "asked": 1480,
+            "misses": {"no reply": 14 if m > 40 else 0, "bad CRC": m % 7 // 5},
+        }
         for m in range(60)
     ]  # fmt: skip
     quiet = [{"time": start + 60000 * m, "asked": 6060, "misses": {}} for m in range(60)]
@@ -197,7 +200,9 @@ def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
         told[line["name"]] = {
             "minutes": noisy if n == 1 else quiet,
             "drives": {
-                d["name"]: {"p50": 3 + i % 4, "p99": 6 + i % 5, "asked": 5120, "missed": 3 if n == 1 and i == 5 else 0}
+                d["name"]: {
+                    "p50": 3 + i % 4, "p99": 6 + i % 5, "asked": 5120, "missed": 3 * ((n, i) == (1, 5)),
+                }
                 for i, d in enumerate(line["drives"])
             },
         }  # fmt: skip
@@ -246,7 +251,8 @@ def audit(handler: Any, gateway: FakeGateway, _: object) -> None:
         }  # fmt: skip
 
     handler.tell({"more": False, "entries": [
-        entry(300, write="frequency_setpoint = 38.0", outcome="confirmed", held=38.0, by="anna by page from 10.0.0.14"),
+        entry(300, write="frequency_setpoint = 38.0", outcome="confirmed", held=38.0,
+              by="anna by page from 10.0.0.14"),
         entry(900, write="stop", outcome="confirmed", by="anna by page from 10.0.0.14"),
         entry(7300, write="start", outcome="unconfirmed", why="no reply", by="scada by http from 10.0.0.2"),
     ]})  # fmt: skip

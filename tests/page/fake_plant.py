@@ -9,7 +9,8 @@ from typing import Any
 NAMES = (
     "pump-1 pump-2 pump-3 pump-4 fan-north fan-south mixer-1 mixer-2 conveyor-1 conveyor-2 screw",
     "filler-1 filler-2 filler-3 capper-1 capper-2 labeller infeed outfeed accumulator rinser",
-    "tower-fan-1 tower-fan-2 tower-fan-3 chilled-1 chilled-2 booster-1 booster-2 exhaust-1 exhaust-2 compressor",
+    "tower-fan-1 tower-fan-2 tower-fan-3 chilled-1 chilled-2 booster-1 booster-2 exhaust-1 exhaust-2 "
+    "compressor",
 )
 FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-220")
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
@@ -48,8 +49,9 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
             "name": f"hall-{n + 1}", "port": f"/dev/ttyUSB{n}", "speed": SPEEDS[n],
             "drives": [
                 {
-                    "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5], "address": i + 1,
-                    "key": KEY, "registers": REGISTERS, "verbs": ["start", "stop", "reset_fault"],
+                    "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5],
+                    "address": i + 1, "key": KEY, "registers": REGISTERS,
+                    "verbs": ["start", "stop", "reset_fault"],
                 }
                 for i, name in enumerate(names.split())
             ],
@@ -105,11 +107,17 @@ def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
         for name, (text, age, kind) in since.items()
     ]
     ended = [
-        {"time": ms(now - 1900), "drive": renamed.get("pump-1", "pump-1"), "text": "overheating of the heatsink",
-         "ended": ms(now - 1500), "kind": "fault"},
-        {"time": ms(now - 2900), "drive": "filler-2", "text": "no reply", "ended": ms(now - 2810), "kind": "silent"},
+        ("pump-1", "overheating of the heatsink", "fault", 1900, 400),
+        ("filler-2", "no reply", "silent", 2900, 90),
+    ]
+    past = [
+        {
+            "time": ms(now - ago), "drive": renamed.get(name, name), "text": text, "kind": kind,
+            "ended": ms(now - ago + lasted),
+        }
+        for name, text, kind, ago, lasted in ended
     ]  # fmt: skip
-    return sorted(lasting + ended, key=lambda alarm: -float(str(alarm["time"])))
+    return sorted(lasting + past, key=lambda alarm: -float(str(alarm["time"])))
 
 
 def ms(seconds: float) -> int:

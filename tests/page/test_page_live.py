@@ -11,6 +11,7 @@ from conftest import Opener
 from fake_gateway import FakeGateway
 from watching import LIVE, STALE, cell, link, until
 
+DASH = "\u2013"
 LATE_S = 2.0  # within which the page says that the daemon is gone
 
 
@@ -105,15 +106,12 @@ def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway:
     gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
     page = opened("#/drives/pump-1")
     for part in ("frequency", "current", "age", "missed"):
-        assert cell(page, "pump-1", part).inner_text().strip() == "–"
-    assert cell(page, "pump-2", "frequency").inner_text().strip() == "–"
+        assert cell(page, "pump-1", part).inner_text().strip() == DASH
+    assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
-    assert set(page.locator(".registers .number").all_inner_texts()) == {
-        "–",
-        "20.0",
-        "4012",
-    }  # two not polled
-    assert page.locator("tr.head .wire").first.inner_text().split() == ["wire", "–", "of", "–", "planned"]
+    shown = set(page.locator(".registers .number").all_inner_texts())
+    assert shown == {DASH, "20.0", "4012"}  # two that are not polled
+    assert page.locator("tr.head .wire").first.inner_text().split() == ["wire", DASH, "of", DASH, "planned"]
 
 
 @pytest.mark.parametrize("off_s", [-90, 90])
@@ -139,7 +137,8 @@ def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> No
     local = int(clock.inner_text()[:2]) * 60 + int(clock.inner_text()[3:5])
     assert (local - utc) % 1440 in (330, 331)
     afternoon = 1764075600  # 2025-11-25 13:00 UTC, 18:30 in Kolkata
-    tick = f"import('/page/clock.js').then(c => [c.ticks([{afternoon}], 3600), c.moment({afternoon}000), c.isUtc()])"
+    asked = f"[c.ticks([{afternoon}], 3600), c.moment({afternoon}000), c.isUtc()]"
+    tick = f"import('/page/clock.js').then(c => {asked})"
     assert page.evaluate(tick)[0] == ["18:30"]
     clock.click()
     ticks, moment, is_utc = page.evaluate(tick)

@@ -13,9 +13,16 @@ def until(page: Any, expression: str, within: float = 10) -> float:
     """Wait until this is true on the page. Return the seconds. Raises AssertionError."""
     began = time.monotonic()
     while not page.evaluate(expression):
-        assert time.monotonic() - began < within, f"not within {within} s: {expression}"
+        assert time.monotonic() - began < within, f"not within {within} s: {expression}; {told(page)}"
         page.wait_for_timeout(20)
     return time.monotonic() - began
+
+
+def told(page: Any) -> str:
+    """Return what the head says, for who reads of a failure."""
+    return str(
+        page.evaluate("['link', 'notice'].map(id => document.getElementById(id).textContent).join(', ')")
+    )
 
 
 def cell(page: Any, drive: str, part: str) -> Any:

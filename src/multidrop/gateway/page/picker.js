@@ -22,9 +22,13 @@ export function begin(into, what) {
   [place, changed] = [into, what];
 }
 
+let wanted = null; // named by an address before the plant was known
+
 // Keep what is chosen as far as this plant has it, and choose something where nothing is.
 export function takePlant() {
   chosen = chosen.filter(name => store.drives.has(name));
+  if (wanted !== null) choose(wanted);
+  wanted = null;
   const all = [...store.drives.keys()];
   if (!chosen.length) chosen = [...all.filter(name => state(name) === "runs"), ...all].slice(0, 1);
   if (!registers.length)
@@ -36,6 +40,7 @@ export function takePlant() {
 
 // Choose this drive, in the place of those before.
 export function choose(name) {
+  if (!store.plant) wanted = name;
   if (!store.drives.has(name)) return;
   chosen = [name];
   registers = [...new Set([...registers, key(name, "frequency"), key(name, "current")])].filter(
@@ -80,10 +85,10 @@ export function draw() {
       "details",
       { open: innerWidth > 1000 },
       make("summary", {}, "What is shown"),
-      make("h3", {}, "Drives"),
+      make("h2", {}, "Drives"),
       names.length > 8 ? filter : null,
       list,
-      make("h3", {}, "Quantities"),
+      make("h2", {}, "Quantities"),
       make(
         "div",
         { class: "choices", role: "group", "aria-label": "Quantities" },

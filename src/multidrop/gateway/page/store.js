@@ -7,7 +7,8 @@ const SAMPLES = 2e6; // of all registers together
 const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
 export const LIVE_MS = 1500; // a frame comes each second at least
 
-export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map(), lines: new Map() };
+export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map() };
+store.lines = new Map();
 const watchers = [];
 
 // Call `what` when there is another plant.

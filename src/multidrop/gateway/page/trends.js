@@ -90,6 +90,8 @@ export function hide() {
 }
 
 function set(from, to, follows) {
+  const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
+  if (isSame && !follows) return; // each plot tells of a drag
   if (view.to) view.back.push([view.from, view.to, view.follows]);
   view.back.splice(0, view.back.length - 50);
   Object.assign(view, { from, to: Math.max(to, from + LEAST_MS), follows });
