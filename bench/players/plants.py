@@ -18,7 +18,7 @@ from multiprocessing.sharedctypes import SynchronizedArray
 from pathlib import Path
 from threading import Thread
 
-from multidrop.cli.demo import DRIVES, OPTIONS
+from multidrop.cli.support.demo_plant import DRIVES, OPTIONS
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant

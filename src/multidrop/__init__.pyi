@@ -25,6 +25,7 @@ from multidrop.drive import verb as verb
 from multidrop.drive import wait as wait
 from multidrop.drive import write as write
 from multidrop.drive.declaration_check import DeclarationError as DeclarationError
+from multidrop.drive.known_state import StateReader as StateReader
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
 from multidrop.drive.register import HOLDING as HOLDING
@@ -79,6 +80,9 @@ from multidrop.recording import open_reader as open_reader
 from multidrop.recording import open_writer as open_writer
 from multidrop.recording.format import RecordingReader as RecordingReader
 from multidrop.recording.reading import read as read
+from multidrop.toml_check import Key as Key
+from multidrop.toml_check import TomlPlace as TomlPlace
+from multidrop.toml_check import parse_duration as parse_duration
 from multidrop.transport.statistics import Delays as Delays
 from multidrop.transport.statistics import Diagnostics as Diagnostics
 from multidrop.transport.statistics import LineStatistics as LineStatistics

@@ -18,7 +18,7 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.demo import DRIVES, _start_motors
+from multidrop.cli.support.demo_plant import DRIVES, start_motors
 from multidrop.core import Status
 from multidrop.errors import NoReply
 from multidrop.recording import open_reader, open_writer
@@ -273,7 +273,7 @@ def test_a_demo_goes_on_without_a_motor_that_does_not_answer() -> None:
     """A machine may have much else to do."""
     toy = Toy(1)
     with Simulator([Faulty([simulated(toy)], lambda reply: b"", unpaced=True)]) as simulator:
-        _start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))
+        start_motors(line(simulator.wires[0].path, polled(toy, toy.readings())))
 
 
 def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ FLOORS = [
     {"poller"},
     {"recording", "sim", "scan", "importers"},
     {"capture", "report"},
+    {"gateway"},
     {"cli"},
     {"__init__", "__main__"},
 ]
@@ -39,6 +40,10 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
+    "gateway/gateway.py",
+    "gateway/listener.py",
+    "gateway/sd_notify.py",
+    "gateway/views.py",
 }
 
 
@@ -61,6 +66,8 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
+    if room(path) == "gateway":  # a client of the library: another test is about its imports
+        others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
 
@@ -107,6 +114,28 @@ def test_imports_for_types_alone_point_downwards_too() -> None:
     """A room whose annotations name what stands above it knows too much."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
+
+
+def test_the_gateway_is_a_client_of_public_names_alone() -> None:
+    """Who writes a daemon of his own can do all that this one does."""
+    found = {
+        str(path.relative_to(PACKAGE)): {
+            name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name)
+        }
+        for path in FILES
+        if room(path) == "gateway"
+    }
+    assert found
+    assert offenders(found) == {}
+
+
+def _is_public(name: str) -> bool:
+    return name.startswith("multidrop.gateway") or name.removeprefix("multidrop.") in multidrop.__all__
+
+
+def test_the_serve_command_alone_imports_the_gateway() -> None:
+    found = {str(path.relative_to(PACKAGE)) for path in FILES if "gateway" in rooms(_imported(path))}
+    assert {name for name in found if not name.startswith("gateway/")} == {"cli/serve.py"}
 
 
 def test_no_test_imports_another_one() -> None:

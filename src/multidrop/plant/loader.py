@@ -31,14 +31,17 @@ def load_plant(path: Path | str) -> Plant:
     path = Path(path)
     place = TomlPlace(path)
     document = place.attempt(read_document, path, "plant file")
-    tables = [] if document is None else place.check(document, _PLANT).get("line", [])
-    lines = tuple(_line(table, at) for table, at in place.inside("line", tables))
+    given = {} if document is None else place.check(document, _PLANT)
+    lines = tuple(_line(table, at) for table, at in place.inside("line", given.get("line", [])))
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
-    return Plant(lines, path)
+    return Plant(lines, path, given.get("serve", {}))
 
 
-_PLANT = {"line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True)}
+_PLANT = {
+    "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),
+    "serve": Key(dict, "[serve], a table that `multidrop serve` reads"),
+}
 
 _LINE = {
     "name": Key(str, 'name = "hall-1"', needed=True),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -64,10 +64,11 @@ class PlantLine:
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file."""
+    """All lines of a plant file, and its table `serve` as it stands: the gateway alone reads that."""
 
     lines: tuple[PlantLine, ...]
     path: Path
+    serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def find_line(self, name: str) -> PlantLine:
         """Return the line of this name; ValueError with the nearest names when there is none."""

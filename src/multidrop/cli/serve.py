@@ -1,0 +1,204 @@
+"""The `serve` command: polls a plant, and lets everybody else in; the only importer of the gateway."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from multidrop.cli.support.demo_plant import DRIVES, plant_file, simulator, start_motors
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.plants import add_port_option, plant_of
+from multidrop.drives import MODELS
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant
+
+if TYPE_CHECKING:
+    from multidrop.gateway.settings import ServeSettings
+
+DEMO_PORTS = (8750, 0)  # the usual one, or any
+ROLES = ("look", "stop", "write")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("plant", metavar="PLANT.toml", nargs="?", help="lines, drives, and the table [serve]")
+    add_port_option(parser)
+    parser.add_argument("--demo", action="store_true", help="serve a simulated plant, and open its page")
+    parser.add_argument("--no-browser", action="store_true", help="open no page, with --demo")
+    parser.add_argument("--check", action="store_true", help="check the file and its [serve], and do nothing")
+    parser.add_argument("--log", choices=("text", "json"), default="text", help="form of the log on stderr")
+    parser.add_argument("--new-token", metavar="ROLE", choices=ROLES, help=f"one of {', '.join(ROLES)}")
+    parser.add_argument("--for", metavar="NAME", dest="owner", help="who will have the new token")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    if arguments.new_token or arguments.owner:
+        return _new_token(arguments.new_token, arguments.owner)
+    if arguments.demo:
+        if arguments.plant:
+            raise ValueError("--demo has a plant of its own: leave the plant file out")
+        return serve_demo(is_shown=not arguments.no_browser, log=arguments.log)
+    if not arguments.plant:
+        raise ValueError("name a plant file, or try `multidrop serve --demo`")
+    _require_server()
+    from multidrop.gateway.settings import read_settings
+
+    plant = plant_of(arguments.plant, arguments)
+    settings = read_settings(plant, os.environ)
+    if arguments.check:
+        parts = ", ".join(settings.parts) or "none"
+        print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
+        return 0
+    with _logging(arguments.log, logging.INFO):
+        return _serve(plant, settings, lambda port: print_text(f"ready {_url(settings, port)}", flush=True))
+
+
+def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
+    """Serve a simulated plant in which everybody on this machine may do everything."""
+    _require_server()
+    with TemporaryDirectory(prefix="multidrop-") as directory:
+        folder = Path(directory)
+        path = folder / "demo.toml"
+        path.write_text(plant_file(folder / "mixed", _demo_registers()))
+        with simulator(path, folder), _logging(log, logging.WARNING):
+            plant = load_plant(path)
+            start_motors(plant.lines[0])
+
+            def on_ready(port: int) -> None:
+                url = f"http://localhost:{port}/"
+                print_text(f"ready {url}\nCtrl-C ends it", flush=True)
+                if is_shown:
+                    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+            return _serve(plant, _demo_settings(plant, folder), on_ready)
+
+
+def _require_server() -> None:
+    for library in ("starlette", "uvicorn"):
+        require_extra(library, "serve", "serve")
+
+
+def _demo_registers() -> list[str]:
+    models = dict.fromkeys(model for _, model, _ in DRIVES)
+    return list(dict.fromkeys(one.name for model in models for one in MODELS[model].readings()))
+
+
+def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
+    from multidrop.gateway.commands import verbs_of
+    from multidrop.gateway.rights import May, Right
+    from multidrop.gateway.settings import ServeSettings
+
+    drives = [polled.drive for line in plant.lines for polled in line.drives]
+    writes = [
+        f"{one.name}.{name}" for one in drives for name, found in one.registers.items() if found.writable
+    ]
+    verbs = [f"{one.name}.{verb}" for one in drives for verb in verbs_of(one)]
+    may = May("anyone", Right.WRITE, frozenset(writes), frozenset(verbs))
+    audit = folder / "audit.jsonl"
+    return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, is_demo=True)
+
+
+def _serve(plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None]) -> int:
+    from dataclasses import replace
+
+    from multidrop.gateway.gateway import Gateway
+
+    try:
+        gateway = Gateway(plant, settings)
+    except OSError:
+        if not settings.is_demo:
+            raise
+        gateway = Gateway(plant, replace(settings, port=DEMO_PORTS[1]))
+
+    async def live() -> None:
+        loop = asyncio.get_running_loop()
+
+        def end(number: signal.Signals) -> None:
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.default_int_handler)  # a second one interrupts
+            gateway.end()
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, end, number)
+        await gateway.run(lambda: on_ready(gateway.port))
+
+    asyncio.run(live())
+    return 0
+
+
+def _url(settings: ServeSettings, port: int) -> str:
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"http{'s' if settings.tls else ''}://{host}:{port}/"
+
+
+def _new_token(role: str | None, owner: str | None) -> int:
+    """Print a line for the tokens' file, and on stderr the token, which is nowhere else."""
+    from multidrop.gateway.rights import Right, new_token
+
+    if not role or not owner:
+        raise ValueError("a new token needs a role and a name: multidrop serve --new-token stop --for anna")
+    secret, token = new_token(owner, Right[role.upper()])
+    print_text(token.line)
+    warn(f"the token of {owner}, shown this once: {secret}")
+    return 0
+
+
+# ---- logs ----
+
+
+class _JsonFormatter(logging.Formatter):
+    """One JSON object a line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        found = {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        if record.exc_info:
+            found["exception"] = self.formatException(record.exc_info)
+        return json.dumps(found, ensure_ascii=False)
+
+
+class _TextFormatter(logging.Formatter):
+    """Time, level and message on a line; a traceback below it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = f"{_time(record)} {record.levelname.lower()} {record.getMessage()}"
+        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
+
+
+def _time(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+
+
+@contextmanager
+def _logging(form: str, level: int) -> Iterator[None]:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonFormatter() if form == "json" else _TextFormatter())
+    levels = {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING}
+    loggers = {logging.getLogger(name): wanted for name, wanted in levels.items()}
+    before = {logger: logger.level for logger in loggers}
+    for logger, wanted in loggers.items():
+        logger.addHandler(handler)
+        logger.setLevel(wanted)
+    try:
+        yield
+    finally:
+        for logger, old in before.items():
+            logger.removeHandler(handler)
+            logger.setLevel(old)

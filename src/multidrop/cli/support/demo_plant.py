@@ -1,0 +1,66 @@
+"""A simulated plant to show: a line with every family on it, and its motors running."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from multidrop.bus import Bus
+from multidrop.drives import MODELS
+from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
+from multidrop.plant.model import PlantLine
+
+DRIVES = (  # name, model, framing
+    ("erman", "erman-er-g-220", "rtu"),
+    ("che", "invt-che", "rtu"),
+    ("ibd", "innovert-ibd", "rtu"),
+    ("ibd-ascii", "innovert-ibd", "ascii"),
+    ("delixi", "delixi-modbus", "rtu"),
+    ("delixi-ascii", "delixi-modbus", "ascii"),
+    ("delixi-native", "delixi-native", "delixi"),
+    ("yd1000", "yd1000", "rtu"),
+)
+OPTIONS = {"maximum_frequency": 50}
+
+
+def plant_file(port: Path, registers: Sequence[str]) -> str:
+    """Return the text of a plant file; of each drive these registers are polled, as far as it has them."""
+    tables = [f'[[line]]\nname = "mixed"\nport = "{port}"\n']
+    for address, (name, model, framing) in enumerate(DRIVES, 1):
+        family = MODELS[model]
+        options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
+        polled = [register for register in registers if register in family.registers]
+        tables.append(
+            f'[[line.drive]]\nname = "{name}"\nmodel = "{model}"\nframing = "{framing}"\n'
+            f"address = {address}\n{options}poll = {polled}\n"
+        )
+    return "\n".join(tables)
+
+
+def start_motors(line: PlantLine) -> None:
+    """Start every simulated motor, each at another frequency."""
+    with Bus(line.port, ledger=Path(line.port).with_name("wear.sqlite")) as bus:
+        for number, polled in enumerate(line.drives):
+            drive = bus.attach(polled.drive)
+            # On a busy machine a simulated drive may answer too late: the demo goes on without its motor.
+            with suppress(BadReply, Expired, NoReply, NotDone, Unconfirmed):
+                drive.set_frequency(20.0 + 3 * number)
+                drive.start()
+
+
+@contextmanager
+def simulator(plant: Path, ports: Path) -> Iterator[None]:
+    """Simulate in another process: the two sides do not share an interpreter."""
+    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
+    # A session of its own keeps Ctrl-C from it: it must outlive the polling.
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        try:
+            if not process.stdout.readline().startswith("ready"):
+                raise OSError("the simulator did not start; see above")
+            yield
+        finally:
+            process.terminate()

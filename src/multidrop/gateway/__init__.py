@@ -1,0 +1,1 @@
+"""The gateway: one process masters the lines, and browsers, brokers and masters get in through it."""

@@ -1,0 +1,317 @@
+"""Commands: everything that is written, by whichever way it is asked for.
+
+The caller's role, the plant file's lists, and then the library's own rules. Each command has a thread of its
+own, so that a stop waits for nothing of the gateway; a write that comes while many are under way is refused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from multidrop import (
+    Bus,
+    BusError,
+    Direction,
+    Drive,
+    Effect,
+    Plant,
+    Refused,
+    Seen,
+    Stopped,
+    Unsupported,
+    written_by,
+)
+from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
+
+MOST_WRITES = 8  # under way on a line, without stops
+BUSY = "too many writes are under way"  # a rule
+
+R = TypeVar("R")
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Told(NamedTuple):
+    """The end of a command: what became of it, in the library's words."""
+
+    is_done: bool
+    text: str  # one sentence for a person
+    error: BusError | ValueError | None = None  # that the library raised
+
+
+class PolledLines(Protocol):
+    """The part of a Poller that commands need."""
+
+    @property
+    def plant(self) -> Plant: ...
+    def bus(self, line: str) -> Bus: ...
+
+
+class VerbRule(NamedTuple):
+    """The rights that a verb needs, and its options."""
+
+    role: Right
+    is_listed: bool  # it must stand in [serve.may] verbs
+    options: Mapping[str, Callable[[object], Any]]
+
+
+def _direction(value: object) -> Direction:
+    try:
+        return Direction(value)
+    except ValueError:
+        raise ValueError(f"direction = {value!r} is neither forward nor reverse") from None
+
+
+def _hertz(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"hz = {value!r} is no number")  # noqa: TRY004 (a person's mistake)
+    return float(value)
+
+
+VERBS: Mapping[str, VerbRule] = {
+    "start": VerbRule(Right.WRITE, True, {"direction": _direction}),
+    "jog": VerbRule(Right.WRITE, True, {"direction": _direction}),
+    "reset_fault": VerbRule(Right.WRITE, True, {}),
+    "set_frequency": VerbRule(Right.WRITE, True, {"hz": _hertz}),
+    "coast": VerbRule(Right.STOP, True, {}),  # a hoist would drop its load
+    "emergency_stop": VerbRule(Right.STOP, True, {}),
+    "stop": VerbRule(Right.STOP, False, {}),
+}
+WAYS_WITHOUT_VERBS = frozenset({"modbus"})
+
+
+def verbs_of(drive: Drive) -> list[str]:
+    """Return the verbs of these that the drive's family has."""
+    return [name for name in VERBS if getattr(type(drive), name) is not getattr(Drive, name)]
+
+
+class Commands:
+    """Carries commands out on the lines of a poller."""
+
+    def __init__(self, lines: PolledLines, may: May) -> None:
+        self.may = may
+        self._lines = lines
+        self.called = 0  # commands that passed all rights, so far
+        self._under_way: dict[str, int] = {}  # writes, by line
+        self._stops: dict[str, int] = {}  # that were called so far, by drive
+
+    # ---- stops ----
+
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, Told]:
+        """Stop these drives, or all with None; by drive's name what is known of each.
+
+        The stops of all lines and drives go side by side. Never raises for one drive: the others go on.
+        Nothing but the role is looked at, and nothing is waited for before it is sent.
+        """
+        plant = self._lines.plant
+        names = [polled.drive.name for line in plant.lines for polled in line.drives]
+        wanted = dict.fromkeys(names if drives is None else drives)
+        if caller.role < Right.STOP:
+            return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
+        self.called += 1
+        told: dict[str, Told] = {}
+        waited: list[asyncio.Future[dict[str, Told]]] = []
+        for line in plant.lines:
+            here = {polled.drive.name: polled.drive for polled in line.drives if polled.drive.name in wanted}
+            for name in here:
+                self._stops[name] = self._stops.get(name, 0) + 1
+            if here and len(here) == len(line.drives):
+                waited.append(_begin_stop(partial(self._stop_line, line.name), caller))
+            else:
+                waited += [_begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
+        _log.warning("stop of %s, asked for %s", "all drives" if drives is None else list(wanted), caller.by)
+        for name in wanted:
+            if name not in names:
+                told[name] = _failed(ValueError(f"there is no drive {name!r}"))
+        for found in await asyncio.gather(*waited):
+            told |= found
+        return {name: told[name] for name in wanted if name in told}
+
+    def _stop_line(self, line: str) -> dict[str, Told]:
+        try:
+            return {name: _of_stop(stopped) for name, stopped in self._lines.bus(line).stop_all().items()}
+        except Exception as failure:  # whatever it is: everybody must see it
+            _log.exception("stop_all of line %s", line)
+            names = [polled.drive.name for polled in self._lines.plant.find_line(line).drives]
+            return dict.fromkeys(names, _failed(failure))
+
+    # ---- writes and verbs ----
+
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> Told:
+        """Write a register that the plant file lists, once; never raises for what becomes of it."""
+        what = f"{drive}.{register}"
+        if caller.role < Right.WRITE:
+            return _denied(caller, Right.WRITE, f"a write of {what}")
+        if what not in self.may.write:
+            return _failed(_not_listed(what, "write"))
+        return await self._carry_out(
+            drive, caller, f"{what} = {value!r}", lambda known: _write(known, register, value)
+        )
+
+    async def act(self, drive: str, verb: str, options: Mapping[str, object], caller: Caller) -> Told:
+        """Carry out a verb that the plant file lists, once; never by a way that cannot ask a person."""
+        what = f"{drive}.{verb}"
+        rule = VERBS.get(verb)
+        if rule is None:
+            return _failed(ValueError(f"there is no verb {verb!r}; there are {', '.join(VERBS)}"))
+        if caller.way in WAYS_WITHOUT_VERBS:
+            refusal = f"{verb} is never carried out by way of {caller.way}"
+            return _failed(Refused(refusal, rule=NEVER_THIS_WAY))
+        if caller.role < rule.role:
+            return _denied(caller, rule.role, what)
+        if rule.is_listed and what not in self.may.verbs:
+            return _failed(_not_listed(what, "verbs"))
+        if verb == "stop":
+            return (await self.stop([drive], caller))[drive]
+        try:
+            arguments = _arguments(rule, verb, options)
+        except ValueError as mistake:
+            return _failed(mistake)
+        return await self._carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))
+
+    async def _carry_out(self, drive: str, caller: Caller, what: str, work: Callable[[Drive], Told]) -> Told:
+        try:
+            line, known = self._lines.plant.find_drive(drive)
+        except ValueError as mistake:
+            return _failed(mistake)
+        if self._under_way.get(line.name, 0) >= MOST_WRITES:
+            reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
+            return _failed(Refused(reason, rule=BUSY))
+        self.called += 1
+        stops = self._stops.get(drive, 0)
+
+        def checked() -> Told:
+            if self._stops.get(drive, 0) != stops:
+                return _failed(Refused(f"{what} was not sent: a stop was called", rule="a stop was called"))
+            return work(known)
+
+        self._under_way[line.name] = self._under_way.get(line.name, 0) + 1
+        try:
+            future = _in_thread(checked, caller)
+        except RuntimeError as failure:
+            self._end(line.name)
+            return _failed(failure)
+        future.add_done_callback(lambda _: self._end(line.name))
+        told = await asyncio.shield(future)
+        _log.info("%s, asked for by %s: %s", what, caller.by, told.text)
+        return told
+
+    def _end(self, line: str) -> None:
+        self._under_way[line] -= 1
+
+
+def _begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
+    """Begin a stop in a thread, or here and now where the system gives none: a stop is always sent."""
+    try:
+        return _in_thread(work, caller)
+    except RuntimeError:
+        future: asyncio.Future[R] = asyncio.get_running_loop().create_future()
+        with written_by(*_author(caller)):
+            future.set_result(work())
+        return future
+
+
+def _in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
+    """Begin work in a thread of its own, as this caller's, whoever waits for it or no longer does."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[R] = loop.create_future()
+
+    def finish(result: R | None, failure: BaseException | None) -> None:
+        if future.done():
+            return
+        if failure is not None:
+            future.set_exception(failure)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]
+
+    def run() -> None:
+        result, failure = None, None
+        try:
+            with written_by(*_author(caller)):
+                result = work()
+        except BaseException as error:
+            failure = error
+        try:
+            loop.call_soon_threadsafe(finish, result, failure)
+        except RuntimeError:  # the loop is closed: nobody waits any more
+            _log.warning("a command ended after the gateway: %s", failure or result)
+
+    threading.Thread(target=run, name="multidrop command", daemon=True).start()
+    return future
+
+
+def _author(caller: Caller) -> tuple[str, str]:
+    """Return the caller as the audit log takes him."""
+    clean = [_printable(text) for text in (caller.name, f"{caller.way} from {caller.address}")]
+    return clean[0] or "anyone", clean[1]
+
+
+def _printable(text: str) -> str:
+    return "".join(sign if sign.isprintable() else "?" for sign in text)[:200].strip()
+
+
+def _arguments(rule: VerbRule, verb: str, options: Mapping[str, object]) -> dict[str, Any]:
+    for name in options:
+        if name not in rule.options:
+            known = ", ".join(rule.options) or "none"
+            raise ValueError(f"{verb} has no option {name!r}; it has {known}")
+    if "hz" in rule.options and "hz" not in options:
+        raise ValueError(f"{verb} needs a frequency: hz = 20.0")
+    return {name: rule.options[name](value) for name, value in options.items() if value is not None}
+
+
+def _stop_one(drive: Drive) -> dict[str, Told]:
+    try:
+        drive.stop()
+    except Exception as failure:  # whatever it is: everybody must see it
+        return {drive.name: _failed(failure)}
+    return {drive.name: Told(True, "stopped: seen to stand")}
+
+
+def _of_stop(stopped: Stopped) -> Told:
+    if stopped.seen is Seen.STOPPED:
+        return Told(True, f"stopped: seen to stand after {stopped.seconds:.1f} s")
+    return Told(False, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
+
+
+def _write(drive: Drive, register: str, value: float) -> Told:
+    try:
+        known = drive.register(register)
+        typed = known.decode(value) if known.values is not None else value
+        outcome = drive.bus.try_write(drive, known, typed)
+    except (BusError, ValueError, TypeError) as failure:
+        return _failed(failure)
+    if outcome.effect is Effect.DONE:
+        return Told(True, str(outcome))
+    return Told(False, str(outcome), outcome.failure or BusError(str(outcome)))
+
+
+def _act(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Told:
+    try:
+        getattr(drive, verb)(**arguments)
+    except (BusError, ValueError, TypeError, Unsupported) as failure:
+        return _failed(failure)
+    return Told(True, f"{drive.name}: {verb} is done")
+
+
+def _failed(failure: BaseException) -> Told:
+    if not isinstance(failure, (BusError, ValueError)):
+        failure = ValueError(str(failure) or type(failure).__name__)
+    return Told(False, str(failure), failure)
+
+
+def _denied(caller: Caller, role: Right, what: str) -> Told:
+    needed = role.name.lower()
+    sentence = f"{what} needs the role {needed}, and {caller.name} has {caller.role.name.lower()}"
+    return _failed(Refused(sentence, rule=NOT_ALLOWED))
+
+
+def _not_listed(what: str, key: str) -> Refused:
+    return Refused(
+        f'{what} is not in the plant file\'s list; add it to {key} = ["{what}"] of [serve.may]',
+        rule=NOT_LISTED,
+    )

@@ -1,0 +1,91 @@
+"""Description of a plant for the page: lines, drives, registers, and what the caller may do. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import Flag
+from typing import Any, cast
+
+from multidrop import Drive, Plant, PlantLine, PolledDrive, Register
+from multidrop.gateway.commands import verbs_of
+from multidrop.gateway.rights import May, Right
+
+FREQUENCIES = ("output_frequency", "motor_speed")
+CURRENTS = ("output_current",)
+
+
+def describe(
+    plant: Plant, may: May, right: Right | None, *, revision: int, version: str, is_demo: bool
+) -> dict[str, Any]:
+    """Return what GET /api/plant answers to a caller with this right."""
+    is_writer = right is Right.WRITE
+    return {
+        "revision": revision,
+        "version": version,
+        "name": plant.path.name,
+        "demo": is_demo,
+        "may": {
+            "role": None if right is None else right.name.lower(),
+            "write": sorted(may.write) if is_writer else [],
+            "verbs": sorted(may.verbs) if is_writer else [],
+        },
+        "lines": [_line(line) for line in plant.lines],
+    }
+
+
+def _line(line: PlantLine) -> dict[str, Any]:
+    speeds = Counter(str(polled.drive.settings) for polled in line.drives)
+    return {
+        "name": line.name,
+        "port": line.port,
+        "speed": speeds.most_common(1)[0][0] if speeds else "",
+        "drives": [_drive(polled) for polled in line.drives],
+    }
+
+
+def _drive(polled: PolledDrive) -> dict[str, Any]:
+    drive = polled.drive
+    periods = {poll.register.name: poll.every or 0.0 for poll in polled.polls}
+    return {
+        "name": drive.name,
+        "family": drive.model or type(drive).__name__,
+        "title": drive.title,
+        "address": drive.address,
+        "key": _key_registers(drive, periods),
+        "registers": [
+            _register(register) | {"period_s": periods.get(register.name)}
+            for register in drive.registers.values()
+        ],
+        "verbs": verbs_of(drive),
+    }
+
+
+def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
+    """Return the registers that stand for all others: those that are polled first, and those that are not."""
+    wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
+    found: dict[str, str | None] = {}
+    for name, registers in wanted.items():
+        there = [one for one in registers if one in drive.registers]
+        found[name] = next((one for one in there if one in periods), next(iter(there), None))
+    return found
+
+
+def _register(register: Register[Any]) -> dict[str, Any]:
+    values = register.values
+    least, most = register.span or (None, None)
+    kind = "number" if values is None else "bits" if issubclass(values, Flag) else "words"
+    members: list[Any] = [] if values is None else list(cast(Any, values))
+    words = {str(int(member)): member.name.lower() for member in members}
+    return {
+        "name": register.name,
+        "unit": register.unit,
+        "digits": register.decimals,
+        "kind": kind,
+        "words": words,
+        "access": register.access.value,
+        "place": register.place,
+        "note": register.note,
+        "least": least,
+        "most": most,
+        "step": register.step,
+    }

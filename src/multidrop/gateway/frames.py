@@ -1,0 +1,164 @@
+"""Frames: what all viewers see, made once for all of them, ten times a second at most.
+
+A viewer asks for the next frame when it has the last one: nothing queues for one that is slow.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+from collections.abc import Callable
+from math import isfinite
+from typing import Any, NamedTuple
+
+from multidrop.gateway.events import Events
+from multidrop.gateway.hub import SILENT, Hub
+from multidrop.gateway.lately import Lately
+
+LEAST_S = 0.1  # between two frames, on the whole
+EARLY_S = 0.02  # by which one may come sooner after one that was late
+WAIT_S = 20.0  # for which a viewer waits for a frame
+MOST_VIEWERS = 200  # that wait at the same time
+MOST_ALARMS = 50  # in a frame
+LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
+
+
+class Encoded(NamedTuple):
+    """A frame as it is sent."""
+
+    n: int
+    plain: bytes
+    gzipped: bytes
+
+
+def frame_of(
+    hub: Hub, events: Events, lately: Lately, *, n: int, revision: int, time_ns: int
+) -> dict[str, Any]:
+    """Return the frame of this moment."""
+    return {
+        "n": n,
+        "revision": revision,
+        "time": str(time_ns),
+        "drives": {name: _drive(hub, name) for name in hub.drives},
+        "lines": {
+            line.name: lately.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines
+        },
+        "alarms": [alarm._asdict() for alarm in events.newest_first()[:MOST_ALARMS]],
+    }
+
+
+def _drive(hub: Hub, name: str) -> dict[str, Any]:
+    state, words = hub.seen(name)
+    seen = hub.seen_at(name)
+    return {
+        "state": state,
+        "fault": hub.fault(name),
+        "why": words if state == SILENT else None,
+        "seen": None if seen is None else seen // 1_000_000,
+        "values": {register.name: _value(hub, name, register.name) for register in hub.polled(name)},
+    }
+
+
+def _value(hub: Hub, drive: str, register: str) -> list[Any] | None:
+    """Return the newest value that is known with its own time, and the newest row's status."""
+    newest, good = hub.newest(drive, register), hub.last_good(drive, register)
+    if newest is None:
+        return [None, None, "not asked yet"]
+    value = good.value if good is not None else None
+    time = good.time if good is not None else newest.time
+    status = newest.status if newest.status != "ok" or hub.is_fresh(drive, register) else "overdue"
+    return [value if value is not None and isfinite(value) else None, time // 1_000_000, status]
+
+
+def lost_of(hub: Hub, line: str) -> str | None:
+    """Return the reason why a line is not there, where all its newest rows say so; None otherwise."""
+    rows = [
+        row
+        for polled in hub.plant.find_line(line).drives
+        for poll in polled.polls
+        if (row := hub.newest(polled.drive.name, poll.register.name))
+    ]
+    reasons = {row.status for row in rows if row.status in LOST}
+    return max(reasons) if reasons and all(row.status in LOST for row in rows) else None
+
+
+class Frames:
+    """The newest frame, and those who wait for the next one. `clock` gives monotonic seconds."""
+
+    def __init__(self, make: Callable[[int], dict[str, Any]], clock: Callable[[], float]) -> None:
+        self._make = make
+        self._clock = clock
+        self._newest: Encoded | None = None
+        self._due = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+        self._has_news = True
+        self._is_closed = False
+        self._waiting: set[asyncio.Future[None]] = set()
+        self.made = 0
+
+    @property
+    def viewers(self) -> int:
+        """Return how many wait at present."""
+        return len(self._waiting)
+
+    def note_news(self) -> None:
+        """Tell that a frame of now would differ from the newest one."""
+        self._has_news = True
+        self._build_when_due()
+
+    def _build_when_due(self) -> None:
+        if self._timer is not None or not self._waiting or not self._has_news:
+            return
+        wait = self._due - self._clock()
+        if wait <= 0:
+            self._build()
+        else:
+            self._timer = asyncio.get_running_loop().call_later(wait, self._on_timer)
+
+    def _on_timer(self) -> None:
+        self._timer = None
+        self._build_when_due()
+
+    async def after(self, n: int) -> Encoded | None:
+        """Return a frame other than the n-th, as soon as there is one; None when there is none for long.
+
+        Raises OverflowError when too many wait already.
+        """
+        if self._has_news and self._clock() >= self._due:
+            self._build()
+        if self._newest is not None and self._newest.n != n:
+            return self._newest
+        if len(self._waiting) >= MOST_VIEWERS:
+            raise OverflowError(f"{MOST_VIEWERS} viewers wait already")
+        if self._is_closed:
+            return None
+        turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.add(turn)
+        self._build_when_due()
+        try:
+            await asyncio.wait_for(turn, WAIT_S)
+        except TimeoutError:
+            return None
+        finally:
+            self._waiting.discard(turn)
+        return self._newest if self._newest is not None and self._newest.n != n else None
+
+    def close(self) -> None:
+        """Let all go who wait."""
+        self._is_closed = True
+        self._wake()
+
+    def _build(self) -> None:
+        self.made += 1
+        plain = json.dumps(self._make(self.made), separators=(",", ":"), allow_nan=False).encode()
+        self._newest = Encoded(self.made, plain, gzip.compress(plain, 5, mtime=0))
+        self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
+        self._has_news = False
+        self._wake()
+
+    def _wake(self) -> None:
+        waiting, self._waiting = self._waiting, set()
+        for turn in waiting:
+            if not turn.done():
+                turn.set_result(None)

@@ -1,0 +1,249 @@
+"""Gateway: its life, from the ports' opening to the last batch."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import uvicorn
+
+import multidrop
+from multidrop import Batch, Bus, Ledger, Plant, Poller
+from multidrop.gateway.commands import Commands
+from multidrop.gateway.events import Events
+from multidrop.gateway.frames import Frames, frame_of
+from multidrop.gateway.hub import Hub
+from multidrop.gateway.lately import Lately
+from multidrop.gateway.listener import listen
+from multidrop.gateway.parts import PARTS, Feed, Inside, build
+from multidrop.gateway.rights import OwnNames, Tokens
+from multidrop.gateway.sd_notify import Notifier
+from multidrop.gateway.settings import ServeSettings
+from multidrop.gateway.side_reads import SideReads
+from multidrop.gateway.web import make_app
+
+TAKE_S = 0.05  # between looks for new rows
+TICK_S = 1.0  # between readings of the statistics
+LOG_S = 60.0  # between log lines of a part that goes on failing
+END_S = 3.0  # for which requests under way are waited for at the end
+MOST_ASKED = 16  # requests past a register table at the same time
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Gateway:
+    """A plant that is polled, and all ways in to it.
+
+    Raises ValueError, LineError or OSError when something of it cannot be opened; then nothing is left open.
+    """
+
+    clock = staticmethod(time.monotonic)
+
+    def __init__(self, plant: Plant, settings: ServeSettings, *, ledger: Ledger | None = None) -> None:
+        self.plant = plant
+        self.settings = settings
+        self.version = multidrop.__version__
+        self.revision = 1
+        self.failures: dict[str, int] = {}
+        self.dead: dict[str, str] = {}  # parts, and why they do not live any more
+        self.feeds: dict[str, Feed] = {}
+        self.guard_clock: Callable[[], float] = self.clock
+        self._logged: dict[str, float] = {}
+        self.begun = self.clock()
+        self._ticked = self.clock()
+        self.ledger = ledger or Ledger()
+        self.poller: Poller | None = None
+        self._end = asyncio.Event()
+        self._threads = ThreadPoolExecutor(MOST_ASKED, "multidrop ask")
+        self.listener = listen(settings.host, settings.port)
+        self.port: int = self.listener.getsockname()[1]
+        self.own_names = OwnNames(settings.names, settings.host, self.port)
+        self.tokens = Tokens(settings.tokens)
+        self.hub = Hub(plant)
+        self.events = Events()
+        self.lately = Lately(plant)
+        self.frames = Frames(self._frame, self.clock)
+        self.commands = Commands(self, settings.may)
+        self.side_reads = SideReads(self.bus, self.clock, _utc_ms)
+
+    # ---- life ----
+
+    async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
+        """Poll and serve until `end` is called."""
+        notifier = Notifier()
+        tasks: list[asyncio.Task[None]] = []
+        server = _Server(self._server_config())
+        try:
+            self._build_parts()
+            self.poller = Poller(self.plant, ledger=self.ledger, audit=self.settings.audit)
+            with self.poller:
+                tasks = [
+                    asyncio.create_task(work, name=name)
+                    for name, work in (
+                        ("take", self._take_all()),
+                        ("tick", self._tick(notifier)),
+                        *((name, self._live(name, feed.run)) for name, feed in self.feeds.items()),
+                    )
+                ]
+                serving = asyncio.create_task(server.serve([self.listener]))
+                while not server.started and not serving.done():
+                    await asyncio.sleep(0.005)
+                if not serving.done():
+                    on_ready()
+                    notifier.tell("READY=1", f"STATUS=polling {len(self.plant.lines)} lines")
+                end = asyncio.create_task(self._end.wait())
+                await asyncio.wait({end, serving, *tasks[:2]}, return_when=asyncio.FIRST_COMPLETED)
+                end.cancel()
+                notifier.tell("STOPPING=1")
+                self.frames.close()
+                server.should_exit = True
+                await serving
+                for task in tasks[:2]:
+                    if task.done():
+                        task.result()
+                await self.side_reads.close()
+                await asyncio.to_thread(self.poller.close)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            if self.poller is not None:
+                self._hand_out(self.poller)  # what came while it closed
+            await self._close_parts()
+            self.listener.close()
+            self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def end(self) -> None:
+        """Let `run` come to its end. To be called in the loop."""
+        self._end.set()
+
+    def _server_config(self) -> uvicorn.Config:
+        context = self.settings.tls
+        return uvicorn.Config(
+            make_app(self),
+            http="h11",
+            ws="none",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            timeout_keep_alive=30,
+            timeout_graceful_shutdown=int(END_S),
+            ssl_context_factory=None if context is None else lambda config, default: context,
+        )
+
+    def _build_parts(self) -> None:
+        inside = Inside(self.plant, self.hub, self.commands, self.ask, self.settings.folder, self.version)
+        for name, settings in self.settings.parts.items():
+            try:
+                self.feeds[name] = build(PARTS[name], settings, inside)
+            except (ValueError, OSError) as failure:
+                raise ValueError(f"[serve.{name}]: {failure}") from failure
+
+    async def _close_parts(self) -> None:
+        for name, feed in self.feeds.items():
+            try:
+                await asyncio.wait_for(feed.close(), END_S)
+            except Exception:  # the others are closed all the same
+                _log.exception("%s did not end in good order", name)
+
+    # ---- rows ----
+
+    async def _take_all(self) -> None:
+        while True:
+            if self.poller is not None:
+                self._hand_out(self.poller)
+            await asyncio.sleep(TAKE_S)
+
+    def _hand_out(self, poller: Poller) -> None:
+        """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
+        is_new = False
+        while batch := poller.take():
+            is_new = True
+            self._guarded("hub", self.hub.take, batch)
+            for name, feed in self.feeds.items():
+                self._guarded(name, feed.take, batch)
+        if is_new:
+            self._guarded("events", self._look_for_events)
+            self._guarded("frames", self.frames.note_news)
+
+    def _look_for_events(self) -> None:
+        for name in self.hub.drives:
+            self.events.look(self.hub.time // 1_000_000, name, self.hub.seen(name))
+
+    def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
+        try:
+            work(*arguments)
+        except Exception:  # whatever it is, polling and stops go on
+            self._note_failure(name)
+
+    def _note_failure(self, name: str) -> None:
+        self.failures[name] = self.failures.get(name, 0) + 1
+        if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
+            self._logged[name] = self.clock()
+            _log.exception("%s failed, %d times so far; the others go on", name, self.failures[name])
+
+    async def _live(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await run()
+        except Exception as failure:  # it dies alone
+            self.dead[name] = f"{type(failure).__name__}: {failure}"
+            self._note_failure(name)
+
+    async def _tick(self, notifier: Notifier) -> None:
+        every = min(TICK_S, (notifier.watchdog_s or 4 * TICK_S) / 4)
+        while True:
+            if self.poller is not None:
+                self._guarded("statistics", self._read_statistics)
+            self._ticked = self.clock()
+            if notifier.watchdog_s:
+                notifier.tell("WATCHDOG=1")
+            await asyncio.sleep(every)
+
+    def _read_statistics(self) -> None:
+        assert self.poller is not None
+        self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
+
+    # ---- for commands, parts and pages ----
+
+    def bus(self, line: str) -> Bus:
+        """Return a line's bus. Raises ValueError for an unknown line, or before polling has begun."""
+        if self.poller is None:
+            raise ValueError("polling has not begun yet")
+        return self.poller.bus(line)
+
+    async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
+        """Return words, or bits, that a drive has at any addresses; see `Bus.ask`."""
+        line, known = self.plant.find_drive(drive)
+        bus = self.bus(line.name)
+        loop = asyncio.get_running_loop()
+        data = await loop.run_in_executor(
+            self._threads, lambda: bus.ask(known, function, start, count, expiry=expiry_s)
+        )
+        if function in (1, 2):
+            return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
+        return list(struct.unpack(f">{count}H", data))
+
+    def _frame(self, n: int) -> dict[str, Any]:
+        return frame_of(
+            self.hub, self.events, self.lately, n=n, revision=self.revision, time_ns=time.time_ns()
+        )
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves signals to the gateway."""
+
+    @contextmanager
+    def capture_signals(self) -> Any:
+        yield
+
+
+def _utc_ms() -> int:
+    return time.time_ns() // 1_000_000

@@ -1,0 +1,187 @@
+"""Guard: what a request must be before any route sees it: whose page it comes from, and who sends it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, NamedTuple
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from multidrop.gateway.rights import Caller, May, OwnNames, Right, Token, Tokens, is_loopback
+
+COOKIE = "multidrop"
+CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
+HEADERS = {
+    "content-security-policy": CSP,
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+}
+ANYONE = "anyone"
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Needed(NamedTuple):
+    """The method of a path, and the right that it needs; None: nobody has to be known."""
+
+    method: str
+    right: Right | None
+
+
+class Denied(Exception):
+    """A request that is not served: its status, and a sentence."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class Guard:
+    """Lets a request through to `app` with its caller in the scope's `caller`, or answers it."""
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        needed: Mapping[str, Needed],
+        names: OwnNames,
+        tokens: Tokens,
+        may: May,
+        behind_proxy: bool,
+        clock: Callable[[], float],
+    ) -> None:
+        self._app = app
+        self._needed = needed
+        self._names = names
+        self._tokens = tokens
+        self._may = may
+        self._behind_proxy = behind_proxy
+        self._clock = clock
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return  # uvicorn refuses a connection that nobody accepts
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers[name] = value
+                headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        try:
+            scope["caller"] = self._check(scope)
+        except Denied as denied:
+            response = JSONResponse({"error": str(denied)}, denied.status)
+            if denied.status == 401:
+                response.headers["www-authenticate"] = "Bearer"
+            await response(scope, receive, send_with_headers)
+            return
+        await self._app(scope, receive, send_with_headers)
+
+    def _check(self, scope: Scope) -> Caller:
+        headers = Headers(scope=scope)
+        hosts = headers.getlist("host")
+        if len(hosts) != 1 or not self._names.has_host(hosts[0]):
+            name = hosts[0] if hosts else ""
+            raise Denied(421, f"{name[:100]!r} is not this gateway; add it to names of [serve] if it is")
+        path: str = scope["path"]
+        needed = self._find(path)
+        if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
+            raise Denied(405, f"{path[:100]!r} takes {needed.method} alone")
+        self._check_site(headers, hosts[0], needed)
+        if needed.right is None:
+            return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
+        return self._admit(scope, headers, needed.right)
+
+    def _find(self, path: str) -> Needed:
+        """Return what the longest prefix that is listed needs."""
+        while path not in self._needed:
+            head, slash, _ = path.rstrip("/").rpartition("/")
+            if not slash:
+                return self._needed["/"]
+            path = f"{head}/"
+        return self._needed[path]
+
+    def _check_site(self, headers: Headers, host: str, needed: Needed) -> None:
+        """Refuse what another site's page sends: a browser says so, and nothing else has to."""
+        origin = headers.get("origin")
+        if origin is not None and not self._names.has_origin(origin, host):
+            raise Denied(403, f"a page of {origin[:100]!r} asks, which is not this gateway's")
+        site = headers.get("sec-fetch-site", "none")
+        is_page = needed == Needed("GET", None) and headers.get("sec-fetch-mode") == "navigate"
+        if site not in ("none", "same-origin") and not is_page:
+            raise Denied(403, "a page of another site asks")
+        if needed.method == "POST":
+            kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+            if kind != "application/json":
+                raise Denied(415, "the body must be application/json")
+
+    def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
+        """Return the caller of a request that needs this right.
+
+        A wrong token gives what no token gives. After some wrong ones no more are looked at for a while, but
+        for a stop, which nothing may hold back.
+        """
+        address = self.address(scope, headers)
+        local = is_loopback(address) and not self._behind_proxy
+        free = self._may.without_token(is_loopback=local)
+        secret, way = _secret(headers)
+        token: Token | None = None
+        is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
+        if secret and not is_shut:
+            token = self._tokens.find(secret)
+            if token is None:
+                self._tokens.note_wrong(address, self._clock())
+                _log.warning("wrong token from %s", address)
+        if token is not None and (free is None or token.right >= free):
+            caller = Caller(token.name, way, address, token.right)
+        elif free is not None:
+            caller = Caller(ANYONE, way, address, free)
+        elif secret and is_shut:
+            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
+        else:
+            raise Denied(401, "the token is wrong" if secret else "a token is needed")
+        if caller.role >= needed:
+            return caller
+        if secret and is_shut:
+            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
+        if token is None:
+            raise Denied(
+                401, "the token is wrong" if secret else f"this needs a token to {needed.name.lower()}"
+            )
+        raise Denied(
+            403, f"{caller.name} may {caller.role.name.lower()}, and this needs {needed.name.lower()}"
+        )
+
+    def address(self, scope: Scope, headers: Headers) -> str:
+        """Return the client's address; behind a proxy the one that it added last."""
+        client: Any = scope.get("client")
+        peer = str(client[0]) if client else ""
+        if not self._behind_proxy:
+            return peer
+        told = headers.get("x-forwarded-for", "").rpartition(",")[2].strip()
+        return told[:64] or peer
+
+
+def _secret(headers: Headers) -> tuple[str, str]:
+    """Return the token that was sent, and the way: of a program or of the page."""
+    scheme, _, secret = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return secret.strip(), "http"
+    cookies: SimpleCookie = SimpleCookie()
+    try:
+        cookies.load(headers.get("cookie", ""))
+    except CookieError:
+        return "", "page"
+    found = cookies.get(COOKIE)
+    is_page = found is not None or "origin" in headers or "sec-fetch-site" in headers
+    return (found.value if found is not None else ""), "page" if is_page else "http"

@@ -1,0 +1,245 @@
+"""Hub: the newest row of every register of every drive, and what they say of the drive's state.
+
+Pure: rows come in, and their times are the only time there is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
+
+RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
+
+NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present
+
+STALE_NS = 1_000_000_000  # a value is never stale before that,
+STALE_PERIODS = 3  # nor before so many of its periods have passed
+
+_STATES = {
+    Condition.STOPPED: STANDS,
+    Condition.RUNNING: RUNS,
+    Condition.ACCELERATING: RUNS,
+    Condition.DECELERATING: RUNS,
+    Condition.FAULT: FAULT,
+    Condition.UNKNOWN: UNKNOWN,
+}
+_TURNING = ("output_frequency", "motor_speed")  # other than 0: the motor turns
+_ANSWERED = ("exception ", "no valid value")  # begin the statuses of misses that are replies all the same
+
+
+class Newest(NamedTuple):
+    """The newest row of one register of one drive."""
+
+    time: int  # UTC ns: the request was sent
+    monotonic_ns: int
+    value: float | None  # None: this row is a miss
+    status: str  # "ok", or the reason
+
+
+class Shown(NamedTuple):
+    """A drive's state in one of five words, and its fault, or why it is silent, in more."""
+
+    state: str
+    words: str | None
+
+
+class _Cell:
+    """One register of one drive."""
+
+    __slots__ = ("good", "interval_ns", "least_ns", "newest")
+
+    def __init__(self, least_ns: int) -> None:
+        self.newest: tuple[int, int, float, int] | None = None  # time, monotonic, value, code of status
+        self.good: tuple[int, int, float, int] | None = None
+        self.least_ns = least_ns  # of its intervals, as planned
+        self.interval_ns = 0  # between its latest two samples, with no miss between them
+
+    @property
+    def stale_ns(self) -> int:
+        """The age from which its value is no longer the present one."""
+        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
+
+
+class _Watched:
+    """One drive of the plant."""
+
+    def __init__(self, polled: PolledDrive, cycle_ns: int) -> None:
+        self.polled = polled
+        self.cycle_ns = cycle_ns  # of its line, as planned
+        self.reader = StateReader(polled.drive)
+        self.cells: dict[str, _Cell] = {}
+        self.seen: tuple[int, Shown] | None = None  # at which batch
+
+    def cell(self, register: str) -> _Cell:
+        """Return the cell of a register, which is new where it was not known."""
+        if register not in self.cells:
+            every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
+            least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
+            self.cells[register] = _Cell(least_ns)
+        return self.cells[register]
+
+
+class Hub:
+    """The newest rows of a plant; `take` is given every batch."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        self.now_ns = 0  # of the monotonic clock: the newest row's
+        self.time = 0  # the same row's, UTC in ns
+        self.taken = 0  # batches
+        self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
+        self._statuses: tuple[str, ...] = ("ok",)
+        self._watched: dict[str, _Watched] = {}
+        self.adopt(plant)
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant; what is known of drives that stay as they are is kept."""
+        before = self._watched
+        self.plant = plant
+        self._cells = {}
+        self._watched = {}
+        planned = plant.metadata()["planned"]
+        for line in plant.lines:
+            cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
+            for polled in line.drives:
+                known = before.get(polled.drive.name)
+                stays = known is not None and known.polled == polled
+                self._watched[polled.drive.name] = (
+                    known if known is not None and stays else _Watched(polled, cycle_ns)
+                )
+
+    def take(self, batch: Batch) -> None:
+        """Note the newest rows of a batch: about 1 us for each."""
+        columns = batch.columns()
+        cells = self._cells
+        self._statuses = columns.statuses
+        rows = zip(
+            columns.time,
+            columns.monotonic_ns,
+            columns.drive,
+            columns.register,
+            columns.value,
+            columns.status,
+            strict=True,
+        )
+        for time, monotonic_ns, drive, register, value, status in rows:
+            key = drive << 16 | register
+            cell = cells.get(key)
+            if cell is None:
+                if key in cells:
+                    continue
+                cell = cells[key] = self._cell(columns.drives[drive], columns.registers[register])
+                if cell is None:
+                    continue
+            row = (time, monotonic_ns, value, status)
+            if status == 0:
+                if cell.good is not None and cell.newest is cell.good:
+                    cell.interval_ns = monotonic_ns - cell.good[1]
+                cell.good = row
+            cell.newest = row
+            if monotonic_ns > self.now_ns:
+                self.now_ns, self.time = monotonic_ns, time
+        self.taken += 1
+
+    def _cell(self, drive: str, register: str) -> _Cell | None:
+        watched = self._watched.get(drive)
+        return watched.cell(register) if watched else None
+
+    # ---- values ----
+
+    def newest(self, drive: str, register: str) -> Newest | None:
+        """Return the newest row, which may be a miss; None when it was never asked."""
+        cell = self._known(drive, register)
+        return self._row(cell.newest) if cell and cell.newest else None
+
+    def last_good(self, drive: str, register: str) -> Newest | None:
+        """Return the newest row with a value, however old it is; None when there never was one."""
+        cell = self._known(drive, register)
+        return self._row(cell.good) if cell and cell.good else None
+
+    def is_fresh(self, drive: str, register: str) -> bool:
+        """Return True while the newest row has a value, and none is overdue."""
+        cell = self._known(drive, register)
+        return cell is not None and self._fresh(cell) and cell.newest is cell.good
+
+    def polled(self, drive: str) -> tuple[Register[Any], ...]:
+        """Return the registers of a drive that are polled, in the plant file's order."""
+        watched = self._watched.get(drive)
+        return tuple(poll.register for poll in watched.polled.polls) if watched else ()
+
+    @property
+    def drives(self) -> Iterator[str]:
+        """The names of all drives, in the plant file's order."""
+        return iter(self._watched)
+
+    def seen_at(self, drive: str) -> int | None:
+        """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
+        watched = self._watched.get(drive)
+        cells = watched.cells.values() if watched else ()
+        return max((cell.good[0] for cell in cells if cell.good), default=None)
+
+    def _known(self, drive: str, register: str) -> _Cell | None:
+        watched = self._watched.get(drive)
+        return watched.cells.get(register) if watched else None
+
+    def _row(self, row: tuple[int, int, float, int]) -> Newest:
+        time, monotonic_ns, value, status = row
+        return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
+
+    def _fresh(self, cell: _Cell) -> bool:
+        return cell.good is not None and self.now_ns - cell.good[1] <= cell.stale_ns
+
+    # ---- what they say of the drive ----
+
+    def state(self, drive: str) -> str:
+        """Return "runs", "stands", "fault", "silent" or "unknown"."""
+        return self.seen(drive).state
+
+    def fault(self, drive: str) -> str | None:
+        """Return the fault that the drive shows, in its own words; None where it shows none."""
+        seen = self.seen(drive)
+        return seen.words if seen.state == FAULT else None
+
+    def seen(self, drive: str) -> Shown:
+        """Return a drive's state, with its fault or the reason why it is silent."""
+        watched = self._watched.get(drive)
+        if watched is None:
+            return Shown(UNKNOWN, None)
+        if watched.seen is None or watched.seen[0] != self.taken:
+            watched.seen = (self.taken, self._look(watched))
+        return watched.seen[1]
+
+    def _look(self, watched: _Watched) -> Shown:
+        cells = watched.cells
+        polls = watched.polled.polls
+        newest = [cells[poll.register.name].newest for poll in polls if poll.register.name in cells]
+        misses = [row for row in newest if row is not None and row[3] != 0]
+        fresh = {name: cell.good[2] for name, cell in cells.items() if cell.good and self._fresh(cell)}
+        if not fresh:
+            return self._unseen(misses, is_all=bool(polls) and len(misses) == len(polls))
+        found = watched.reader.state(fresh)
+        if found is not None and found.condition is not Condition.UNKNOWN:
+            fault = found.fault or "it shows a fault"
+            return Shown(_STATES[found.condition], fault if found.condition is Condition.FAULT else None)
+        if not watched.reader.has_state and fresh.get("fault"):
+            register = watched.polled.drive.registers["fault"]
+            return Shown(FAULT, _words(register, fresh["fault"]))
+        is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
+        return Shown(RUNS if is_turning else UNKNOWN, None)
+
+    def _unseen(self, misses: list[tuple[int, int, float, int]], *, is_all: bool) -> Shown:
+        """Tell a silent drive from one that refuses, and from one that was not asked lately."""
+        if not is_all:
+            return Shown(UNKNOWN, NOT_ASKED)
+        reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
+        if any(reason.startswith(_ANSWERED) for reason in reasons):
+            return Shown(UNKNOWN, None)
+        asked = next((reason for reason in reasons if not reason.startswith("not ")), reasons[0])
+        return Shown(SILENT, asked)
+
+
+def _words(register: Register[Any], value: float) -> str:
+    """Return a value's name, or the number that it is."""
+    return register.format(value if register.values is None else register.decode(value))

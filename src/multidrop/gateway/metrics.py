@@ -1,0 +1,137 @@
+"""Metrics: the plant as OpenMetrics text. Pure.
+
+A drive that is silent has no values: its series vanish, and nobody takes an old value for the present one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from math import isfinite
+from typing import NamedTuple
+
+from multidrop import LineStatistics
+from multidrop.gateway.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
+
+CONTENT_TYPE = "application/openmetrics-text; version=1.0.0; charset=utf-8"
+STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
+
+Labels = Mapping[str, str]
+Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
+
+
+class Figures(NamedTuple):
+    """What the gateway knows of itself."""
+
+    version: str
+    viewers: int
+    frames: int
+    dropped: int  # rows
+    failures: Mapping[str, int]  # of parts, by name
+    parts: Mapping[str, Mapping[str, float]]  # figures of each, by name
+
+
+def metrics_of(hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures) -> str:
+    """Return the exposition, with its end mark."""
+    families = (
+        _family("multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]),
+        _family(
+            "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
+        ),
+        _family("multidrop_drive_state", "stateset", "State of each drive.", _states(hub)),
+        *_line_families(statistics),
+        *_drive_families(statistics),
+        _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped),
+        _count("multidrop_frames", "Frames made for viewers.", figures.frames),
+        _family("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)]),
+        _family(
+            "multidrop_part_failures",
+            "counter",
+            "Failures of each part.",
+            [("_total", {"part": name}, n) for name, n in figures.failures.items()],
+        ),
+        *_part_families(figures.parts),
+    )
+    return "".join(line for family in families for line in family) + "# EOF\n"
+
+
+def _values(hub: Hub) -> Iterator[Sample]:
+    for line in hub.plant.lines:
+        for polled in line.drives:
+            name = polled.drive.name
+            for register in hub.polled(name):
+                row = hub.newest(name, register.name)
+                if row is None or row.value is None or not hub.is_fresh(name, register.name):
+                    continue
+                labels = {"line": line.name, "drive": name, "register": register.name, "unit": register.unit}
+                yield "", labels, row.value
+
+
+def _states(hub: Hub) -> Iterator[Sample]:
+    for line in hub.plant.lines:
+        for polled in line.drives:
+            present = hub.state(polled.drive.name)
+            for state in STATES:
+                labels = {"line": line.name, "drive": polled.drive.name, "multidrop_drive_state": state}
+                yield "", labels, float(state == present)
+
+
+def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterable[str]]:
+    counters: dict[str, tuple[str, Callable[[LineStatistics], float]]] = {
+        "multidrop_line_exchanges": ("Requests that left.", lambda line: line.exchanges),
+        "multidrop_line_samples": ("Values that came.", lambda line: line.samples),
+        "multidrop_line_used_seconds": (
+            "Time that answered exchanges had to take of the line.",
+            lambda line: line.utilisation * line.seconds,
+        ),
+    }
+    for name, (text, count) in counters.items():
+        samples = [("_total", {"line": line}, count(found)) for line, found in statistics.items()]
+        yield _family(name, "counter", text, samples)
+
+
+def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterable[str]]:
+    drives = [
+        ({"line": line, "drive": name}, drive)
+        for line, found in statistics.items()
+        for name, drive in found.drives.items()
+    ]
+    misses = [
+        ("_total", {**labels, "reason": reason}, float(n))
+        for labels, drive in drives
+        for reason, n in drive.misses.items()
+    ]
+    yield _family("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
+    delays: list[Sample] = []
+    for labels, drive in drives:
+        found = drive.delays
+        for quantile, value in (("0.5", found.p50), ("0.9", found.p90), ("0.99", found.p99)):
+            delays.append(("", {**labels, "quantile": quantile}, value))
+        delays.append(("_count", labels, float(found.replies)))
+    yield _family(
+        "multidrop_response_delay_seconds", "summary", "From a request's end to its reply's begin.", delays
+    )
+
+
+def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[Iterable[str]]:
+    for part, found in parts.items():
+        for name, value in found.items():
+            base, is_count = name.removesuffix("_total"), name.endswith("_total")
+            kind, suffix = ("counter", "_total") if is_count else ("gauge", "")
+            text = base.replace("_", " ").capitalize() + f" of {part}."
+            yield _family(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
+
+
+def _count(name: str, text: str, value: float) -> Iterable[str]:
+    return _family(name, "counter", text, [("_total", {}, value)])
+
+
+def _family(name: str, kind: str, text: str, samples: Iterable[Sample]) -> Iterator[str]:
+    yield f"# TYPE {name} {kind}\n# HELP {name} {text}\n"
+    for suffix, labels, value in samples:
+        if isfinite(value):
+            inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
+            yield f"{name}{suffix}{{{inside}}} {value!r}\n" if inside else f"{name}{suffix} {value!r}\n"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

@@ -1,0 +1,31 @@
+"""Notify the service manager, as sd_notify(3) says: ready, alive, and about to end."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import suppress
+
+
+class Notifier:
+    """The manager's socket; without one nothing is told."""
+
+    def __init__(self, address: str | None = None) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """Seconds within which the manager wants to hear; None where it does not."""
+        asked = os.environ.get("WATCHDOG_USEC", "")
+        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
+
+    def tell(self, *lines: str) -> None:
+        """Send lines such as READY=1. What the manager does not take is lost."""
+        if not self._address:
+            return
+        abstract = self._address.startswith("@")
+        address = "\0" + self._address[1:] if abstract else self._address
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+            manager.setblocking(False)
+            manager.sendto("\n".join(lines).encode(), address)

@@ -1,0 +1,272 @@
+"""Settings: the table `[serve]` of a plant file; all mistakes in it are found before anything is done."""
+
+from __future__ import annotations
+
+import re
+import ssl
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from multidrop import Key, Plant, PlantError, TomlPlace
+from multidrop.gateway.commands import VERBS, verbs_of
+from multidrop.gateway.parts import PARTS, Part, settings_class
+from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
+
+LISTEN = "127.0.0.1:8750"
+HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
+EXAMPLES = {  # of a part's values, by their type
+    bool: "true",
+    int: "10",
+    float: "1.5",
+    str: '"text"',
+    dict: "{ name = value }",
+    list: '["one", "two"]',
+    tuple: '["one", "two"]',
+}
+
+_SERVE = {
+    "listen": Key(str, f'listen = "{LISTEN}"'),
+    "names": Key(list, 'names = ["plant.example"]'),
+    "certificate": Key(str, 'certificate = "cert.pem"'),
+    "key": Key(str, 'key = "key.pem"'),
+    "behind_proxy": Key(bool, "behind_proxy = true"),
+    "tokens": Key(str, 'tokens = "tokens"'),
+    "audit": Key(str, 'audit = "audit.jsonl"'),
+    "may": Key(dict, "[serve.may], a table"),
+} | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
+
+_MAY = {
+    "look": Key(str, 'look = "anyone"'),
+    "stop": Key(str, 'stop = "token"'),
+    "write": Key(list, 'write = ["pump-1.frequency_setpoint"], or leave it out'),
+    "verbs": Key(list, 'verbs = ["pump-1.start"], or leave it out'),
+}
+
+
+@dataclass(frozen=True)
+class ServeSettings:
+    """All that `[serve]` says, checked."""
+
+    host: str = "127.0.0.1"
+    port: int = 8750
+    names: tuple[str, ...] = ()
+    tls: ssl.SSLContext | None = None
+    behind_proxy: bool = False
+    tokens: tuple[Token, ...] = ()
+    may: May = May()  # noqa: RUF009 (it cannot change)
+    audit: Path | None = None
+    folder: Path = Path()
+    parts: Mapping[str, Any] = field(default_factory=dict)
+    is_demo: bool = False
+
+
+class Folders:
+    """Where files are looked for: credentials of the service manager, and then beside the plant file.
+
+    What is written goes to the service's state folder, or else beside the plant file.
+    """
+
+    def __init__(self, plant: Path, environment: Mapping[str, str]) -> None:
+        self._beside = plant.resolve().parent
+        credentials = environment.get("CREDENTIALS_DIRECTORY")
+        state = environment.get("STATE_DIRECTORY", "").partition(":")[0]
+        self._credentials = Path(credentials) if credentials else None
+        self.state = Path(state) if state else self._beside
+
+    def find(self, name: str) -> Path:
+        """Return the path of a file to be read, whether or not it is there."""
+        if self._credentials and not Path(name).is_absolute() and (self._credentials / name).exists():
+            return self._credentials / name
+        return self._beside / name
+
+
+def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings:
+    """Return what `[serve]` of a plant says. Raises PlantError with all mistakes in it."""
+    place = TomlPlace(plant.path, ("[serve]",))
+    folders = Folders(plant.path, environment)
+    given = place.check(dict(plant.serve), _SERVE)
+    host, port = place.attempt(_address, given.get("listen", LISTEN)) or ("127.0.0.1", 0)
+    names = tuple(filter(None, (place.attempt(_name, name) for name in given.get("names", ()))))
+    tls = _tls(given, folders, place)
+    tokens = _tokens(given, folders, place)
+    may = _may(given.get("may", {}), plant, place.of_file(plant.path, "[serve.may]"))
+    behind_proxy = given.get("behind_proxy", False)
+    if may.look == "token" and not tokens and "tokens" not in given:
+        place.wrong('look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"')
+    is_safe = behind_proxy or (tokens and tls)
+    if not is_loopback(host) and not is_safe and "listen" in given and not _has_begun(given):
+        place.wrong(
+            f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '
+            "key, or behind_proxy = true; or listen on 127.0.0.1"
+        )
+    audit = folders.state / given.get("audit", "audit.jsonl")
+    place.attempt(_check_writable, audit)
+    parts = {
+        name: _part(PARTS[name], given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
+        for name in PARTS
+        if name in given
+    }
+    if place.config_errors:
+        raise PlantError(tuple(place.config_errors))
+    return ServeSettings(
+        host, port, names, tls, behind_proxy, tuple(tokens), may, audit, folders.state, parts
+    )
+
+
+def _has_begun(given: Mapping[str, Any]) -> bool:
+    """Return True where all that a listener needs is there, though with mistakes told already."""
+    return {"tokens", "certificate", "key"} <= given.keys()
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not colon or not host or not re.fullmatch(r"\d{1,5}", port) or int(port) > 65535:
+        raise ValueError(f'listen = "{text}" is no address and port; write listen = "{LISTEN}"')
+    return host, int(port)
+
+
+def _name(name: object) -> str:
+    if not isinstance(name, str) or not HOST.fullmatch(name):
+        raise ValueError(f'names: {name!r} is no host name; write names = ["plant.example"], without a port')
+    return name
+
+
+def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SSLContext | None:
+    paths = {key: folders.find(given[key]) for key in ("certificate", "key") if key in given}
+    if len(paths) == 1:
+        place.wrong(f"{next(iter(paths))} needs the other one of certificate and key too")
+    for key, path in paths.items():
+        place.attempt(_check_readable, f"{key} {path}", path)
+    if len(paths) < 2 or not all(map(_can_be_read, paths.values())):
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(paths["certificate"], paths["key"], password="")
+    except (ssl.SSLError, ValueError) as failure:
+        mismatch = getattr(failure, "reason", "") == "KEY_VALUES_MISMATCH"
+        why = "do not belong together" if mismatch else "are no certificate and key in PEM, without password"
+        place.wrong(f"certificate {paths['certificate']} and key {paths['key']} {why}")
+        return None
+    return context
+
+
+def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> list[Token]:
+    if "tokens" not in given:
+        return []
+    path = folders.find(given["tokens"])
+    if place.attempt(_check_readable, f"tokens {path}", path) is None:
+        return []
+    try:
+        found, wrong = read_tokens(path.read_text("utf-8"))
+    except UnicodeDecodeError:
+        found, wrong = [], ["it is no text"]
+    for sentence in wrong:
+        place.wrong(f"tokens {path}: {sentence}")
+    if not found and not wrong:
+        place.wrong(f"tokens {path} has none; `multidrop serve --new-token stop --for anna` makes one")
+    return found
+
+
+def _may(table: Any, plant: Plant, place: TomlPlace) -> May:
+    given = place.check(table, _MAY)
+    for key in ("look", "stop"):
+        if given.get(key, "anyone") not in ("anyone", "token"):
+            place.wrong(f'{key} = "{given[key]}" is neither "anyone" nor "token"')
+    listed = {
+        key: frozenset(
+            entry for entry in given.get(key, ()) if place.attempt(_check_listed, key, entry, plant)
+        )
+        for key in ("write", "verbs")
+    }
+    on_loopback = Right.STOP if given.get("stop") == "anyone" else Right.LOOK
+    return May(given.get("look", "anyone"), on_loopback, listed["write"], listed["verbs"])
+
+
+def _check_listed(key: str, entry: object, plant: Plant) -> bool:
+    """Check that an entry is a register that can be written, or a verb that its drive has."""
+    example = "pump-1.frequency_setpoint" if key == "write" else "pump-1.start"
+    name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
+    if not dot:
+        raise ValueError(
+            f'{key}: {entry!r} is not drive.{"register" if key == "write" else "verb"}, as "{example}" is'
+        )
+    try:
+        _, drive = plant.find_drive(name)
+    except ValueError as unknown:
+        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
+    if key == "write":
+        register = drive.register(rest)
+        if not register.writable:
+            why = register.never or "it can only be read"
+            raise ValueError(f"{key}: {entry} is never written: {why}")
+    elif rest not in verbs_of(drive):
+        known = ", ".join(verb for verb in verbs_of(drive) if VERBS[verb].is_listed) or "none"
+        raise ValueError(f"{key}: {name} has no verb {rest!r}; it has {known}")
+    return True
+
+
+def _part(part: Part, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
+    """Return a part's settings: its keys, and the types of their defaults."""
+    made = place.attempt(settings_class, part)
+    if made is None:
+        return None
+    defaults = {one.name: _default(one) for one in fields(made) if one.init}
+    keys = {name: _key_of(name, default) for name, default in defaults.items()}
+    before = len(place.config_errors)
+    given = place.check(dict(table), keys)
+    try:
+        found = made(**given)
+    except (ValueError, TypeError) as mistakes:
+        for sentence in str(mistakes).splitlines():
+            place.wrong(sentence)
+        return None
+    if len(place.config_errors) == before and hasattr(found, "check"):
+        for sentence in found.check(plant):
+            place.wrong(sentence)
+    return found
+
+
+def _default(one: Field[Any]) -> Any:
+    return one.default_factory() if one.default_factory is not MISSING else one.default
+
+
+def _key_of(name: str, default: object) -> Key:
+    if default is None:
+        return Key((str, int, float, dict, list), f"{name} = …")
+    kind = list if isinstance(default, tuple) else type(default)
+    return Key((int, float) if kind is float else kind, f"{name} = {EXAMPLES[kind]}")
+
+
+# ---- files ----
+
+
+def _can_be_read(path: Path) -> bool:
+    try:
+        with path.open("rb"):
+            return True
+    except OSError:
+        return False
+
+
+def _check_readable(what: str, path: Path) -> bool:
+    try:
+        with path.open("rb"):
+            return True
+    except OSError as failure:
+        raise ValueError(f"{what} cannot be read: {failure.strerror}") from failure
+
+
+def _check_writable(path: Path) -> bool:
+    is_new = not path.exists()
+    try:
+        with path.open("ab"):
+            pass
+    except OSError as failure:
+        raise ValueError(f"audit {path} cannot be written: {failure.strerror}") from failure
+    if is_new:
+        path.unlink(missing_ok=True)
+    return True

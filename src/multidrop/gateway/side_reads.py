@@ -1,0 +1,68 @@
+"""Side reads: registers of one drive that are not polled, read one by one while somebody looks at them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from multidrop import Bus, BusError, Drive, Plant
+
+PAUSE_S = 0.2  # between two reads: the polling keeps nearly all of the line
+LOOKED_S = 3.0  # after the last look nothing more is read
+MOST_DRIVES = 4  # that are looked at, at the same time
+
+Found = dict[str, list[Any]]  # by register: value or null, UTC in ms, "ok" or the reason
+
+
+class SideReads:
+    """Reads of the drives that are looked at; each drive has one read under way at most."""
+
+    def __init__(
+        self, bus: Callable[[str], Bus], clock: Callable[[], float], utc_ms: Callable[[], int]
+    ) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._utc_ms = utc_ms
+        self._looked: dict[str, float] = {}
+        self._found: dict[str, Found] = {}
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+
+    def look(self, plant: Plant, name: str) -> Found:
+        """Return what was read of a drive so far, and read on. Raises ValueError for an unknown drive."""
+        line, drive = plant.find_drive(name)
+        self._looked[name] = self._clock()
+        found = self._found.setdefault(name, {})
+        if name not in self._tasks and len(self._tasks) < MOST_DRIVES:
+            polled = next(one for one in line.drives if one.drive is drive)
+            others = set(drive.registers) - {poll.register.name for poll in polled.polls}
+            names = [one for one in drive.registers if one in others and drive.registers[one].readable]
+            self._tasks[name] = asyncio.create_task(self._read(line.name, drive, names))
+        return found
+
+    async def close(self) -> None:
+        """Read no more."""
+        for task in self._tasks.values():
+            task.cancel()
+        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+
+    async def _read(self, line: str, drive: Drive, registers: list[str]) -> None:
+        try:
+            while registers:
+                for register in registers:
+                    if self._clock() - self._looked[drive.name] > LOOKED_S:
+                        return
+                    self._found[drive.name][register] = await asyncio.to_thread(
+                        self._read_one, line, drive, register
+                    )
+                    await asyncio.sleep(PAUSE_S)
+        finally:
+            del self._tasks[drive.name]
+            self._found.pop(drive.name, None)  # nobody is shown what nobody keeps up to date
+
+    def _read_one(self, line: str, drive: Drive, register: str) -> list[Any]:
+        try:
+            value = self._bus(line).read(drive, drive.registers[register])
+        except (BusError, ValueError) as failure:
+            return [None, self._utc_ms(), str(failure)]
+        return [float(value), self._utc_ms(), "ok"]

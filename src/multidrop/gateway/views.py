@@ -1,0 +1,114 @@
+"""Views: what pages and probes are told of a gateway, made when they ask."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, Any
+
+from multidrop import Ledger, Statistics
+from multidrop.gateway.frames import lost_of
+from multidrop.gateway.metrics import Figures
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
+
+async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
+    """Return what the page shows of one drive alone. Raises ValueError for an unknown one."""
+    line, drive = gateway.plant.find_drive(name)
+    wear = await asyncio.to_thread(_wear, gateway.ledger, line.port, drive.address)  # it may wait for a lock
+    found = gateway.side_reads.look(gateway.plant, name)
+    statistics = gateway.lately.drive(line.name, name)
+    delays = statistics.delays if statistics else None
+    return {
+        "drive": name,
+        "delays": None
+        if delays is None
+        else {
+            "replies": delays.replies,
+            "p50_ms": round(delays.p50 * 1e3, 3),
+            "p99_ms": round(delays.p99 * 1e3, 3),
+            "longest_ms": round(delays.longest * 1e3, 3),
+        },
+        "misses": {why: n for why, n in statistics.misses.items() if n} if statistics else {},
+        "exchanges": statistics.exchanges if statistics else 0,
+        "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
+        "values": found,
+        "ledger": wear,
+    }
+
+
+def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
+    with contextlib.suppress(OSError):
+        return [
+            {"register": wear.cell.register, "writes": wear.writes, "this_year": wear.this_year}
+            for wear in ledger.at(port).wear(time.time())
+            if wear.cell.address == address
+        ]
+    return []
+
+
+def look_at_lines(gateway: Gateway) -> dict[str, Any]:
+    """Return what the page shows of the lines alone."""
+    return {
+        line.name: gateway.lately.line(line.name)
+        | {
+            "lost": lost_of(gateway.hub, line.name),
+            "hour": gateway.lately.hour(line.name),
+            "drives": {
+                polled.drive.name: _drive_figures(gateway.lately.drive(line.name, polled.drive.name))
+                for polled in line.drives
+            },
+        }
+        for line in gateway.plant.lines
+    }
+
+
+def health_of(gateway: Gateway) -> dict[str, Any]:
+    """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
+    lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
+    parts = {name: gateway.dead.get(name) or _health_of_part(feed) for name, feed in gateway.feeds.items()}
+    is_well = all(said == "ok" for said in (*lost.values(), *parts.values()))
+    return {
+        "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
+        "version": gateway.version,
+        "uptime_s": round(gateway.clock() - gateway.begun, 1),
+        "newest_row": gateway.hub.time // 1_000_000,
+        "lines": lost,
+        "parts": parts,
+        "failures": gateway.failures,
+    }
+
+
+def _health_of_part(feed: object) -> str:
+    try:
+        return str(getattr(feed, "health", str)()) or "ok"
+    except Exception as failure:  # it is not well then
+        return f"{type(failure).__name__}: {failure}"
+
+
+def figures_of(gateway: Gateway) -> Figures:
+    """Return what the metrics say of the gateway itself."""
+    parts = {}
+    for name, feed in gateway.feeds.items():
+        said = getattr(feed, "figures", None)
+        if said is not None:
+            with contextlib.suppress(Exception):  # a part's failure hides its own figures alone
+                parts[name] = dict(said())
+    dropped = gateway.poller.summary()["dropped"] if gateway.poller else 0
+    failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures
+    return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)
+
+
+def _drive_figures(drive: Statistics | None) -> dict[str, Any] | None:
+    if drive is None:
+        return None
+    delays = drive.delays
+    return {
+        "p50_ms": round(delays.p50 * 1e3, 3),
+        "p99_ms": round(delays.p99 * 1e3, 3),
+        "misses": sum(drive.misses.values()),
+        "exchanges": drive.exchanges,
+    }

@@ -1,0 +1,293 @@
+"""Web: the routes, each behind the guard."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from multidrop import Refused
+from multidrop.gateway.audit import newest_records
+from multidrop.gateway.commands import Told
+from multidrop.gateway.describe import describe
+from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
+from multidrop.gateway.metrics import CONTENT_TYPE, metrics_of
+from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, Right
+from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+
+PAGE = Path(__file__).parent / "page"
+MOST_BYTES = 64 * 1024  # of a body
+MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
+COOKIE_S = 30 * 24 * 3600
+KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
+
+NEEDED: Mapping[str, Needed] = {
+    "/": Needed("GET", None),
+    "/page/": Needed("GET", None),
+    "/api/": Needed("GET", Right.LOOK),
+    "/health": Needed("GET", Right.LOOK),
+    "/metrics": Needed("GET", Right.LOOK),
+    "/api/stop": Needed("POST", Right.STOP),
+    "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
+    "/api/write": Needed("POST", Right.WRITE),
+    "/api/token": Needed("POST", None),
+    "/api/forget": Needed("POST", None),
+}
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+def make_app(gateway: Gateway) -> ASGIApp:
+    """Return the whole application."""
+    pages = _Pages(gateway)
+    routes = [
+        Route("/", pages.index),
+        Route("/api/plant", pages.plant),
+        Route("/api/frame", pages.frame),
+        Route("/api/drive/{name:path}", pages.drive),
+        Route("/api/lines", pages.lines),
+        Route("/api/history", pages.history),
+        Route("/api/export", pages.export),
+        Route("/api/audit", pages.audit),
+        Route("/health", pages.health),
+        Route("/metrics", pages.metrics),
+        Route("/api/stop", pages.stop, methods=["POST"]),
+        Route("/api/write", pages.write, methods=["POST"]),
+        Route("/api/act", pages.act, methods=["POST"]),
+        Route("/api/token", pages.token, methods=["POST"]),
+        Route("/api/forget", pages.forget, methods=["POST"]),
+    ]
+    if PAGE.is_dir():
+        routes.append(Mount("/page", StaticFiles(directory=PAGE)))  # type: ignore[arg-type]
+    handlers: Any = {
+        Denied: _denied,
+        404: lambda request, failure: _error(404, "there is nothing here"),
+        500: lambda request, failure: _error(500, "this went wrong in the gateway; its log says why"),
+    }
+    return Guard(
+        Starlette(routes=routes, exception_handlers=handlers),
+        needed=NEEDED,
+        names=gateway.own_names,
+        tokens=gateway.tokens,
+        may=gateway.settings.may,
+        behind_proxy=gateway.settings.behind_proxy,
+        clock=lambda: gateway.guard_clock(),
+    )
+
+
+def _error(status: int, sentence: str) -> Response:
+    return JSONResponse({"error": sentence}, status)
+
+
+async def _denied(request: Request, failure: Exception) -> Response:
+    return _error(getattr(failure, "status", 400), str(failure))
+
+
+def _caller(request: Request) -> Caller:
+    caller: Caller = request.scope["caller"]
+    return caller
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
+    data = bytearray()
+    async for chunk in request.stream():
+        data += chunk
+        if len(data) > MOST_BYTES:
+            raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        raise Denied(400, "the body is not JSON") from None
+    if not isinstance(found, dict):
+        raise Denied(400, "the body is not a JSON object")
+    return found
+
+
+def _text(body: Mapping[str, Any], key: str) -> str:
+    value = body.get(key)
+    if not isinstance(value, str) or not value:
+        raise Denied(400, f"{key} is missing, or is no text")
+    return value
+
+
+def _number(text: str, key: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None
+
+
+def _told(told: Told) -> dict[str, Any]:
+    return {"done": told.is_done, "text": told.text}
+
+
+def _answer(told: Told) -> Response:
+    """Return what became of a command: 403 where a right was missing, else 200 with what happened."""
+    is_denied = isinstance(told.error, Refused) and told.error.rule in RIGHTS_RULES
+    return JSONResponse(_told(told) | ({"error": told.text} if is_denied else {}), 403 if is_denied else 200)
+
+
+class _Pages:
+    """The routes' functions."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._queries = asyncio.Semaphore(MOST_QUERIES)
+
+    async def index(self, request: Request) -> Response:
+        page = PAGE / "index.html"
+        if not page.exists():
+            return _error(404, "this version of multidrop has no page; /api/plant and /metrics are there")
+        return FileResponse(page, headers={"cache-control": "no-cache"})
+
+    # ---- looks ----
+
+    async def plant(self, request: Request) -> Response:
+        gateway = self._gateway
+        described = describe(
+            gateway.plant,
+            gateway.settings.may,
+            _caller(request).role,
+            revision=gateway.revision,
+            version=gateway.version,
+            is_demo=gateway.settings.is_demo,
+        )
+        return JSONResponse(described)
+
+    async def frame(self, request: Request) -> Response:
+        after = _number(request.query_params.get("after", "-1"), "after")
+        try:
+            frame = await self._gateway.frames.after(after)
+        except OverflowError as full:
+            return _error(503, str(full))
+        if frame is None:
+            return Response(status_code=304)
+        headers = {"content-type": "application/json", "vary": "accept-encoding"}
+        if "gzip" in request.headers.get("accept-encoding", ""):
+            return Response(frame.gzipped, headers=headers | {"content-encoding": "gzip"})
+        return Response(frame.plain, headers=headers)
+
+    async def drive(self, request: Request) -> Response:
+        try:
+            return JSONResponse(await look_at(self._gateway, request.path_params["name"]))
+        except ValueError as unknown:
+            return _error(404, str(unknown))
+
+    async def lines(self, request: Request) -> Response:
+        return JSONResponse(look_at_lines(self._gateway))
+
+    async def health(self, request: Request) -> Response:
+        health = health_of(self._gateway)
+        return JSONResponse(health, 503 if health["status"] == "failed" else 200)
+
+    async def metrics(self, request: Request) -> Response:
+        gateway = self._gateway
+        text = metrics_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
+        return PlainTextResponse(text, headers={"content-type": CONTENT_TYPE})
+
+    async def audit(self, request: Request) -> Response:
+        before = request.query_params.get("before", "")
+        async with self._queries:
+            found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before)
+        return JSONResponse(found)
+
+    # ---- history ----
+
+    async def history(self, request: Request) -> Response:
+        part = self._history()
+        query = request.query_params
+        points = _number(query.get("points", "800"), "points")
+        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        try:
+            async with self._queries:
+                return JSONResponse(await part.series(query.getlist("series"), begin, end, points))
+        except ValueError as mistake:
+            return _error(400, str(mistake))
+
+    async def export(self, request: Request) -> Response:
+        part = self._history()
+        query = request.query_params
+        kind = query.get("format", "csv")
+        if kind not in KINDS:
+            return _error(400, f"format = {kind[:20]!r} is neither csv nor parquet")
+        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        try:
+            chunks = part.export(query.getlist("series"), begin, end, kind)
+        except ValueError as mistake:
+            return _error(400, str(mistake))
+        name = {"content-disposition": f'attachment; filename="multidrop.{kind}"'}
+        return StreamingResponse(chunks, media_type=KINDS[kind], headers=name)
+
+    def _history(self) -> Any:
+        part = self._gateway.feeds.get("history")
+        if part is None:
+            raise Denied(404, "no history is kept; add [serve.history] to the plant file")
+        return part
+
+    # ---- commands ----
+
+    async def stop(self, request: Request) -> Response:
+        body = await _body(request)
+        drives = body.get("drives")
+        if drives is not None and not (
+            isinstance(drives, list) and all(isinstance(one, str) for one in drives)
+        ):
+            raise Denied(400, "drives is neither a list of names nor null, which means all")
+        told = await self._gateway.commands.stop(drives, _caller(request))
+        return JSONResponse({name: _told(one) for name, one in told.items()})
+
+    async def write(self, request: Request) -> Response:
+        body = await _body(request)
+        value = body.get("value")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise Denied(400, "value is missing, or is no number")
+        drive, register = _text(body, "drive"), _text(body, "register")
+        return _answer(await self._gateway.commands.write(drive, register, value, _caller(request)))
+
+    async def act(self, request: Request) -> Response:
+        body = await _body(request)
+        options = body.get("options", {})
+        if not isinstance(options, dict):
+            raise Denied(400, "options is no JSON object")
+        drive, verb = _text(body, "drive"), _text(body, "verb")
+        return _answer(await self._gateway.commands.act(drive, verb, options, _caller(request)))
+
+    # ---- tokens ----
+
+    async def token(self, request: Request) -> Response:
+        """Keep a token in a cookie that no script can read."""
+        gateway, caller = self._gateway, _caller(request)
+        secret = _text(await _body(request), "token")
+        if gateway.tokens.is_shut(caller.address, gateway.guard_clock()):
+            raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
+        token = gateway.tokens.find(secret)
+        if token is None:
+            gateway.tokens.note_wrong(caller.address, gateway.guard_clock())
+            _log.warning("wrong token from %s", caller.address)
+            raise Denied(401, "the token is wrong")
+        response = JSONResponse({"name": token.name, "role": token.right.name.lower()})
+        is_secure = gateway.settings.tls is not None or gateway.settings.behind_proxy
+        response.set_cookie(
+            COOKIE, secret, max_age=COOKIE_S, httponly=True, samesite="strict", secure=is_secure
+        )
+        return response
+
+    async def forget(self, request: Request) -> Response:
+        response = JSONResponse({})
+        response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+        return response

@@ -1,0 +1,173 @@
+"""Newest rows and drives' states, from rows of the core; alarms from states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from batches import SECOND, UTC_0, completion
+from completions import add_miss, add_rows
+from gateways import written
+from hypothesis import given
+from hypothesis import strategies as st
+
+from multidrop import load_plant
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
+from multidrop.gateway.events import Events
+from multidrop.gateway.hub import NOT_ASKED, Hub, Newest, Shown
+from multidrop.polling.batch import Batch
+
+REGISTERS = ("status", "output_frequency", "output_current", "fault")
+STATUS, FREQUENCY, CURRENT, FAULT = range(4)
+FORWARD, STANDBY, TRIPPED = 1, 3, 4
+PERIOD = SECOND // 10
+DRIVES = ("pump-1", "pump-2", "pump-9")
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Hub:
+    return Hub(written(tmp_path))
+
+
+def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1") -> Batch:
+    """Rows of a drive: time in periods, register, and its raw count or a status."""
+    columns = Columns(len(found))
+    for at, register, said in found:
+        layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
+        if isinstance(said, Status):
+            assert add_miss(columns, layout, said, at * PERIOD, UTC_0)
+        else:
+            assert add_rows(columns, layout, completion(at * PERIOD, words=(said,)), UTC_0)
+    return Batch(columns, Names(DRIVES), Names(REGISTERS))
+
+
+def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
+    return rows((at, STATUS, status), (at, FREQUENCY, frequency), (at, CURRENT, 0), (at, FAULT, fault))
+
+
+def test_nothing_is_known_before_it_was_asked(hub: Hub) -> None:
+    assert hub.newest("pump-1", "status") is None
+    assert hub.last_good("pump-1", "status") is None
+    assert hub.state("pump-1") == "unknown"
+    assert hub.seen_at("pump-1") is None
+    assert hub.newest("pump-9", "status") is None
+    assert hub.state("pump-9") == "unknown"
+
+
+def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub) -> None:
+    hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
+    sent, missed = 10 * PERIOD, 11 * PERIOD
+    assert hub.last_good("pump-1", "output_frequency") == Newest(UTC_0 + sent, sent, 25.0, "ok")
+    assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
+    assert not hub.is_fresh("pump-1", "output_frequency")
+
+
+@pytest.mark.parametrize(
+    ("status", "frequency", "state"),
+    [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
+)
+def test_a_state_is_what_the_family_makes_of_its_registers(
+    hub: Hub, status: int, frequency: int, state: str
+) -> None:
+    hub.take(all_of(10, status, frequency))
+    assert hub.state("pump-1") == state
+    assert hub.fault("pump-1") is None
+
+
+def test_a_fault_has_the_drives_words(hub: Hub) -> None:
+    hub.take(all_of(10, TRIPPED, fault=4))
+    assert hub.state("pump-1") == "fault"
+    assert hub.fault("pump-1") == "OC1_OVERCURRENT_ACCELERATING"
+    assert hub.state("pump-2") == "unknown"
+
+
+def test_one_lost_reply_is_no_silence_and_many_are(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    for at in range(11, 20):
+        hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
+        assert hub.state("pump-1") == "runs", at
+    hub.take(rows(*((21, register, Status.NO_REPLY) for register in range(4))))
+    hub.take(rows(*((22, register, Status.NOT_ASKED) for register in range(4))))
+    assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
+    assert hub.seen_at("pump-1") == UTC_0 + 10 * PERIOD
+    hub.take(all_of(23, STANDBY))
+    assert hub.state("pump-1") == "stands"
+
+
+def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
+    columns = Columns(4)
+    for register in range(4):
+        layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
+        assert add_rows(columns, layout, completion(SECOND, exception=6), UTC_0)
+    hub.take(Batch(columns, Names(DRIVES), Names(REGISTERS)))
+    assert hub.state("pump-1") == "unknown"
+
+
+def test_a_value_that_is_overdue_is_not_fresh(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    hub.take(rows((10 + 11, STATUS, STANDBY), drive="pump-2"))  # time passes elsewhere
+    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
+
+
+def test_what_is_read_seldom_is_fresh_for_longer(tmp_path: Path) -> None:
+    path = written(tmp_path).path
+    path.write_text(path.read_text().replace("100 ms", "10 s"))
+    hub = Hub(load_plant(path))
+    hub.take(all_of(10, FORWARD, 25))
+    hub.take(rows((10 + 290, STATUS, STANDBY), drive="pump-2"))
+    assert hub.is_fresh("pump-1", "output_frequency")
+    hub.take(rows((10 + 301, STATUS, STANDBY), drive="pump-2"))
+    assert not hub.is_fresh("pump-1", "output_frequency")
+
+
+def test_rows_of_a_drive_that_is_gone_are_dropped(hub: Hub) -> None:
+    hub.take(rows((10, STATUS, FORWARD), drive="pump-9"))
+    assert "pump-9" not in list(hub.drives)
+
+
+def test_a_plant_that_is_taken_over_keeps_what_is_known(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    hub.adopt(hub.plant)
+    assert hub.state("pump-1") == "runs"
+
+
+SHOWN = st.sampled_from(
+    [
+        Shown("runs", None),
+        Shown("fault", "a"),
+        Shown("fault", "b"),
+        Shown("silent", "x"),
+        Shown("unknown", None),
+        Shown("unknown", NOT_ASKED),
+    ]
+)
+
+
+@given(st.lists(SHOWN, max_size=30))
+def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
+    """Compared with a plain reading of the rules, one state after another."""
+    events = Events()
+    fault: str | None = None
+    silent = False
+    for time, one in enumerate(shown):
+        events.look(time, "pump-1", one)
+        if one.state == "silent":
+            silent = True
+        elif one.words != NOT_ASKED:
+            silent = False
+            fault = one.words if one.state == "fault" else None
+        lasting = {alarm.text for alarm in events.lasting}
+        assert lasting == ({fault} - {None}) | ({"x"} if silent else set())
+    found = events.newest_first()
+    assert [alarm.time for alarm in found] == sorted((alarm.time for alarm in found), reverse=True)
+    assert all(alarm.ended is None or alarm.ended > alarm.time for alarm in found)
+    assert len([alarm for alarm in found if alarm.ended is None]) == len(events.lasting)
+
+
+def test_ended_alarms_are_bounded() -> None:
+    events = Events()
+    for time in range(1000):
+        events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
+    assert len(events.newest_first()) <= 201
+    assert events.begun == 500

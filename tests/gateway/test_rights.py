@@ -1,0 +1,206 @@
+"""The right of every caller for every route, by one table, over HTTP; and pages that are not ours."""
+
+from __future__ import annotations
+
+import http.client
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from gateways import Served, served
+from lines import until
+
+from multidrop.gateway.rights import MOST_WRONG, Right
+
+MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
+LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
+CLOSED = MAY.replace("[serve.may]", '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"')
+
+LOOKS = ("/api/plant", "/api/frame", "/api/lines", "/api/audit", "/api/drive/pump-1", "/health", "/metrics")
+STOP = ("/api/stop", {"drives": ["pump-1"]})
+WRITE = ("/api/write", {"drive": "pump-1", "register": "setpoint", "value": 50.0})
+UNLISTED_WRITE = ("/api/write", {"drive": "pump-2", "register": "setpoint", "value": 50.0})
+RESET = ("/api/act", {"drive": "pump-1", "verb": "reset_fault", "options": {}})
+UNLISTED_VERB = ("/api/act", {"drive": "pump-1", "verb": "jog", "options": {}})
+STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
+ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
+
+LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # as a proxy tells them
+# of looks, and of ACTS in their order
+TABLE = [
+    (MAY, LOCAL, None, 200, (401, 401, 401, 401, 401, 401)),
+    (MAY, LOCAL, Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+    (MAY, LOCAL, Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+    (MAY, LOCAL, Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    (MAY, OTHER, None, 200, (401, 401, 401, 401, 401, 401)),
+    (MAY, OTHER, Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+    (MAY, OTHER, Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    (LOOPBACK_STOPS, LOCAL, None, 200, (200, 401, 401, 403, 403, 200)),
+    (LOOPBACK_STOPS, LOCAL, Right.LOOK, 200, (200, 403, 403, 403, 403, 200)),
+    (LOOPBACK_STOPS, LOCAL, Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+    (LOOPBACK_STOPS, OTHER, None, 200, (401, 401, 401, 401, 401, 401)),
+    (LOOPBACK_STOPS, OTHER, Right.STOP, 200, (200, 403, 403, 403, 403, 200)),
+    (CLOSED, LOCAL, None, 401, (401, 401, 401, 401, 401, 401)),
+    (CLOSED, LOCAL, Right.LOOK, 200, (403, 403, 403, 403, 403, 403)),
+    (CLOSED, OTHER, None, 401, (401, 401, 401, 401, 401, 401)),
+    (CLOSED, OTHER, Right.WRITE, 200, (200, 200, 403, 200, 403, 200)),
+]
+
+
+@pytest.mark.parametrize(("serve", "address", "right", "look", "acts"), TABLE)
+def test_each_caller_may_what_the_table_says(
+    tmp_path: Path, serve: str, address: str, right: Right | None, look: int, acts: tuple[int, ...]
+) -> None:
+    with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
+        headers = {} if right is None else {"authorization": gateway.bearer(right)}
+        if address is OTHER:
+            headers["x_forwarded_for"] = (
+                f"127.0.0.1, {address}"  # the first is what the client says of itself
+            )
+        until(lambda: gateway.gateway.hub.taken > 0)
+        assert {path: gateway.get(path, **headers).status for path in LOOKS} == dict.fromkeys(LOOKS, look)
+        found = tuple(gateway.post(path, body, **headers).status for path, body in ACTS)
+        assert found == acts
+        assert gateway.get("/", **headers).status in (200, 404)  # the page itself is nobody's secret
+
+
+@pytest.fixture(scope="module")
+def open_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Everybody on this machine may stop."""
+    with served(tmp_path_factory.mktemp("open"), LOOPBACK_STOPS, names=("plant.example",)) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        yield gateway
+
+
+FOREIGN = {
+    "another name, such as a rebound one": ({"host": "evil.test"}, 421),
+    "another name with our port": ({"host": "evil.test:8750"}, 421),
+    "no host name": ({"host": "plant.example/x"}, 421),
+    "an empty name": ({"host": ""}, 421),
+    "a page of another site": ({"origin": "http://evil.test"}, 403),
+    "another port of this machine": ({"origin": "http://localhost:1"}, 403),
+    "a file, or a sandboxed frame": ({"origin": "null"}, 403),
+    "a script of another site": ({"sec_fetch_site": "cross-site"}, 403),
+    "a script of another port": ({"sec_fetch_site": "same-site"}, 403),
+    "a form": ({"content_type": "application/x-www-form-urlencoded"}, 415),
+    "a form that looks like text": ({"content_type": "text/plain"}, 415),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_pages_that_are_not_ours_send_no_frame(open_gateway: Served, case: str) -> None:
+    headers, status = FOREIGN[case]
+    before = open_gateway.gateway.commands.called
+    assert open_gateway.post(*STOP, **headers).status == status
+    assert open_gateway.gateway.commands.called == before
+
+
+def test_our_own_page_and_programs_do(open_gateway: Served) -> None:
+    port = open_gateway.gateway.port
+    before = open_gateway.gateway.commands.called
+    for headers in (
+        {},
+        {"host": f"localhost:{port}", "origin": f"http://localhost:{port}", "sec_fetch_site": "same-origin"},
+        {"host": "plant.example", "origin": "http://plant.example"},
+        {"host": f"[::1]:{port}"},
+    ):
+        assert open_gateway.post(*STOP, **headers).json["pump-1"]["done"] is True
+    assert open_gateway.gateway.commands.called == before + 4
+
+
+def test_two_host_headers(open_gateway: Served) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", open_gateway.gateway.port)
+    connection.putrequest("GET", "/health", skip_host=True)
+    connection.putheader("host", "localhost")
+    connection.putheader("host", "evil.test")
+    connection.endheaders()
+    assert connection.getresponse().status in (400, 421)
+    connection.close()
+
+
+@pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
+def test_no_answer_lets_itself_be_framed_or_guessed_at(open_gateway: Served, path: str) -> None:
+    headers = open_gateway.get(path).headers
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert "default-src 'self'" in headers["content-security-policy"]
+    assert headers["cross-origin-resource-policy"] == "same-origin"
+    assert headers["x-content-type-options"] == "nosniff"
+    assert "server" not in headers
+
+
+def test_methods_and_bodies(open_gateway: Served) -> None:
+    post, get = open_gateway.post, open_gateway.get
+    assert get("/api/stop").status == 405
+    assert post("/api/plant").status == 405
+    assert open_gateway.request("PUT", "/api/stop").status == 405
+    assert open_gateway.request("OPTIONS", "/api/stop").status == 405
+    assert post("/api/stop", b"no json").json == {"error": "the body is not JSON"}
+    assert post("/api/stop", b"[" * 50_000).status == 400
+    assert post("/api/stop", b"[]").json == {"error": "the body is not a JSON object"}
+    assert post("/api/stop", {"drives": "pump-1"}).status == 400
+    assert post("/api/stop", b" " * 70_000).status == 413
+    assert get("/api/nothing").json == {"error": "there is nothing here"}
+    assert get("/api/drive/pump-9").status == 404
+    assert get("/api/frame?after=x").status == 400
+    assert get("/api/history?series=pump-1.setpoint&from=0&to=1").status == 404
+    writer = {"authorization": open_gateway.bearer(Right.WRITE)}
+    assert (
+        post("/api/write", {"drive": "pump-1", "register": "setpoint", "value": True}, **writer).status == 400
+    )
+    assert post("/api/write", {"drive": "", "register": "setpoint", "value": 1}, **writer).status == 400
+    assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
+
+
+def test_the_page_keeps_its_token_where_no_script_sees_it(open_gateway: Served) -> None:
+    told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
+    assert told.json == {"name": "writer", "role": "write"}
+    cookie = told.headers["set-cookie"]
+    assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {part.strip() for part in cookie.split(";")}
+    assert "Secure" not in cookie  # no TLS here
+    kept = cookie.partition(";")[0]
+    assert open_gateway.get("/api/plant", cookie=kept).json["may"]["role"] == "write"
+    assert open_gateway.post(*WRITE, cookie=kept).status == 200
+    gone = open_gateway.post("/api/forget", cookie=kept).headers["set-cookie"]
+    assert 'multidrop=""' in gone
+    assert "Max-Age=0" in gone
+
+
+def test_wrong_tokens_are_looked_at_five_times_a_minute(tmp_path: Path) -> None:
+    """Neither a right token on another address nor any stop is held up by them."""
+    now = [1000.0]
+    with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
+        gateway.gateway.tokens.find("")  # the table is there
+        guard_clock(gateway, now)
+        anna = {"x_forwarded_for": "10.0.0.1"}
+        wrong = {**anna, "authorization": "Bearer wrong"}
+        right = {**anna, "authorization": gateway.bearer(Right.STOP)}
+        assert [gateway.get("/api/plant", **wrong).status for _ in range(MOST_WRONG)] == [401] * MOST_WRONG
+        assert gateway.get("/api/plant", **wrong).status == 429
+        assert gateway.get("/api/plant", **right).status == 429  # not even looked at
+        assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
+        assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
+        assert gateway.post(*STOP, **wrong).status == 401
+        elsewhere = {"x_forwarded_for": "10.0.0.2", "authorization": gateway.bearer(Right.STOP)}
+        assert gateway.get("/api/plant", **elsewhere).status == 200
+        now[0] += 60.0
+        assert gateway.get("/api/plant", **right).status == 200
+
+
+def guard_clock(gateway: Served, now: list[float]) -> None:
+    """Let the guard see this time."""
+    gateway.gateway.guard_clock = lambda: now[0]
+
+
+def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
+    with served(tmp_path, LOOPBACK_STOPS) as gateway:
+        until(lambda: gateway.gateway.hub.taken > 0)
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        assert gateway.post(*WRITE, **writer).json["done"] is True
+        assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
+        records = gateway.get("/api/audit").json
+        assert [(one["drive"], one["by"], one["way"]) for one in records[-1:]] == [
+            ("pump-1", "writer", "http from 127.0.0.1")
+        ]
+        assert {(one["by"], one["way"]) for one in records[:-1]} == {("anyone", "page from 127.0.0.1")}
+        oldest = records[-1]["time"]
+        assert gateway.get(f"/api/audit?before={oldest}").json == []

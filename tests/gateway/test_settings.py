@@ -1,0 +1,213 @@
+"""The table `[serve]`: what it may say, and all mistakes in it at once."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from gateways import certificate, written
+
+from multidrop import PlantError
+from multidrop.gateway.listener import listen
+from multidrop.gateway.rights import Right, digest, new_token, read_tokens
+from multidrop.gateway.settings import read_settings
+
+SHA = digest("secret")
+
+
+def mistakes(folder: Path, serve: str) -> list[str]:
+    with pytest.raises(PlantError) as wrong:
+        read_settings(written(folder, serve), {})
+    start = f"{folder / 'plant.toml'}: "
+    assert all(mistake.startswith(start) for mistake in wrong.value.mistakes)
+    return [mistake.removeprefix(start) for mistake in wrong.value.mistakes]
+
+
+def test_without_a_table_only_this_machine_may_look(tmp_path: Path) -> None:
+    settings = read_settings(written(tmp_path), {})
+    assert (settings.host, settings.port) == ("127.0.0.1", 8750)
+    assert settings.may.without_token(is_loopback=True) is Right.LOOK
+    assert settings.may.write == settings.may.verbs == frozenset()
+    assert settings.audit == tmp_path / "audit.jsonl"
+    assert not (tmp_path / "audit.jsonl").exists()
+
+
+def test_all_that_a_table_may_say(tmp_path: Path) -> None:
+    certificate(tmp_path, "own")
+    (tmp_path / "tokens").write_text(f"# people\n\nanna stop {SHA}\nscada write {digest('other')}\n")
+    serve = """
+[serve]
+listen = "0.0.0.0:8443"
+names = ["plant.example"]
+certificate = "own.pem"
+key = "own.key"
+tokens = "tokens"
+audit = "log/audit.jsonl"
+[serve.may]
+look = "token"
+stop = "anyone"
+write = ["pump-1.setpoint"]
+verbs = ["pump-1.start", "pump-2.reset_fault"]
+"""
+    (tmp_path / "log").mkdir()
+    settings = read_settings(written(tmp_path, serve), {})
+    assert settings.tls is not None
+    assert [(token.name, token.right) for token in settings.tokens] == [
+        ("anna", Right.STOP),
+        ("scada", Right.WRITE),
+    ]
+    assert settings.may.write == {"pump-1.setpoint"}
+    assert settings.may.verbs == {"pump-1.start", "pump-2.reset_fault"}
+    assert settings.may.without_token(is_loopback=True) is Right.STOP
+    assert settings.may.without_token(is_loopback=False) is None
+
+
+def test_fourteen_mistakes_are_told_in_one_run(tmp_path: Path) -> None:
+    (tmp_path / "tokens").write_text("anna stop 1234\nanna look\n")
+    (tmp_path / "key.pem").write_text("no key\n")
+    serve = """
+[serve]
+listen = "everywhere"
+names = ["http://plant.example/"]
+nmaes = ["plant.example"]
+certificate = "cert.pem"
+key = "key.pem"
+behind_proxy = "yes"
+tokens = "tokens"
+audit = "no/such/folder/audit.jsonl"
+[serve.may]
+look = "everybody"
+write = ["pump-1.output_current", "pump-9.setpoint", "setpoint"]
+verbs = ["pump-1.fly"]
+[serve.mqqt]
+"""
+    found = mistakes(tmp_path, serve)
+    expected = [
+        "[serve]: unknown key 'nmaes'; did you mean 'names'?",
+        "[serve]: unknown key 'mqqt'; did you mean 'mqtt'?",
+        "[serve]: behind_proxy = 'yes' is not right; write behind_proxy = true",
+        '[serve]: listen = "everywhere" is no address and port; write listen = "127.0.0.1:8750"',
+        "[serve]: names: 'http://plant.example/' is no host name; write names = [\"plant.example\"], without "
+        "a port",
+        f"[serve]: certificate {tmp_path}/cert.pem cannot be read: No such file or directory",
+        f"[serve]: tokens {tmp_path}/tokens: line 1 is not `name role sha256`; `multidrop serve --new-token` "
+        "prints one",
+        f"[serve]: tokens {tmp_path}/tokens: line 2 is not `name role sha256`; `multidrop serve --new-token` "
+        "prints one",
+        '[serve.may]: look = "everybody" is neither "anyone" nor "token"',
+        "[serve.may]: write: pump-1.output_current is never written: it can only be read",
+        "[serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
+        "[serve.may]: write: 'setpoint' is not drive.register, as \"pump-1.frequency_setpoint\" is",
+        "[serve.may]: verbs: pump-1 has no verb 'fly'; it has start, jog, reset_fault, set_frequency, coast",
+        f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
+    ]
+    assert sorted(found) == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    ("keys", "is_right"),
+    [
+        ("", False),
+        ('tokens = "tokens"', False),
+        ('certificate = "own.pem"\nkey = "own.key"', False),
+        ('certificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"', True),
+        ("behind_proxy = true", True),
+    ],
+)
+@pytest.mark.parametrize("address", ["0.0.0.0:80", "[::]:80", "10.0.0.7:80", "plant.example:80"])
+def test_other_machines_need_tokens_and_tls(
+    tmp_path: Path, certificates: Path, address: str, keys: str, is_right: bool
+) -> None:
+    for name in ("own.pem", "own.key"):
+        (tmp_path / name).write_bytes((certificates / name).read_bytes())
+    (tmp_path / "tokens").write_text(f"anna stop {SHA}\n")
+    serve = f'[serve]\nlisten = "{address}"\n{keys}\n'
+    if is_right:
+        assert read_settings(written(tmp_path, serve), {}).port == 80
+        return
+    (only,) = mistakes(tmp_path, serve)
+    assert only == (
+        f'[serve]: listen = "{address}" is open to other machines: that needs tokens, certificate and key, '
+        "or behind_proxy = true; or listen on 127.0.0.1"
+    )
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two pairs."""
+    folder = tmp_path_factory.mktemp("certificates")
+    certificate(folder, "own")
+    certificate(folder, "other")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("pair", "why"),
+    [
+        (("own.pem", "other.key"), "do not belong together"),
+        (("own.key", "own.key"), "are no certificate and key in PEM, without password"),
+        (("own.pem", "own.pem"), "are no certificate and key in PEM, without password"),
+    ],
+)
+def test_certificates_that_do_not_fit(
+    tmp_path: Path, certificates: Path, pair: tuple[str, str], why: str
+) -> None:
+    paths = [certificates / name for name in pair]
+    (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{paths[0]}"\nkey = "{paths[1]}"\n')
+    assert only == f"[serve]: certificate {paths[0]} and key {paths[1]} {why}"
+
+
+def test_a_certificate_without_its_key(tmp_path: Path, certificates: Path) -> None:
+    (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{certificates}/own.pem"\n')
+    assert only == "[serve]: certificate needs the other one of certificate and key too"
+
+
+@pytest.mark.skipif(
+    os.geteuid() == 0, reason="root may write everywhere: tests/gateway/test_serve.py does this"
+)
+def test_no_rights_on_the_folder(tmp_path: Path) -> None:
+    plant = written(tmp_path)
+    tmp_path.chmod(0o500)
+    with pytest.raises(PlantError, match=r"audit .* cannot be written: Permission denied"):
+        read_settings(plant, {})
+
+
+def test_what_a_service_manager_gives(tmp_path: Path) -> None:
+    """Credentials are found before files beside the plant file, and what is kept goes to the state folder."""
+    credentials, state = tmp_path / "credentials", tmp_path / "state"
+    credentials.mkdir()
+    state.mkdir()
+    (credentials / "tokens").write_text(f"anna stop {SHA}\n")
+    environment = {"CREDENTIALS_DIRECTORY": str(credentials), "STATE_DIRECTORY": f"{state}:/other"}
+    settings = read_settings(written(tmp_path, '[serve]\ntokens = "tokens"\n'), environment)
+    assert [token.name for token in settings.tokens] == ["anna"]
+    assert settings.folder == state
+    assert settings.audit == state / "audit.jsonl"
+
+
+def test_nobody_could_look(tmp_path: Path) -> None:
+    (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
+    assert only == (
+        '[serve]: look = "token" of [serve.may] needs tokens: nobody could look; add tokens = "tokens"'
+    )
+
+
+def test_a_tokens_file_holds_no_token() -> None:
+    secret, token = new_token("anna", Right.STOP)
+    assert read_tokens(f"{token.line}\n") == ([token], [])
+    assert secret not in token.line
+    assert read_tokens(f"{token.line}\n{token.line}\n")[1] == [
+        "line 2: another token is called anna; give every one its own name"
+    ]
+
+
+def test_a_port_that_is_taken() -> None:
+    with listen("127.0.0.1", 0) as first:
+        port = first.getsockname()[1]
+        with pytest.raises(OSError, match=f"listen: 127.0.0.1:{port} cannot be had: another program listens"):
+            listen("127.0.0.1", port)
+    with pytest.raises(OSError, match=r"listen: 192\.0\.2\.1:80 cannot be had: it is no address of this"):
+        listen("192.0.2.1", 80)
+    with pytest.raises(OSError, match=r"listen: nowhere\.invalid is no address of this machine"):
+        listen("nowhere.invalid", 80)

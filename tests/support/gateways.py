@@ -1,0 +1,166 @@
+"""A gateway that polls a simulated plant in a thread, and requests to it as others send them."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import subprocess
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lines import PATIENCE, until
+
+from multidrop import InvtCHE, Plant, load_plant
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.rights import Right, Token, new_token
+from multidrop.gateway.settings import ServeSettings, read_settings
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+NAMES = {Right.LOOK: "looker", Right.STOP: "stopper", Right.WRITE: "writer"}
+POLL = '["status", "output_frequency", "output_current", "fault"]'
+
+
+class Answer(NamedTuple):
+    """A response."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Served:
+    """A gateway that runs, the simulated drives by name, and a secret for each right."""
+
+    def __init__(
+        self, gateway: Gateway, sims: Mapping[str, SimulatedDrive], secrets: Mapping[Right, str]
+    ) -> None:
+        self.gateway = gateway
+        self.sims = sims
+        self.secrets = secrets
+
+    def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
+        """Send one request on a connection of its own; a header's _ is a -."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.gateway.port, timeout=PATIENCE)
+        sent = {name.replace("_", "-"): value for name, value in headers.items()}
+        data = None
+        if method == "POST":
+            data = body if isinstance(body, bytes) else json.dumps(body if body is not None else {})
+            sent.setdefault("content-type", "application/json")
+        try:
+            connection.request(method, path, data, sent)
+            response = connection.getresponse()
+            return Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
+        finally:
+            connection.close()
+
+    def get(self, path: str, **headers: str) -> Answer:
+        return self.request("GET", path, **headers)
+
+    def post(self, path: str, body: object = None, **headers: str) -> Answer:
+        return self.request("POST", path, body, **headers)
+
+    def bearer(self, right: Right) -> str:
+        return f"Bearer {self.secrets[right]}"
+
+    def frame(self) -> Any:
+        return self.get("/api/frame").json
+
+    def await_state(self, drive: str, *states: str) -> None:
+        """Wait until a frame shows a drive in one of these states."""
+        until(lambda: self.frame()["drives"][drive]["state"] in states)
+
+
+def certificate(folder: Path, name: str) -> None:
+    """A certificate and its key, as openssl makes them."""
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"),
+            *("-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"),
+            *("-keyout", f"{folder}/{name}.key", "-out", f"{folder}/{name}.pem"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+
+
+def tokens() -> tuple[dict[Right, str], tuple[Token, ...]]:
+    """A token for each right."""
+    made = {right: new_token(name, right) for right, name in NAMES.items()}
+    return {right: secret for right, (secret, _) in made.items()}, tuple(token for _, token in made.values())
+
+
+def plant_text(port: str, drives: Sequence[str], serve: str = "") -> str:
+    text = f'[[line]]\nname = "hall"\nport = "{port}"\nbaudrate = 38400\n'
+    for address, name in enumerate(drives, 1):
+        text += (
+            f'[[line.drive]]\nname = "{name}"\nmodel = "invt-che"\naddress = {address}\n'
+            f'every = "100 ms"\npoll = {POLL}\n'
+        )
+    return f"{text}{serve}"
+
+
+def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUSB0") -> Plant:
+    """A plant from a file with this table `[serve]`; nothing is opened."""
+    path = folder / "plant.toml"
+    path.write_text(plant_text(port, drives or ("pump-1", "pump-2"), serve))
+    return load_plant(path)
+
+
+@contextmanager
+def served(
+    folder: Path, serve: str = "", *drives: str, environment: Mapping[str, str] | None = None, **settings: Any
+) -> Iterator[Served]:
+    """A gateway of simulated INVT CHE drives, with tokens; `settings` replace those of the file."""
+    names = drives or ("pump-1", "pump-2")
+    sims = {name: simulated(InvtCHE(n, name=name, baudrate=38400)) for n, name in enumerate(names, 1)}
+    secrets, known = tokens()
+    (folder / "tokens").write_text("".join(f"{token.line}\n" for token in known))
+    with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
+        plant = written(folder, serve, *names, port=simulator.wires[0].path)
+        found: ServeSettings = read_settings(plant, environment or {})
+        gateway = Gateway(plant, replace(found, port=0, **{"tokens": known, **settings}))
+        with running(gateway):
+            yield Served(gateway, sims, secrets)
+
+
+@contextmanager
+def running(gateway: Gateway) -> Iterator[None]:
+    """Run a gateway in a thread; its failure is raised at the end."""
+    ready = threading.Event()
+    failures: list[BaseException] = []
+    loops: list[asyncio.AbstractEventLoop] = []
+
+    async def live() -> None:
+        loops.append(asyncio.get_running_loop())
+        await gateway.run(ready.set)
+
+    def work() -> None:
+        try:
+            asyncio.run(live())
+        except BaseException as failure:
+            failures.append(failure)
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    assert ready.wait(PATIENCE)
+    try:
+        if not failures:
+            yield
+    finally:
+        if thread.is_alive():
+            loops[0].call_soon_threadsafe(gateway.end)
+        thread.join(PATIENCE)
+        assert not thread.is_alive()
+    if failures:
+        raise failures[0]
