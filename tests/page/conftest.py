@@ -12,6 +12,7 @@ from fake_gateway import FakeGateway
 from watching import LIVE, until
 
 SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
+PATIENCE_MS = 30000  # a busy machine is no failure of the page
 Opener = Callable[..., Any]
 
 
@@ -53,7 +54,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
     def open_page(view: str = "#/drives", size: str = "desk", live: bool = True, **options: Any) -> Any:
         width, height = SIZES[size]
         context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        context.set_default_timeout(5000)
+        context.set_default_timeout(PATIENCE_MS)
         contexts.append(context)
         page = context.new_page()
         page.on("pageerror", lambda error: problems.append(str(error)))

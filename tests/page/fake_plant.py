@@ -16,7 +16,7 @@ FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-2
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
 FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}
 SILENT = {"labeller": 42}
-SPEEDS = (38400, 9600, 38400)
+SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
 
 def register(name: str, unit: str, digits: int, place: str, **more: Any) -> dict[str, Any]:
@@ -35,7 +35,7 @@ REGISTERS = [
     register("output_power", "kW", 1, "section 7.2, 1006H"),
     register("heatsink_temperature", "°C", 0, "section 7.2, 1007H", period_s=1.0),
     register("run_state", "", 0, "table 9-2, 3000H", kind="words", words={"1": "runs", "3": "standby"}),
-    register("status_bits", "", 0, "table 9-3, 3001H", kind="bits", words={"0": "ready", "2": "at setpoint"}),
+    register("status_bits", "", 0, "table 9-3, 3001H", kind="bits", words={"1": "ready", "4": "at_setpoint"}),
     register("acceleration_time", "s", 1, "P0.11", access="setting", least=0, most=3600, period_s=None),
     register("run_hours", "h", 0, "P7.11", period_s=None),
 ]
@@ -135,13 +135,13 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
         if name in SILENT:
             seen = began - SILENT[name]
             old = values(name, number, seen)
-            rows = {r: [None, ms(now), "no reply", old[r], ms(seen)] for r in polled}
+            rows = {r: [old[r], ms(seen), "no reply"] for r in polled}
         else:
             seen = at
             rows = {r: [held[r], ms(at), "ok"] for r in polled}
         drives[renamed.get(name, name)] = {
             "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": ms(seen),
-            "values": rows, "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
+            "values": rows, "why": "no reply" if name in SILENT else None,
         }  # fmt: skip
     return {
         "n": n, "revision": 1, "time": str(int(now * 1e9)), "drives": drives, "lines": lines(),
@@ -150,11 +150,8 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
 
 
 def lines() -> dict[str, Any]:
-    used, planned, misses, rate, p99 = (
-        (0.72, 0.94, 0.61), (0.71, 0.93, 0.62), (0, 14, 0), (101.3, 24.8, 92.4), (6.1, 11.9, 5.4),
-    )  # fmt: skip
+    used, planned, misses = (0.72, 0.94, 0.61), (0.71, 0.93, 0.62), (0, 14, 0)
     return {
-        f"hall-{n + 1}": {"used": used[n], "planned": planned[n], "misses": misses[n], "lost": None,
-                          "rate": rate[n], "p99": p99[n]}
+        f"hall-{n + 1}": {"used": used[n], "planned": planned[n], "misses": misses[n], "lost": None}
         for n in range(3)
-    }  # fmt: skip
+    }

@@ -101,7 +101,7 @@ def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> Non
 
 def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway: FakeGateway) -> None:
     now = int(time.time() * 1000)
-    rows = {"output_frequency": [None, now, "no reply"]}
+    rows = {"output_frequency": [None, now, "no reply"], "output_current": [None, None, "not asked yet"]}
     drive = {"state": "unknown", "fault": None, "seen": None, "values": rows}
     gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
     page = opened("#/drives/pump-1")
@@ -110,7 +110,7 @@ def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway:
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
     shown = set(page.locator(".registers .number").all_inner_texts())
-    assert shown == {DASH, "20.0", "4012"}  # two that are not polled
+    assert shown == {DASH, "20.0", "4012"}  # two that are looked at
     assert page.locator("tr.head .wire").first.inner_text().split() == ["wire", DASH, "of", DASH, "planned"]
 
 

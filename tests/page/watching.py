@@ -9,7 +9,7 @@ LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
 
 
-def until(page: Any, expression: str, within: float = 10) -> float:
+def until(page: Any, expression: str, within: float = 30) -> float:
     """Wait until this is true on the page. Return the seconds. Raises AssertionError."""
     began = time.monotonic()
     while not page.evaluate(expression):

@@ -15,6 +15,7 @@ class Alarm(NamedTuple):
 
     time: int
     drive: str
+    kind: str  # "fault" or "silent"
     text: str
     ended: int | None
 
@@ -59,7 +60,7 @@ class Events:
         if before is not None and (before.text == text or kind == SILENT):
             return
         self._end(time, drive, kind)
-        self._lasting[drive, kind] = Alarm(time, drive, text, None)
+        self._lasting[drive, kind] = Alarm(time, drive, kind, text, None)
         self.begun += 1
 
     def _end(self, time: int, drive: str, kind: str) -> None:

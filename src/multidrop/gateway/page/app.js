@@ -1,6 +1,7 @@
 // The page's views, its keys and its beat: texts and plots five times a second, sparklines once.
 
 import { get } from "./api.js";
+import { askToken } from "./ask.js";
 import * as audit from "./audit.js";
 import * as clock from "./clock.js";
 import { find } from "./dom.js";
@@ -10,6 +11,7 @@ import * as lines from "./lines.js";
 import { run } from "./link.js";
 import * as markers from "./markers.js";
 import * as plots from "./panel_plots.js";
+import * as rates from "./rates.js";
 import * as settings from "./settings.js";
 import { stopOne } from "./stop.js";
 import { onPlant, store, takePlant } from "./store.js";
@@ -82,9 +84,10 @@ function tick() {
   }
   if (view === "drives" && beat % 2 === 0) safely(drive.drawPlots);
   if (view === "drives" && beat % 10 === 0) safely(table.drawSparks);
-  if (view === "faults" && beat % 10 === 0) faults.show();
+  if (view === "faults" && beat % 10 === 0) safely(faults.show);
   if (view === "lines" && beat % 30 === 0) lines.show();
-  if (view === "drives" && beat % 50 === 0) drive.refresh();
+  if (view === "drives" && beat % 20 === 0) drive.refresh();
+  if (view === "drives" && beat % 50 === 10) rates.keepUp();
 }
 
 // Make plots anew: their size, colours or times are others.
@@ -136,8 +139,12 @@ addEventListener("hashchange", route);
 addEventListener("keydown", keys);
 addEventListener("theme", redraw);
 addEventListener("timezone", redraw);
+addEventListener(
+  "stranger",
+  () => find("#ask").open || askToken("This gateway wants a token to look, too."),
+);
 addEventListener("written", () => drive.refresh());
-addEventListener("signed", () => get("api/plant").then(takePlant, console.error));
+addEventListener("signed", () => get("api/plant").then(takePlant, () => {}));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 find(".skip").addEventListener("click", event => {
   event.preventDefault();

@@ -1,29 +1,25 @@
 // Faults and silences as bars over the time that the trends show.
 
 import { fill, glyph, make, named } from "./dom.js";
-import { read } from "./faults.js";
 import { now } from "./link.js";
+import { alarms as known } from "./store.js";
 
 const KINDS = [
   ["fault", "faults"],
   ["silent", "silent"],
 ];
-let serial = 0;
-
 // Draw the alarms of these drives between two times into a place.
-export async function draw(place, from, to, drives) {
-  const mine = ++serial;
+export function draw(place, from, to, drives) {
   if (!drives.length) {
     fill(place);
     return;
   }
-  const alarms = (await read(from, to)).filter(alarm => drives.includes(alarm.drive));
-  if (mine !== serial) return;
+  const alarms = known().filter(alarm => drives.includes(alarm.drive));
   fill(
     place,
     KINDS.map(([kind, title]) => {
       const there = alarms.filter(
-        alarm => (alarm.kind ?? "fault") === kind && (alarm.ended ?? now()) > from && alarm.time < to,
+        alarm => alarm.kind === kind && (alarm.ended ?? now()) > from && alarm.time < to,
       );
       return make(
         "div",
@@ -32,7 +28,9 @@ export async function draw(place, from, to, drives) {
         make(
           "div",
           { class: "bars" },
-          there.length ? there.map(alarm => bar(alarm, from, to)) : make("span", { class: "none" }, "none"),
+          there.length
+            ? there.map(alarm => bar(alarm, from, to))
+            : make("span", { class: "none" }, "none known"),
         ),
       );
     }),
@@ -43,8 +41,8 @@ function bar(alarm, from, to) {
   const text = `${alarm.drive}: ${alarm.text}`;
   const shown = make(
     "span",
-    { class: alarm.kind ?? "fault", title: text },
-    glyph(alarm.kind ?? "fault"),
+    { class: alarm.kind, title: text },
+    glyph(alarm.kind),
     named(alarm.drive),
     `: ${alarm.text}`,
   );

@@ -1,13 +1,12 @@
 // The lines: wire used against plan, misses by reason over the last hour, delays of each drive.
 
-import { get } from "./api.js";
 import * as clock from "./clock.js";
-import { colour, fill, find, glyph, make, named } from "./dom.js";
+import { fill, find, glyph, make, named } from "./dom.js";
+import { misses } from "./misses.js";
+import * as rates from "./rates.js";
 import { isLive, store } from "./store.js";
 import { now } from "./link.js";
 import { milliseconds, share, UNKNOWN } from "./values.js";
-
-const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
 
 let shown = "";
 
@@ -17,7 +16,7 @@ export async function show() {
   let told = {},
     error = null;
   try {
-    told = await get("api/lines");
+    told = await rates.fetchLines();
   } catch (problem) {
     error = problem.message;
   }
@@ -40,16 +39,16 @@ function card(line, told) {
     make(
       "p",
       { class: "note" },
-      `${line.port}${line.speed ? ` · ${line.speed} baud` : ""} · ${line.drives.length} drives`,
+      `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${line.drives.length} drives`,
     ),
     frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
-    figures(frame),
-    misses(told?.minutes ?? []),
+    figures(frame, rates.line(line.name)),
+    misses(told?.hour ?? []),
     delays(line, told?.drives ?? {}),
   );
 }
 
-function figures({ used = null, planned = null, rate = null, p99 = null, misses: missed = null }) {
+function figures({ used = null, planned = null, misses: missed = null }, rate) {
   const isOver = used !== null && planned !== null && used > planned + 0.05;
   const bar = make("span", {
     class: "use",
@@ -68,7 +67,6 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
       [share(planned), isOver ? make("small", { class: "warn" }, " more is used than planned") : null],
     ],
     ["Exchanges", [rate === null ? UNKNOWN : `${rate.toFixed(1)} /s`]],
-    ["Delay, 99 % within", [milliseconds(p99)]],
     [
       "Missed in the last minute",
       [make("span", { class: missed > 0 ? "warn" : "" }, missed === null ? UNKNOWN : String(missed))],
@@ -81,88 +79,8 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
   );
 }
 
-// Draw one bar for each minute, stacked by reason, and the hour's sums as a table.
-function misses(minutes) {
-  const sums = new Map();
-  let asked = 0;
-  for (const minute of minutes) {
-    asked += minute.asked ?? 0;
-    for (const [reason, n] of Object.entries(minute.misses)) sums.set(reason, (sums.get(reason) ?? 0) + n);
-  }
-  const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
-    total = [...sums.values()].reduce((a, b) => a + b, 0);
-  if (!minutes.length) return make("p", { class: "note" }, "No misses counted yet.");
-  const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
-  if (!total) return make("section", {}, head);
-  const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));
-  return make(
-    "section",
-    {},
-    head,
-    make(
-      "div",
-      { class: "minutes", role: "img", "aria-label": `Missed each minute, at most ${most}` },
-      minutes.map(minute => column(minute, reasons, most)),
-    ),
-    make(
-      "div",
-      { class: "ends" },
-      make("span", {}, `${clock.minute(minutes[0].time)} ${clock.zoneName()}`),
-      make("span", {}, `at most ${most} a minute`),
-      make("span", {}, clock.minute(minutes[minutes.length - 1].time)),
-    ),
-    make(
-      "table",
-      { class: "plain" },
-      make(
-        "thead",
-        {},
-        make(
-          "tr",
-          {},
-          ["Reason", "Missed", "Share"].map(h => make("th", { scope: "col" }, h)),
-        ),
-      ),
-      make(
-        "tbody",
-        {},
-        reasons.map((reason, i) =>
-          make(
-            "tr",
-            {},
-            make("th", { scope: "row" }, swatch(i), reason),
-            make("td", {}, String(sums.get(reason))),
-            make("td", {}, share(asked ? sums.get(reason) / asked : null)),
-          ),
-        ),
-      ),
-    ),
-  );
-}
-
-function column(minute, reasons, most) {
-  const parts = reasons.map((reason, i) => {
-    const part = make("i");
-    part.style.height = `${((minute.misses[reason] ?? 0) / most) * 100}%`;
-    part.style.background = colour(REASONS[i % REASONS.length]);
-    return part;
-  });
-  const words =
-    reasons
-      .filter(r => minute.misses[r])
-      .map(r => `${r} ${minute.misses[r]}`)
-      .join(", ") || "none";
-  return make("div", { title: `${clock.minute(minute.time)}: ${words}` }, parts);
-}
-
-function swatch(i) {
-  const mark = make("i", { class: "swatch", "aria-hidden": "true" });
-  mark.style.background = colour(REASONS[i % REASONS.length]);
-  return mark;
-}
-
 function delays(line, told) {
-  const most = Math.max(1, ...Object.values(told).map(d => d.p99 ?? 0));
+  const most = Math.max(1, ...Object.values(told).map(d => d?.p99_ms ?? 0));
   return make(
     "section",
     {},
@@ -192,9 +110,9 @@ function delays(line, told) {
               half = make("i"),
               tail = make("u"),
               bar = make("span", { class: "delay", "aria-hidden": "true" }, half, tail);
-            half.style.width = `${((d.p50 ?? 0) / most) * 100}%`;
-            tail.style.left = `${((d.p99 ?? 0) / most) * 100}%`;
-            bar.hidden = d.p99 === null || d.p99 === undefined;
+            half.style.width = `${((d.p50_ms ?? 0) / most) * 100}%`;
+            tail.style.left = `${((d.p99_ms ?? 0) / most) * 100}%`;
+            bar.hidden = typeof d.p99_ms !== "number";
             return make(
               "tr",
               {},
@@ -203,13 +121,13 @@ function delays(line, told) {
                 { scope: "row" },
                 make("a", { href: `#/drives/${encodeURIComponent(name)}` }, named(name)),
               ),
-              make("td", {}, milliseconds(d.p50)),
-              make("td", {}, milliseconds(d.p99)),
+              make("td", {}, milliseconds(d.p50_ms)),
+              make("td", {}, milliseconds(d.p99_ms)),
               make("td", {}, bar),
               make(
                 "td",
-                { class: d.missed ? "warn" : "" },
-                d.asked ? `${d.missed} of ${d.asked}, ${share(d.missed / d.asked)}` : UNKNOWN,
+                { class: d.misses ? "warn" : "" },
+                d.exchanges ? `${d.misses} of ${d.exchanges}, ${share(d.misses / d.exchanges)}` : UNKNOWN,
               ),
             );
           }),

@@ -55,6 +55,7 @@ export async function run() {
     } catch (error) {
       if (error.name === "AbortError") continue;
       [store.isLost, link.why, isKnown] = [true, error.message, false];
+      if (error.status === 401) dispatchEvent(new Event("stranger"));
       await pause(AGAIN_MS);
     }
   }

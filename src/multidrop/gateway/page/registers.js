@@ -6,6 +6,8 @@ import { make, put } from "./dom.js";
 import { mayWrite, reading, store } from "./store.js";
 import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
 
+const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
+
 let name = null,
   rows = [],
   others = {};
@@ -84,18 +86,14 @@ export function takeOthers(values) {
   others = values ?? {};
 }
 
-// Return the reading of a register, polled or not. One that is not polled is as old as it is: it is told so.
+// Return the reading of a register, polled or looked at.
 export function known(drive, register, t) {
   const polled = reading(drive, register, t),
-    other = drive === name ? others[register] : undefined;
-  if (polled || !other) return polled;
-  return {
-    value: other[2] === "ok" ? other[0] : null,
-    ms: other[1],
-    status: other[2],
-    age: t - other[1],
-    isOld: true,
-  };
+    row = drive === name ? others[register] : undefined;
+  if (polled || !row) return polled;
+  const [value, ms, status] = row,
+    age = t - ms;
+  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS };
 }
 
 export function draw(t) {

@@ -5,6 +5,7 @@ import { Ring } from "./ring.js";
 
 const SAMPLES = 2e6; // of all registers together
 const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
+const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
 export const LIVE_MS = 1500; // a frame comes each second at least
 
 export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map() };
@@ -49,13 +50,12 @@ export function takeFrame(frame) {
   }
 }
 
-function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
-  const isGood = status === "ok" && value !== null;
-  if (isGood) drive.good.set(register, { value, ms });
-  else if (lastMs > (drive.good.get(register)?.ms ?? 0))
-    drive.good.set(register, { value: lastValue, ms: lastMs });
+// A row is the newest good value, its time, and what became of the newest request.
+function keep(drive, register, [value, ms, status]) {
+  if (value !== null) drive.good.set(register, { value, ms });
   if (!drive.pasts.has(register)) drive.pasts.set(register, new Ring(most()));
-  drive.pasts.get(register).add(ms, isGood ? value : NaN);
+  const isGood = status === "ok" && value !== null;
+  drive.pasts.get(register).add(isGood ? ms : store.time, isGood ? value : NaN);
 }
 
 function most() {
@@ -65,8 +65,8 @@ function most() {
 }
 
 // Return what is known of a register now, or null where nothing ever was:
-// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when its newest request
-// failed, when it is later than three periods, or when the frame itself is.
+// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when it is older than
+// three periods, than a second where the newest request failed, or when the frame itself is old.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
     row = store.frame?.drives[name]?.values?.[register];
@@ -80,7 +80,7 @@ export function reading(name, register, now) {
     ms: good.ms,
     status,
     age,
-    isOld: status !== "ok" || age > limit(drive, register) || !isLive(now),
+    isOld: age > (status === "ok" ? limit(drive, register) : FAILED_LIMIT_MS) || !isLive(now),
   };
 }
 
@@ -102,8 +102,23 @@ export const state = name => store.frame?.drives[name]?.state ?? "unknown";
 // Return the register that has this part in the drive, "frequency" for one, or null.
 export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
 
-// Return the alarms that last, newest first.
-export const lasting = () => (store.frame?.alarms ?? []).filter(alarm => alarm.ended === null);
+const KINDS = ["fault", "silent", "port"];
+
+// Return what is and was wrong, newest first; lines whose port is gone come before.
+export function alarms() {
+  const { alarms: told = [], lines = {} } = store.frame ?? {};
+  const gone = Object.entries(lines)
+    .filter(([, line]) => line.lost)
+    .map(([line, { lost }]) => ({ kind: "port", line, text: lost, time: null, ended: null }));
+  return gone.concat(told.map(alarm => ({ ...alarm, kind: kindOf(alarm) })));
+}
+
+function kindOf({ kind, drive, ended }) {
+  if (KINDS.includes(kind)) return kind;
+  return ended === null && state(drive) === "silent" ? "silent" : "fault";
+}
+
+export const lasting = () => alarms().filter(alarm => alarm.ended === null);
 
 // Return whether the page's user may do this here: a register or a verb of a drive.
 export const mayWrite = (drive, register) =>

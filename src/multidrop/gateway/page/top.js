@@ -3,13 +3,13 @@
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
 import { correction, link, now } from "./link.js";
-import { LIVE_MS, isLive, lasting, store } from "./store.js";
+import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
 
 const DEAD_MS = 3000;
 const SKEW_MS = 2000; // a viewer's clock that is so wrong is told of
-const KINDS = { fault: "fault", silent: "silent", port: "port" };
 let told = "";
-let shownStrip = "";
+let shownStrip = "",
+  ages = []; // [element, time in ms or null] of what the strip shows
 
 // Say what the plant file holds, wherever the head shows it.
 export function showPlant() {
@@ -76,49 +76,50 @@ function tellChange(isNow) {
 
 // Show what is wrong, newest first, each with its full text; a click opens the drive.
 function drawStrip(t) {
-  const strip = find("#strip"),
-    alarms = lasting(),
+  const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
   const count = find("#count");
   put(count, String(alarms.length || ""));
   count.hidden = alarms.length === 0;
-  const shown = alarms.slice(0, most),
-    more = alarms.length - shown.length;
-  const sign = JSON.stringify([
-    shown.map(a => [a.drive, a.text, a.time, clock.lasting(t - a.time)]),
-    more,
-    store.drives.size,
-    !store.frame,
-  ]);
-  if (sign === shownStrip) return;
+  const shown = alarms.slice(0, most);
+  const sign = JSON.stringify([shown, alarms.length, calm()]);
+  if (sign !== shownStrip) buildStrip(shown, alarms.length - shown.length);
   shownStrip = sign;
+  for (const [age, time] of ages) put(age, time === null ? "" : `, ${clock.lasting(t - time)}`);
+}
+
+// Return the words for a plant where no alarm lasts.
+function calm() {
+  if (!store.frame) return "No values yet.";
+  const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;
+  const others = unknown ? `, ${unknown} of unknown state` : "";
+  return `${store.drives.size} drives, no fault known, none silent${others}.`;
+}
+
+function buildStrip(alarms, more) {
+  const strip = find("#strip");
+  ages = [];
   setClass(
     strip,
     "bad",
     alarms.some(alarm => alarm.kind === "fault"),
   );
-  if (!store.frame) fill(strip, make("li", {}, "No values yet."));
-  else if (!alarms.length)
-    fill(strip, make("li", {}, `${store.drives.size} drives, no fault, none silent.`));
+  if (!alarms.length) fill(strip, make("li", {}, calm()));
   else
     fill(
       strip,
-      shown.map(alarm => item(alarm, t)),
+      alarms.map(item),
       more ? make("li", {}, make("a", { href: "#/faults" }, `and ${more} more`)) : null,
     );
 }
 
-function item(alarm, t) {
-  const kind = KINDS[alarm.kind] ?? "fault";
+function item({ kind, drive, line, text, time }) {
+  const age = make("span");
+  ages.push([age, time]);
+  const href = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
   return make(
     "li",
     {},
-    make(
-      "a",
-      { class: kind, href: alarm.drive ? `#/drives/${encodeURIComponent(alarm.drive)}` : "#/lines" },
-      glyph(kind),
-      named(alarm.drive ?? ""),
-      `: ${alarm.text}, ${clock.lasting(t - alarm.time)}`,
-    ),
+    make("a", { class: kind, href }, glyph(kind), named(drive ?? line), ": ", named(text), age),
   );
 }

@@ -19,7 +19,7 @@ export const words = name => name.replaceAll("_", " ");
 export function text(value, register) {
   if (value === null || value === undefined || Number.isNaN(value)) return UNKNOWN;
   if (register?.kind === "words")
-    return register.words?.[value] ? `${register.words[value]} (${value})` : String(value);
+    return register.words?.[value] ? `${words(register.words[value])} (${value})` : String(value);
   if (register?.kind === "bits") return bits(value, register.words ?? {});
   return Number(value).toFixed(register?.digits ?? 0);
 }
@@ -27,7 +27,7 @@ export function text(value, register) {
 function bits(value, names) {
   const set = [];
   for (let bit = 0; bit < MOST_BITS; bit++)
-    if (Math.floor(value / 2 ** bit) % 2) set.push(names[bit] ?? `bit ${bit}`);
+    if (Math.floor(value / 2 ** bit) % 2) set.push(words(names[2 ** bit] ?? `bit ${bit}`));
   return set.length ? set.join(", ") : "none set";
 }
 
