@@ -59,6 +59,7 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
         page = context.new_page()
         page.on("pageerror", lambda error: problems.append(str(error)))
         page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+        page.on("requestfailed", lambda request: print("failed:", request.url, request.failure))
         page.goto(gateway.url + view)
         if live:
             until(page, LIVE)

@@ -95,6 +95,7 @@ def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGa
     page.route("**/page/vendor/*", lambda route: route.abort())
     page.route("**/api/frame*", lambda route: route.abort())
     page.reload()
+    page.locator("#notice").get_by_text("could not be loaded whole").wait_for()
     page.locator("#stopall").click()
     assert title(page).inner_text() == "Stop all drives?"
     page.get_by_role("button", name="Stop all drives").click()

@@ -162,5 +162,6 @@ onPlant(() => {
   if (view === "drives") route();
 });
 route();
+document.body.dataset.begun = "yes";
 setInterval(tick, BEAT_MS);
 run();

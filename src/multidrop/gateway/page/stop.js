@@ -78,6 +78,17 @@ function outcome(told) {
   return { title, contents: contents.filter(Boolean), isWhole };
 }
 
+const WHOLE_MS = 8000; // in which the other parts of the page should be there
+
+// Say so where the other parts of the page could not be loaded: nothing else would.
+setTimeout(() => {
+  if (document.body.dataset.begun) return;
+  find("#notice").textContent =
+    "This page could not be loaded whole. Stop all works; load it again for the rest.";
+  find("#notice").classList.add("bad");
+  find("#notice").hidden = false;
+}, WHOLE_MS);
+
 find("#stopall").addEventListener("click", stopAll);
 addEventListener("keydown", event => {
   if (
