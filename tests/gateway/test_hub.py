@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from multidrop import load_plant
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.gateway.events import Events
+from multidrop.gateway.frames import lost_of
 from multidrop.gateway.hub import NOT_ASKED, Hub, Newest, Shown
 from multidrop.polling.batch import Batch
 
@@ -59,7 +60,7 @@ def test_a_miss_is_newest_and_the_value_before_it_is_the_last_good_one(hub: Hub)
     sent, missed = 10 * PERIOD, 11 * PERIOD
     assert hub.last_good("pump-1", "output_frequency") == Newest(UTC_0 + sent, sent, 25.0, "ok")
     assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply")
-    assert not hub.is_fresh("pump-1", "output_frequency")
+    assert hub.is_fresh("pump-1", "output_frequency")
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,25 @@ def test_a_drive_that_refuses_is_not_silent(hub: Hub) -> None:
         layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
         assert add_rows(columns, layout, completion(SECOND, exception=6), UTC_0)
     hub.take(Batch(columns, Names(DRIVES), Names(REGISTERS)))
+    assert hub.state("pump-1") == "unknown"
+
+
+def test_a_line_is_lost_where_all_its_newest_rows_say_so(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
+    assert lost_of(hub, "hall") is None
+    hub.take(rows((31, FAULT, Status.LINE_LOST)))
+    assert lost_of(hub, "hall") == "port lost"
+    assert hub.seen("pump-1") == Shown("silent", "port lost")
+
+
+def test_values_grow_old_where_no_row_comes(hub: Hub) -> None:
+    hub.take(all_of(10, FORWARD, 25))
+    hub.pass_time(10 * PERIOD + SECOND)
+    assert hub.is_fresh("pump-1", "output_frequency")
+    hub.pass_time(10 * PERIOD + SECOND + 1)
+    assert not hub.is_fresh("pump-1", "output_frequency")
     assert hub.state("pump-1") == "unknown"
 
 
@@ -159,7 +179,7 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
             fault = one.words if one.state == "fault" else None
         lasting = {alarm.text for alarm in events.lasting}
         assert lasting == ({fault} - {None}) | ({"x"} if silent else set())
-    found = events.newest_first()
+    found = events.between(0, len(shown))
     assert [alarm.time for alarm in found] == sorted((alarm.time for alarm in found), reverse=True)
     assert all(alarm.ended is None or alarm.ended > alarm.time for alarm in found)
     assert len([alarm for alarm in found if alarm.ended is None]) == len(events.lasting)
@@ -167,7 +187,8 @@ def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
 
 def test_ended_alarms_are_bounded() -> None:
     events = Events()
-    for time in range(1000):
+    for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
-    assert len(events.newest_first()) <= 201
-    assert events.begun == 500
+    assert len(events.between(0, 9999)) <= 1001
+    assert events.begun == 2000
+    assert len(events.shown()) <= 21

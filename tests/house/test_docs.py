@@ -55,6 +55,10 @@ NOT_RUN = {
     "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
     "multidrop plot demo.arrows": "needs the demo's recording",
     "multidrop report demo.arrows": "needs the demo's recording",
+    "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
+    "multidrop serve --demo": "runs until it is told to end: tests/gateway/test_serve.py",
+    "multidrop serve plant.toml": "runs until it is told to end: tests/gateway/test_serve.py",
+    "curl": "is another program: tests/gateway/test_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",
 }

@@ -117,7 +117,7 @@ def test_imports_for_types_alone_point_downwards_too() -> None:
 
 
 def test_the_gateway_is_a_client_of_public_names_alone() -> None:
-    """Who writes a daemon of his own can do all that this one does."""
+    """So a daemon of one's own can do all that this one does."""
     found = {
         str(path.relative_to(PACKAGE)): {
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name)

@@ -1,4 +1,7 @@
-"""`multidrop check`: says what a family's file declares, what it leaves open, and what will be refused."""
+"""`multidrop check`: says what a family's file declares, what it leaves open, and what will be refused.
+
+A plant file is checked too, without opening a port; its table `[serve]` by `multidrop serve --check`.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +25,25 @@ from multidrop.drives import MODELS
 from multidrop.drives.registry import find_model
 from multidrop.family_file.loader import FamilyError, load_family
 from multidrop.family_file.step_words import declared_in_words
+from multidrop.plant.loader import PlantError, load_plant
+from multidrop.toml_check import read_document
 
 Remark = tuple[str, str]  # a register or a key, and the sentence about it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "file", metavar="FILE.toml", type=Path, help="a family's file, or a shipped family's name"
+        "file",
+        metavar="FILE.toml",
+        type=Path,
+        help="a family's file, a shipped family's name, or a plant file",
     )
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    if _is_plant(arguments.file):
+        return _check_plant(arguments)
     try:
         family = _family(arguments.file)
     except FamilyError as wrong:
@@ -60,6 +70,31 @@ def run(arguments: argparse.Namespace) -> int:
         lines += ["", heading, *_lines(remarks)]
     print_text("\n".join([*lines, "", _verdict(family, arguments.file)]))
     return 0
+
+
+def _is_plant(file: Path) -> bool:
+    """Return True for a file with lines; what cannot be read is left to who takes it for a family's."""
+    try:
+        return "line" in read_document(file, "file")
+    except ValueError:
+        return False
+
+
+def _check_plant(arguments: argparse.Namespace) -> int:
+    mistakes: tuple[str, ...] = ()
+    try:
+        plant = load_plant(arguments.file)
+    except PlantError as wrong:
+        mistakes = wrong.mistakes
+    if arguments.json:
+        print_text(json.dumps({"mistakes": mistakes}, indent=2))
+    elif mistakes:
+        warn("\n".join(mistakes))
+    else:
+        drives = sum(len(line.drives) for line in plant.lines)
+        served = "; `multidrop serve --check` checks its [serve]" if plant.serve else ""
+        print_text(f"No mistake found in {plant.path}: {len(plant.lines)} lines, {drives} drives{served}.")
+    return 1 if mistakes else 0
 
 
 def _family(file: Path) -> type[Drive]:

@@ -21,13 +21,14 @@ POLLED = ("output_frequency", "motor_speed", "output_current", "dc_bus_voltage")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_polling_arguments(parser, out="demo.arrows", seconds=10.0)
     parser.add_argument("--web", action="store_true", help="show it in a browser, as `serve --demo` does")
+    parser.add_argument("--no-browser", action="store_true", help="open no page, with --web")
 
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.web:
         from multidrop.cli.serve import serve_demo
 
-        return serve_demo()
+        return serve_demo(is_shown=not arguments.no_browser)
     _make_room(arguments.out)
     with TemporaryDirectory(prefix="multidrop-") as directory:
         path = Path(directory) / "demo.toml"

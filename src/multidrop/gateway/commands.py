@@ -123,7 +123,9 @@ class Commands:
                 waited.append(_begin_stop(partial(self._stop_line, line.name), caller))
             else:
                 waited += [_begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
-        _log.warning("stop of %s, asked for %s", "all drives" if drives is None else list(wanted), caller.by)
+        _log.warning(
+            "stop of %s, asked for by %s", "all drives" if drives is None else list(wanted), caller.by
+        )
         for name in wanted:
             if name not in names:
                 told[name] = _failed(ValueError(f"there is no drive {name!r}"))

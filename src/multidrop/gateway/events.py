@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from multidrop.gateway.hub import FAULT, NOT_ASKED, SILENT, Shown
 
-MOST_ENDED = 200  # that are remembered
+MOST_ENDED = 1000  # that are remembered
+MOST_SHOWN = 20  # of them beside those that last
 
 
 class Alarm(NamedTuple):
@@ -15,9 +16,9 @@ class Alarm(NamedTuple):
 
     time: int
     drive: str
-    kind: str  # "fault" or "silent"
     text: str
     ended: int | None
+    kind: str  # "fault" or "silent"
 
 
 class Events:
@@ -47,9 +48,17 @@ class Events:
         self._end(time, drive, SILENT)
         self._end(time, drive, FAULT)
 
-    def newest_first(self) -> list[Alarm]:
-        """Return all alarms by the time of their begin."""
-        return sorted([*self._lasting.values(), *self._ended], key=lambda alarm: -alarm.time)
+    def shown(self) -> list[Alarm]:
+        """Return those that last and the newest that ended, by the time of their begin, the newest first."""
+        ended = [*self._ended][-MOST_SHOWN:]
+        return sorted([*self._lasting.values(), *ended], key=lambda alarm: -alarm.time)
+
+    def between(self, begin: int, end: int) -> list[Alarm]:
+        """Return the alarms of a span of time, the newest first."""
+        found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
+        return sorted(
+            (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time
+        )
 
     @property
     def lasting(self) -> list[Alarm]:
@@ -60,7 +69,7 @@ class Events:
         if before is not None and (before.text == text or kind == SILENT):
             return
         self._end(time, drive, kind)
-        self._lasting[drive, kind] = Alarm(time, drive, kind, text, None)
+        self._lasting[drive, kind] = Alarm(time, drive, text, None, kind)
         self.begun += 1
 
     def _end(self, time: int, drive: str, kind: str) -> None:

@@ -13,14 +13,13 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop.gateway.events import Events
-from multidrop.gateway.hub import SILENT, Hub
+from multidrop.gateway.hub import FAULT, SILENT, Hub, Known
 from multidrop.gateway.lately import Lately
 
 LEAST_S = 0.1  # between two frames, on the whole
 EARLY_S = 0.02  # by which one may come sooner after one that was late
 WAIT_S = 20.0  # for which a viewer waits for a frame
 MOST_VIEWERS = 200  # that wait at the same time
-MOST_ALARMS = 50  # in a frame
 LOST = ("port lost", "port refused its settings")  # statuses of all rows of a line that is not there
 
 
@@ -40,35 +39,44 @@ def frame_of(
         "n": n,
         "revision": revision,
         "time": str(time_ns),
-        "drives": {name: _drive(hub, name) for name in hub.drives},
+        "drives": {
+            polled.drive.name: _drive(hub, polled.drive.name, time_ns)
+            | lately.drive_figures(polled.drive.name)
+            for line in hub.plant.lines
+            for polled in line.drives
+        },
         "lines": {
             line.name: lately.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines
         },
-        "alarms": [alarm._asdict() for alarm in events.newest_first()[:MOST_ALARMS]],
+        "alarms": [alarm._asdict() for alarm in events.shown()],
     }
 
 
-def _drive(hub: Hub, name: str) -> dict[str, Any]:
+def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     state, words = hub.seen(name)
     seen = hub.seen_at(name)
     return {
         "state": state,
-        "fault": hub.fault(name),
+        "fault": words if state == FAULT else None,
         "why": words if state == SILENT else None,
         "seen": None if seen is None else seen // 1_000_000,
-        "values": {register.name: _value(hub, name, register.name) for register in hub.polled(name)},
+        "values": {known.register: _value(known, time_ns) for known in hub.known(name)},
     }
 
 
-def _value(hub: Hub, drive: str, register: str) -> list[Any] | None:
-    """Return the newest value that is known with its own time, and the newest row's status."""
-    newest, good = hub.newest(drive, register), hub.last_good(drive, register)
+def _value(known: Known, time_ns: int) -> list[Any]:
+    """Return value, time and status; of what is not known now null, and then the last value and its time."""
+    newest, good = known.newest, known.good
     if newest is None:
-        return [None, None, "not asked yet"]
-    value = good.value if good is not None else None
-    time = good.time if good is not None else newest.time
-    status = newest.status if newest.status != "ok" or hub.is_fresh(drive, register) else "overdue"
-    return [value if value is not None and isfinite(value) else None, time // 1_000_000, status]
+        return [None, time_ns // 1_000_000, "not asked yet"]
+    last = [] if good is None or good.value is None else [_finite(good.value), good.time // 1_000_000]
+    if newest.value is None:
+        return [None, newest.time // 1_000_000, newest.status, *last]
+    return [*last, "ok"] if known.is_fresh else [None, time_ns // 1_000_000, "overdue", *last]
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def lost_of(hub: Hub, line: str) -> str | None:

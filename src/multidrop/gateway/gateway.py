@@ -18,7 +18,7 @@ from multidrop import Batch, Bus, Ledger, Plant, Poller
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of
-from multidrop.gateway.hub import Hub
+from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import listen
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
@@ -29,6 +29,7 @@ from multidrop.gateway.side_reads import SideReads
 from multidrop.gateway.web import make_app
 
 TAKE_S = 0.05  # between looks for new rows
+EVENTS_S = 0.2  # between looks for faults and silence
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
 END_S = 3.0  # for which requests under way are waited for at the end
@@ -56,7 +57,7 @@ class Gateway:
         self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
-        self._ticked = self.clock()
+        self._looked = 0.0
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None
         self._end = asyncio.Event()
@@ -70,7 +71,7 @@ class Gateway:
         self.lately = Lately(plant)
         self.frames = Frames(self._frame, self.clock)
         self.commands = Commands(self, settings.may)
-        self.side_reads = SideReads(self.bus, self.clock, _utc_ms)
+        self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
 
     # ---- life ----
 
@@ -108,7 +109,8 @@ class Gateway:
                     if task.done():
                         task.result()
                 await self.side_reads.close()
-                await asyncio.to_thread(self.poller.close)
+                with ThreadPoolExecutor(1, "multidrop close") as own:  # others may be busy
+                    await asyncio.get_running_loop().run_in_executor(own, self.poller.close)
         finally:
             for task in tasks:
                 task.cancel()
@@ -165,18 +167,21 @@ class Gateway:
     def _hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
         is_new = False
+        self.hub.pass_time(time.monotonic_ns())
         while batch := poller.take():
             is_new = True
             self._guarded("hub", self.hub.take, batch)
             for name, feed in self.feeds.items():
                 self._guarded(name, feed.take, batch)
         if is_new:
-            self._guarded("events", self._look_for_events)
             self._guarded("frames", self.frames.note_news)
+        if self.clock() - self._looked >= EVENTS_S:
+            self._looked = self.clock()
+            self._guarded("events", self._look_for_events)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
-            self.events.look(self.hub.time // 1_000_000, name, self.hub.seen(name))
+            self.events.look(_utc_ms(), name, self.hub.seen(name))
 
     def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
         try:
@@ -202,7 +207,7 @@ class Gateway:
         while True:
             if self.poller is not None:
                 self._guarded("statistics", self._read_statistics)
-            self._ticked = self.clock()
+            self._guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
@@ -212,6 +217,9 @@ class Gateway:
         self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
 
     # ---- for commands, parts and pages ----
+
+    def _is_there(self, drive: str) -> bool:
+        return self.hub.state(drive) != SILENT
 
     def bus(self, line: str) -> Bus:
         """Return a line's bus. Raises ValueError for an unknown line, or before polling has begun."""

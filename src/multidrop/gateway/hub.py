@@ -5,7 +5,7 @@ Pure: rows come in, and their times are the only time there is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
@@ -62,6 +62,35 @@ class _Cell:
         return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
 
 
+class _Fresh(Mapping[str, float]):
+    """Values of one drive's registers that are young enough, looked up when they are asked for."""
+
+    def __init__(self, cells: Mapping[str, _Cell], now_ns: int) -> None:
+        self._cells = cells
+        self._now_ns = now_ns
+
+    def __getitem__(self, register: str) -> float:
+        cell = self._cells[register]
+        if cell.good is None or self._now_ns - cell.good[1] > cell.stale_ns:
+            raise KeyError(register)
+        return cell.good[2]
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._cells if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+class Known(NamedTuple):
+    """All that is known of one polled register."""
+
+    register: str
+    newest: Newest | None
+    good: Newest | None
+    is_fresh: bool
+
+
 class _Watched:
     """One drive of the plant."""
 
@@ -70,7 +99,7 @@ class _Watched:
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
         self.cells: dict[str, _Cell] = {}
-        self.seen: tuple[int, Shown] | None = None  # at which batch
+        self.seen: tuple[int, int, Shown] | None = None  # at which batch and time
 
     def cell(self, register: str) -> _Cell:
         """Return the cell of a register, which is new where it was not known."""
@@ -86,8 +115,8 @@ class Hub:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.now_ns = 0  # of the monotonic clock: the newest row's
-        self.time = 0  # the same row's, UTC in ns
+        self.now_ns = 0  # of the monotonic clock
+        self.time = 0  # of the newest row, UTC in ns
         self.taken = 0  # batches
         self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
         self._statuses: tuple[str, ...] = ("ok",)
@@ -140,12 +169,18 @@ class Hub:
                 cell.good = row
             cell.newest = row
             if monotonic_ns > self.now_ns:
-                self.now_ns, self.time = monotonic_ns, time
+                self.now_ns = monotonic_ns
+            if time > self.time:
+                self.time = time
         self.taken += 1
 
     def _cell(self, drive: str, register: str) -> _Cell | None:
         watched = self._watched.get(drive)
         return watched.cell(register) if watched else None
+
+    def pass_time(self, monotonic_ns: int) -> None:
+        """Note that it is so late: values grow old, also where no row comes."""
+        self.now_ns = max(self.now_ns, monotonic_ns)
 
     # ---- values ----
 
@@ -160,9 +195,9 @@ class Hub:
         return self._row(cell.good) if cell and cell.good else None
 
     def is_fresh(self, drive: str, register: str) -> bool:
-        """Return True while the newest row has a value, and none is overdue."""
+        """Return True while the newest value is young: a single miss after it makes it no older."""
         cell = self._known(drive, register)
-        return cell is not None and self._fresh(cell) and cell.newest is cell.good
+        return cell is not None and self._fresh(cell)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
@@ -173,6 +208,19 @@ class Hub:
     def drives(self) -> Iterator[str]:
         """The names of all drives, in the plant file's order."""
         return iter(self._watched)
+
+    def known(self, drive: str) -> Iterator[Known]:
+        """Yield what is known of each polled register of a drive, in the plant file's order."""
+        watched = self._watched.get(drive)
+        for poll in watched.polled.polls if watched else ():
+            assert watched is not None
+            cell = watched.cells.get(poll.register.name)
+            if cell is None or cell.newest is None:
+                yield Known(poll.register.name, None, None, False)
+                continue
+            newest = self._row(cell.newest)
+            good = newest if cell.good is cell.newest else self._row(cell.good) if cell.good else None
+            yield Known(poll.register.name, newest, good, self._fresh(cell))
 
     def seen_at(self, drive: str) -> int | None:
         """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
@@ -207,31 +255,32 @@ class Hub:
         watched = self._watched.get(drive)
         if watched is None:
             return Shown(UNKNOWN, None)
-        if watched.seen is None or watched.seen[0] != self.taken:
-            watched.seen = (self.taken, self._look(watched))
-        return watched.seen[1]
+        if watched.seen is None or watched.seen[:2] != (self.taken, self.now_ns):
+            watched.seen = (self.taken, self.now_ns, self._look(watched))
+        return watched.seen[2]
 
     def _look(self, watched: _Watched) -> Shown:
-        cells = watched.cells
-        polls = watched.polled.polls
-        newest = [cells[poll.register.name].newest for poll in polls if poll.register.name in cells]
-        misses = [row for row in newest if row is not None and row[3] != 0]
-        fresh = {name: cell.good[2] for name, cell in cells.items() if cell.good and self._fresh(cell)}
-        if not fresh:
-            return self._unseen(misses, is_all=bool(polls) and len(misses) == len(polls))
+        fresh = _Fresh(watched.cells, self.now_ns)
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or "it shows a fault"
             return Shown(_STATES[found.condition], fault if found.condition is Condition.FAULT else None)
+        if not any(True for _ in fresh):
+            return self._unseen(watched)
         if not watched.reader.has_state and fresh.get("fault"):
             register = watched.polled.drive.registers["fault"]
             return Shown(FAULT, _words(register, fresh["fault"]))
         is_turning = any(fresh.get(name) for name in _TURNING)  # 0 Hz may be a run at a setpoint of 0
         return Shown(RUNS if is_turning else UNKNOWN, None)
 
-    def _unseen(self, misses: list[tuple[int, int, float, int]], *, is_all: bool) -> Shown:
+    def _unseen(self, watched: _Watched) -> Shown:
         """Tell a silent drive from one that refuses, and from one that was not asked lately."""
-        if not is_all:
+        polls = watched.polled.polls
+        newest = [
+            cell.newest for poll in polls if (cell := watched.cells.get(poll.register.name)) and cell.newest
+        ]
+        misses = [row for row in newest if row[3] != 0]
+        if not misses or len(misses) < len(polls):
             return Shown(UNKNOWN, NOT_ASKED)
         reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
         if any(reason.startswith(_ANSWERED) for reason in reasons):

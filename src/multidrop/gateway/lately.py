@@ -5,7 +5,7 @@ Pure: readings and times come in.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
@@ -24,6 +24,7 @@ class Lately:
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
+        self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=MINUTES + 1)
         self.adopt(plant)
 
@@ -40,19 +41,32 @@ class Lately:
             self._recent.popleft()
         if not self._minutes or utc_ms - self._minutes[-1][0] >= 60_000:
             self._minutes.append((utc_ms, reading))
+        self._drives = {
+            name: _of_minute(statistics)
+            for line in reading
+            for name, statistics in (self._last_minute(line) or reading[line]).drives.items()
+        }
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return how much of a line is used and planned, and the misses of the last minute."""
-        used = 0.0
+        """Return how much of a line is used and planned, its rate, and the misses of the last minute."""
         lately = self._since(self._recent[0][1] if self._recent else {}, name)
-        if lately is not None:
-            used = lately.utilisation
-        misses = self._since(self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}, name)
+        minute = self._last_minute(name)
         return {
-            "used": round(used, 4),
+            "used": None if lately is None else round(lately.utilisation, 4),
             "planned": round(self._planned.get(name, 0.0), 4),
-            "misses": sum(misses.misses.values()) if misses else 0,
+            "rate": None if lately is None else round(lately.exchanges_per_second, 1),
+            "p99": None if minute is None else _ms(minute.delays.p99),
+            "misses": sum(minute.misses.values()) if minute else 0,
         }
+
+    def drive_figures(self, name: str) -> dict[str, Any]:
+        """Return the share that was missed in the last minute, and the delay of a drive."""
+        return self._drives.get(name, {"missed": None, "p99": None})
+
+    def _last_minute(self, line: str) -> LineStatistics | None:
+        """Return what came in the last one to two minutes."""
+        earlier = self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}
+        return self._since(earlier, line)
 
     def _since(self, earlier: Reading, name: str) -> LineStatistics | None:
         now = self.newest.get(name)
@@ -66,11 +80,33 @@ class Lately:
         return found.drives.get(name) if found else None
 
     def hour(self, line: str) -> list[dict[str, Any]]:
-        """Return misses by reason in each of the last 60 minutes, the oldest first."""
+        """Return what was asked, and misses by reason, in each of the last 60 minutes, the oldest first."""
         readings = [*self._minutes, *([(0, self.newest)] if self.newest else [])]
         found = []
         for (begin_ms, before), (_, after) in pairwise(readings):
             if line in before and line in after and before[line] is not after[line]:
-                misses: Counter[str] = after[line].since(before[line]).misses
-                found.append({"time": begin_ms, "misses": {why: n for why, n in misses.items() if n > 0}})
+                minute = after[line].since(before[line])
+                found.append({"time": begin_ms, "asked": _asked(minute), "misses": misses_of(minute)})
         return found
+
+
+def misses_of(statistics: Statistics) -> dict[str, int]:
+    """Return the misses by reason, without those that never came."""
+    return {why: n for why, n in statistics.misses.items() if n > 0}
+
+
+def _asked(statistics: Statistics) -> int:
+    return statistics.samples + sum(statistics.misses.values())
+
+
+def _of_minute(statistics: Statistics) -> dict[str, Any]:
+    asked = _asked(statistics)
+    delays = statistics.delays
+    return {
+        "missed": round(1 - statistics.samples / asked, 4) if asked else None,
+        "p99": _ms(delays.p99) if delays.replies else None,
+    }
+
+
+def _ms(seconds: float) -> float:
+    return round(seconds * 1e3, 3)

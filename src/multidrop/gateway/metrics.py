@@ -20,7 +20,7 @@ Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
 
 
 class Figures(NamedTuple):
-    """What the gateway knows of itself."""
+    """Figures of the gateway itself."""
 
     version: str
     viewers: int
@@ -59,7 +59,7 @@ def _values(hub: Hub) -> Iterator[Sample]:
         for polled in line.drives:
             name = polled.drive.name
             for register in hub.polled(name):
-                row = hub.newest(name, register.name)
+                row = hub.last_good(name, register.name)
                 if row is None or row.value is None or not hub.is_fresh(name, register.name):
                     continue
                 labels = {"line": line.name, "drive": name, "register": register.name, "unit": register.unit}
@@ -130,7 +130,11 @@ def _family(name: str, kind: str, text: str, samples: Iterable[Sample]) -> Itera
     for suffix, labels, value in samples:
         if isfinite(value):
             inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
-            yield f"{name}{suffix}{{{inside}}} {value!r}\n" if inside else f"{name}{suffix} {value!r}\n"
+            yield (
+                f"{name}{suffix}{{{inside}}} {float(value)!r}\n"
+                if inside
+                else f"{name}{suffix} {float(value)!r}\n"
+            )
 
 
 def _escaped(text: str) -> str:

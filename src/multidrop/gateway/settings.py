@@ -63,7 +63,7 @@ class ServeSettings:
 
 
 class Folders:
-    """Where files are looked for: credentials of the service manager, and then beside the plant file.
+    """Folders in which files are found: the service manager's credentials, and then the plant file's own.
 
     What is written goes to the service's state folder, or else beside the plant file.
     """

@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from math import isfinite
 from typing import Any
 
-from multidrop import Bus, BusError, Drive, Plant
+from multidrop import Bus, BusError, Drive, NoReply, Plant
 
-PAUSE_S = 0.2  # between two reads: the polling keeps nearly all of the line
+PAUSE_S = 0.2  # between two reads on a line,
+SHARE = 20  # or so many times what the last one took, if that is more: the polling keeps the line
 LOOKED_S = 3.0  # after the last look nothing more is read
 MOST_DRIVES = 4  # that are looked at, at the same time
+
+UNANSWERED = "no reply"
 
 Found = dict[str, list[Any]]  # by register: value or null, UTC in ms, "ok" or the reason
 
 
 class SideReads:
-    """Reads of the drives that are looked at; each drive has one read under way at most."""
+    """Reads of the drives that are looked at, one at a time on each line; `is_there` tells who answers."""
 
     def __init__(
-        self, bus: Callable[[str], Bus], clock: Callable[[], float], utc_ms: Callable[[], int]
+        self,
+        bus: Callable[[str], Bus],
+        is_there: Callable[[str], bool],
+        clock: Callable[[], float],
+        utc_ms: Callable[[], int],
     ) -> None:
         self._bus = bus
+        self._is_there = is_there
+        self._turns: dict[str, asyncio.Lock] = {}  # by line
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
@@ -40,6 +50,11 @@ class SideReads:
             self._tasks[name] = asyncio.create_task(self._read(line.name, drive, names))
         return found
 
+    @property
+    def under_way(self) -> int:
+        """Return how many drives are read at present."""
+        return len(self._tasks)
+
     async def close(self) -> None:
         """Read no more."""
         for task in self._tasks.values():
@@ -47,22 +62,33 @@ class SideReads:
         await asyncio.gather(*self._tasks.values(), return_exceptions=True)
 
     async def _read(self, line: str, drive: Drive, registers: list[str]) -> None:
+        turn = self._turns.setdefault(line, asyncio.Lock())
+        found = self._found[drive.name]
         try:
             while registers:
-                for register in registers:
+                for register in [*registers]:
                     if self._clock() - self._looked[drive.name] > LOOKED_S:
                         return
-                    self._found[drive.name][register] = await asyncio.to_thread(
-                        self._read_one, line, drive, register
-                    )
-                    await asyncio.sleep(PAUSE_S)
+                    async with turn:
+                        await self._read_in_turn(line, drive, register)
+                    if found.get(register, ["", 0, ""])[2].startswith(UNANSWERED):
+                        registers.remove(register)  # each would cost its time-out
         finally:
             del self._tasks[drive.name]
             self._found.pop(drive.name, None)  # nobody is shown what nobody keeps up to date
 
+    async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
+        begun = self._clock()
+        if self._is_there(drive.name):
+            reading = asyncio.to_thread(self._read_one, line, drive, register)
+            self._found[drive.name][register] = await reading
+        await asyncio.sleep(max(PAUSE_S, SHARE * (self._clock() - begun)))
+
     def _read_one(self, line: str, drive: Drive, register: str) -> list[Any]:
         try:
             value = self._bus(line).read(drive, drive.registers[register])
+        except NoReply:
+            return [None, self._utc_ms(), UNANSWERED]
         except (BusError, ValueError) as failure:
             return [None, self._utc_ms(), str(failure)]
-        return [float(value), self._utc_ms(), "ok"]
+        return [float(value) if isfinite(value) else None, self._utc_ms(), "ok"]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop import Ledger, Statistics
 from multidrop.gateway.frames import lost_of
+from multidrop.gateway.lately import misses_of
 from multidrop.gateway.metrics import Figures
 
 if TYPE_CHECKING:
@@ -21,30 +22,42 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
     wear = await asyncio.to_thread(_wear, gateway.ledger, line.port, drive.address)  # it may wait for a lock
     found = gateway.side_reads.look(gateway.plant, name)
     statistics = gateway.lately.drive(line.name, name)
-    delays = statistics.delays if statistics else None
     return {
         "drive": name,
-        "delays": None
-        if delays is None
-        else {
-            "replies": delays.replies,
-            "p50_ms": round(delays.p50 * 1e3, 3),
-            "p99_ms": round(delays.p99 * 1e3, 3),
-            "longest_ms": round(delays.longest * 1e3, 3),
-        },
-        "misses": {why: n for why, n in statistics.misses.items() if n} if statistics else {},
-        "exchanges": statistics.exchanges if statistics else 0,
+        "delays": _delays(statistics),
+        "misses": misses_of(statistics) if statistics else {},
+        "asked": statistics.exchanges if statistics else 0,
         "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
         "values": found,
         "ledger": wear,
     }
 
 
+def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
+    if statistics is None:
+        return None
+    delays = statistics.delays
+    return {
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "longest": round(delays.longest * 1e3, 3),
+        "replies": delays.replies,
+        "counts": [[round(least * 1e3, 3), count] for least, count in statistics.delay_counts],
+    }
+
+
 def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
+    """Return the writes of a year to each cell of a drive's EEPROM, and how many it may have."""
     with contextlib.suppress(OSError):
+        book = ledger.at(port)
         return [
-            {"register": wear.cell.register, "writes": wear.writes, "this_year": wear.this_year}
-            for wear in ledger.at(port).wear(time.time())
+            {
+                "register": wear.cell.register,
+                "year": wear.this_year,
+                "budget": book.budget,
+                "total": wear.writes,
+            }
+            for wear in book.wear(time.time())
             if wear.cell.address == address
         ]
     return []
@@ -53,10 +66,9 @@ def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
 def look_at_lines(gateway: Gateway) -> dict[str, Any]:
     """Return what the page shows of the lines alone."""
     return {
-        line.name: gateway.lately.line(line.name)
-        | {
+        line.name: {
             "lost": lost_of(gateway.hub, line.name),
-            "hour": gateway.lately.hour(line.name),
+            "minutes": gateway.lately.hour(line.name),
             "drives": {
                 polled.drive.name: _drive_figures(gateway.lately.drive(line.name, polled.drive.name))
                 for polled in line.drives
@@ -102,13 +114,13 @@ def figures_of(gateway: Gateway) -> Figures:
     return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)
 
 
-def _drive_figures(drive: Statistics | None) -> dict[str, Any] | None:
-    if drive is None:
+def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:
+    if statistics is None:
         return None
-    delays = drive.delays
+    delays = statistics.delays
     return {
-        "p50_ms": round(delays.p50 * 1e3, 3),
-        "p99_ms": round(delays.p99 * 1e3, 3),
-        "misses": sum(drive.misses.values()),
-        "exchanges": drive.exchanges,
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "asked": statistics.exchanges,
+        "missed": sum(statistics.misses.values()),
     }

@@ -17,7 +17,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from multidrop import Refused
-from multidrop.gateway.audit import newest_records
+from multidrop.gateway.audit import MOST_RECORDS, newest_records
 from multidrop.gateway.commands import Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
@@ -63,6 +63,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/history", pages.history),
         Route("/api/export", pages.export),
         Route("/api/audit", pages.audit),
+        Route("/api/alarms", pages.alarms),
         Route("/health", pages.health),
         Route("/metrics", pages.metrics),
         Route("/api/stop", pages.stop, methods=["POST"]),
@@ -201,10 +202,17 @@ class _Pages:
         return PlainTextResponse(text, headers={"content-type": CONTENT_TYPE})
 
     async def audit(self, request: Request) -> Response:
-        before = request.query_params.get("before", "")
+        query = request.query_params
+        before, count = query.get("before", ""), _number(query.get("count", str(MOST_RECORDS)), "count")
         async with self._queries:
-            found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before)
+            found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before, count)
         return JSONResponse(found)
+
+    async def alarms(self, request: Request) -> Response:
+        query = request.query_params
+        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        found = self._gateway.events.between(begin, end)
+        return JSONResponse({"alarms": [alarm._asdict() for alarm in found]})
 
     # ---- history ----
 

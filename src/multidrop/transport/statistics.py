@@ -135,6 +135,14 @@ class Statistics:
         return Delays(counters.delays.total(), p50, p90, p99, counters.longest_ns / 1e9)
 
     @property
+    def delay_counts(self) -> list[tuple[float, int]]:
+        """Replies by their delay: the least delay of each bucket, in s, and how many there were.
+
+        Buckets without replies are left out. Their width is an eighth of their delay.
+        """
+        return [(delay_edge(bucket) / 1e9, n) for bucket, n in sorted(self.counters.delays.items()) if n > 0]
+
+    @property
     def diagnostics(self) -> Diagnostics:
         counters = self.counters
         return Diagnostics(

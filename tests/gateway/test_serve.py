@@ -1,0 +1,230 @@
+"""The command `serve` as its users and the service manager run it, in a process of its own."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import MULTIDROP, Run, multidrop
+from gateways import certificate, plant_text, written
+from lines import PATIENCE, until
+
+from multidrop import InvtCHE
+from multidrop.gateway.listener import listen
+from multidrop.gateway.rights import Right, digest, read_tokens
+from multidrop.sim import Simulator, Wire, simulated
+
+UNIT = Path(__file__).parents[2] / "packaging" / "multidrop@.service"
+
+
+@contextmanager
+def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
+    """A plant file whose line is simulated while the context lasts."""
+    drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
+    with Simulator([Wire(drives, unpaced=True)]) as simulator:
+        path = folder / "plant.toml"
+        path.write_text(plant_text(simulator.wires[0].path, ("pump-1", "pump-2"), serve))
+        yield path
+
+
+@contextmanager
+def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The command, once it is ready, and the address that it prints."""
+    words = [*MULTIDROP, "serve", str(path), *options]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert process.stderr is not None
+            assert line.startswith("ready "), process.stderr.read()
+            yield process, line.removeprefix("ready ").strip()
+        finally:
+            process.kill()
+
+
+def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE)
+        with simulated_plant(
+            tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
+        ) as path:
+            environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "400000"}
+            with serving(path, "--log", "json", **environment) as (process, url):
+                told = {manager.recv(1000).decode() for _ in range(6)}
+                assert "WATCHDOG=1" in told
+                assert any(one.startswith("READY=1\n") for one in told)
+                port = int(url.rstrip("/").rpartition(":")[2])
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+                with closing(connection):
+                    connection.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
+                    found = json.loads(connection.getresponse().read())
+                assert [one["done"] for one in found.values()] == [True, True]
+                process.send_signal(signal.SIGTERM)
+                out, errors = process.communicate(timeout=PATIENCE)
+                assert (process.returncode, out) == (0, "")
+                last = b""
+                while b"STOPPING=1" not in last:
+                    last = manager.recv(1000)
+    records = [json.loads(line) for line in errors.splitlines()]
+    (stop,) = [one for one in records if one["message"].startswith("stop of all drives")]
+    assert stop["message"] == "stop of all drives, asked for by anyone by http from 127.0.0.1"
+    assert (stop["level"], stop["logger"]) == ("warning", "multidrop.gateway")
+    assert all({"time", "level", "logger", "message"} <= one.keys() for one in records)
+
+
+def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
+    """They wait for frames of a plant that is read every ten minutes."""
+    with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n') as path:
+        path.write_text(path.read_text().replace("100 ms", "10 min"))
+        with serving(path) as (process, url), ExitStack() as stack:
+            port = int(url.rstrip("/").rpartition(":")[2])
+            viewers = []
+            for _ in range(5):
+                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+                viewers.append(stack.enter_context(closing(connection)))
+            first = json.loads(get(viewers[0], "/api/frame"))
+            until(lambda: get(viewers[0], "/metrics").count(b"multidrop_value{") == 8)
+            newest = json.loads(get(viewers[0], f"/api/frame?after={first['n']}"))["n"]
+            for viewer in viewers[1:]:
+                viewer.request("GET", f"/api/frame?after={newest}")
+            process.send_signal(signal.SIGTERM)
+            assert {viewer.getresponse().status for viewer in viewers[1:]} <= {200, 304}
+            _, errors = process.communicate(timeout=PATIENCE)
+            assert process.returncode == 0
+            assert "Traceback" not in errors
+
+
+def get(connection: http.client.HTTPConnection, path: str) -> bytes:
+    connection.request("GET", path)
+    return connection.getresponse().read()
+
+
+def test_tls(tmp_path: Path) -> None:
+    certificate(tmp_path, "own")
+    serve = '[serve]\nlisten = "127.0.0.1:0"\ncertificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n'
+    (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
+    with simulated_plant(tmp_path, serve) as path, serving(path) as (_, url):
+        assert url.startswith("https://127.0.0.1:")
+        port = int(url.rstrip("/").rpartition(":")[2])
+        context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
+        silent = socket.create_connection(("127.0.0.1", port))  # it says nothing, and holds nobody up
+        connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=PATIENCE)
+        connection.request("POST", "/api/token", '{"token": "secret"}', {"content-type": "application/json"})
+        response = connection.getresponse()
+        assert json.loads(response.read()) == {"name": "anna", "role": "stop"}
+        assert "Secure" in str(response.getheader("set-cookie"))
+        silent.close()
+        connection.close()
+
+
+def test_a_port_that_is_taken_is_one_sentence(tmp_path: Path) -> None:
+    with listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        written(tmp_path, f'[serve]\nlisten = "127.0.0.1:{port}"\n')
+        done = multidrop("serve", tmp_path / "plant.toml")
+    assert done.returncode == 1
+    assert (
+        done.stderr == f"multidrop: listen: 127.0.0.1:{port} cannot be had: another program listens there\n"
+    )
+
+
+def test_check_and_its_mistakes(run: Run, tmp_path: Path) -> None:
+    plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\n')
+    assert run("serve", "--check", plant.path) == (
+        0,
+        f"{plant.path}: no mistake found; http://localhost:80/, parts: none\n",
+        "",
+    )
+    written(tmp_path, "[serve]\nlisten = 80\n[serve.may]\nstop = 1\n")
+    status, out, errors = run("serve", "--check", plant.path)
+    assert (status, out) == (2, "")
+    assert errors.splitlines() == [
+        f'multidrop: {plant.path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
+        f'multidrop: {plant.path}: [serve.may]: stop = 1 is not right; write stop = "token"',
+    ]
+
+
+@pytest.mark.parametrize("command", ["check", "plan"])
+def test_other_commands_leave_the_table_alone(run: Run, tmp_path: Path, command: str) -> None:
+    plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\nnot_known = 1\n')
+    status, out, errors = run(command, plant.path)
+    assert (status, errors) == (0, "")
+    if command == "check":
+        found = f"No mistake found in {plant.path}: 1 lines, 2 drives"
+        assert out == f"{found}; `multidrop serve --check` checks its [serve].\n"
+
+
+def test_a_new_token_is_shown_once(run: Run) -> None:
+    status, line, told = run("serve", "--new-token", "stop", "--for", "anna")
+    assert status == 0
+    (token,), _ = read_tokens(line)
+    assert (token.name, token.right) == ("anna", Right.STOP)
+    assert told.startswith("multidrop: the token of anna, shown this once: ")
+    assert digest(told.rpartition(" ")[2].strip()) == token.sha256
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ((), "name a plant file, or try `multidrop serve --demo`"),
+        (("--demo", "plant.toml"), "--demo has a plant of its own: leave the plant file out"),
+        (
+            ("--new-token", "stop"),
+            "a new token needs a role and a name: multidrop serve --new-token stop --for anna",
+        ),
+        (
+            ("--new-token", "stop", "--for", "a b"),
+            "'a b' is no name for a token: letters, digits, . _ @ and - do, 64 at most",
+        ),
+    ],
+)
+def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None:
+    assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [("serve", "--demo", "--no-browser"), ("demo", "--web", "--no-browser")])
+def test_the_demo_is_live_and_everybody_here_may_stop_it(words: tuple[str, ...]) -> None:
+    with subprocess.Popen([*MULTIDROP, *words], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])
+
+            def read(path: str) -> dict[str, Any]:
+                with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
+                    found: dict[str, Any] = json.loads(get(connection, path))
+                    return found
+
+            plant = read("/api/plant")
+            assert plant["demo"] is True
+            assert plant["may"]["role"] == "write"
+            until(lambda: all(one["seen"] for one in dict(read("/api/frame")["drives"]).values()))
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE) == 0
+        finally:
+            process.kill()
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_the_unit_file_is_right_and_exposes_little(tmp_path: Path) -> None:
+    unit = tmp_path / "multidrop@hall.service"
+    unit.write_text(UNIT.read_text().replace("/opt/multidrop/bin/multidrop", "/bin/true"))
+    verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    judge = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", str(unit)]
+    judged = subprocess.run(judge, capture_output=True, text=True)
+    assert judged.returncode == 0, judged.stdout

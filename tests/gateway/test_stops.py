@@ -1,0 +1,276 @@
+"""Stops through the gateway: whatever else is broken or busy, they are sent, and seen to have stopped."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from broken_part import BrokenFeed
+from gateways import Served, running, served, written
+from lines import until
+
+from multidrop import PlantError
+from multidrop.gateway import parts
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.parts import Part
+from multidrop.gateway.rights import Right
+from multidrop.gateway.settings import read_settings
+
+MAY = """[serve.may]
+stop = "anyone"
+write = ["pump-1.setpoint", "pump-2.setpoint"]
+verbs = ["pump-1.start", "pump-2.start", "pump-1.set_frequency", "pump-1.jog"]
+"""
+BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
+
+
+@pytest.fixture
+def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("history", "mqtt"):
+        broken = Part("broken_part", "BrokenSettings", "build", "broken")
+        monkeypatch.setitem(parts.PARTS, name, broken)  # type: ignore[arg-type]
+
+
+def start(gateway: Served, *drives: str) -> None:
+    """Start motors by the gateway's own way."""
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
+    for drive in drives:
+        value = {"drive": drive, "register": "setpoint", "value": 50.0}
+        assert gateway.post("/api/write", value, **writer).json["done"] is True
+        told = gateway.post("/api/act", {"drive": drive, "verb": "start", "options": {}}, **writer).json
+        assert told == {"done": True, "text": f"{drive}: start is done"}
+        assert gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
+
+
+def stands(gateway: Served, drive: str) -> bool:
+    return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
+
+
+def test_all_drives_are_stopped_and_seen_to_stand(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        gateway.await_state("pump-1", "runs")
+        told = gateway.post("/api/stop", {"drives": None}).json
+        assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
+        assert all("seen to stand" in one["text"] for one in told.values())
+        assert stands(gateway, "pump-1")
+        assert stands(gateway, "pump-2")
+        gateway.await_state("pump-1", "stands")
+
+
+def test_one_drive_is_stopped_and_the_other_runs_on(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
+        assert told["pump-1"]["done"] is True
+        assert told["pump-9"] == {"done": False, "text": "there is no drive 'pump-9'"}
+        assert stands(gateway, "pump-1")
+        assert not stands(gateway, "pump-2")
+
+
+@pytest.mark.usefixtures("_broken_parts")
+def test_a_stop_works_while_all_parts_are_broken(tmp_path: Path) -> None:
+    with served(tmp_path, BROKEN) as gateway:
+        assert isinstance(gateway.gateway.feeds["mqtt"], BrokenFeed)
+        start(gateway, "pump-1", "pump-2")
+        until(lambda: gateway.gateway.failures.get("history", 0) > 3)
+        told = gateway.post("/api/stop").json
+        assert [one["done"] for one in told.values()] == [True, True]
+        health = gateway.get("/health")
+        assert health.status == 200
+        assert health.json["status"] == "degraded"
+        assert health.json["parts"] == {
+            "history": "RuntimeError: no broker",
+            "mqtt": "RuntimeError: no broker",
+        }
+        gateway.await_state("pump-1", "stands")
+        assert 'multidrop_part_failures_total{part="history"}' in gateway.get("/metrics").body.decode()
+
+
+def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+
+        def fail(*arguments: object, **more: object) -> None:
+            raise ZeroDivisionError
+
+        for broken in ("hub.take", "hub.seen", "events.look", "frames.note_news", "lately.tick"):
+            name, method = broken.split(".")
+            monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
+        until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
+        assert gateway.get("/api/frame").status == 500
+        assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+
+
+def test_a_stop_waits_for_no_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writes that hang fill all that is kept for them, and further ones are refused; stops go on."""
+    held, entered = threading.Event(), []
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        bus = gateway.gateway.bus("hall")
+
+        def hang(*arguments: object) -> None:
+            entered.append(arguments)
+            held.wait()
+            raise ValueError("it was held up")
+
+        monkeypatch.setattr(bus, "try_write", hang)
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+        found: list[str] = []
+        writes = [
+            threading.Thread(
+                target=lambda: found.append(gateway.post("/api/write", body, **writer).json["text"])
+            )
+            for _ in range(12)
+        ]
+        try:
+            for write in writes:
+                write.start()
+            until(lambda: len(entered) == 8 and len(found) == 4)
+            assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+        finally:
+            held.set()
+        for write in writes:
+            write.join()
+        assert sorted(found) == [
+            *["it was held up"] * 8,
+            *["pump-1.setpoint = 10.0 was not sent: 8 others are under way on line hall"] * 4,
+        ]
+
+
+def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -> None:
+    """A command whose thread begins only after the stop was called finds that out."""
+    begun: list[threading.Thread] = []
+
+    class Late(threading.Thread):
+        def start(self) -> None:
+            begun.append(self)
+
+    with served(tmp_path, MAY) as gateway:
+        commands = gateway.gateway.commands
+        start(gateway, "pump-1")
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        body = {"drive": "pump-1", "verb": "start", "options": {}}
+        told: list[str] = []
+        asked = threading.Thread(
+            target=lambda: told.append(gateway.post("/api/act", body, **writer).json["text"])
+        )
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("multidrop.gateway.commands.threading", SimpleNamespace(Thread=Late))
+            asked.start()
+            until(lambda: len(begun) == 1)
+        assert gateway.post("/api/stop").json["pump-1"]["done"] is True
+        threading.Thread.start(begun[0])
+        asked.join()
+        assert told == ["pump-1.start was not sent: a stop was called"]
+        assert stands(gateway, "pump-1")
+        assert commands.called == 4
+
+
+def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None:
+    class NoThread(threading.Thread):
+        def start(self) -> None:
+            raise RuntimeError("can't start new thread")
+
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("multidrop.gateway.commands.threading", SimpleNamespace(Thread=NoThread))
+            writer = {"authorization": gateway.bearer(Right.WRITE)}
+            body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+            told = gateway.post("/api/write", body, **writer).json
+            assert told == {"done": False, "text": "can't start new thread"}
+            assert gateway.post("/api/stop").json["pump-1"]["done"] is True
+        assert stands(gateway, "pump-1")
+
+
+def test_a_silent_drives_stop_says_so_and_holds_no_other_up(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        start(gateway, "pump-1", "pump-2")
+        gateway.sims["pump-2"].deaf_until = float("inf")
+        gateway.await_state("pump-2", "silent")
+        found: list[object] = []
+        asked = threading.Thread(target=lambda: found.append(gateway.post("/api/stop").json))
+        asked.start()
+        until(lambda: stands(gateway, "pump-1"))
+        gateway.sims["pump-2"].deaf_until = 0.0
+        asked.join()
+        assert stands(gateway, "pump-2")
+        assert [one["done"] for one in found[0].values()] == [True, True]  # type: ignore[attr-defined]
+
+
+def test_verbs_and_writes_say_what_became_of_them(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+
+        def act(verb: str, **options: object) -> str:
+            body = {"drive": "pump-1", "verb": verb, "options": options}
+            text: str = gateway.post("/api/act", body, **writer).json["text"]
+            return text
+
+        def write(value: float) -> str:
+            body = {"drive": "pump-1", "register": "setpoint", "value": value}
+            text: str = gateway.post("/api/write", body, **writer).json["text"]
+            return text
+
+        assert write(50.0) == "pump-1: setpoint = 50.00 %: done (read back)"
+        assert write(150.0) == (
+            "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
+        )
+        assert act("fly") == (
+            "there is no verb 'fly'; there are start, jog, reset_fault, set_frequency, coast, "
+            "emergency_stop, stop"
+        )
+        assert act("start", direction="up") == "direction = 'up' is neither forward nor reverse"
+        assert act("start", at=5) == "start has no option 'at'; it has direction"
+        assert act("set_frequency") == "set_frequency needs a frequency: hz = 20.0"
+        assert act("set_frequency", hz="fast") == "hz = 'fast' is no number"
+        assert act("set_frequency", hz=20) == (
+            "pump-1 takes its setpoint in percent of P0.04: declare maximum_frequency = HZ"
+        )
+
+
+@pytest.mark.usefixtures("_broken_parts")
+def test_a_part_that_cannot_begin_is_one_sentence(tmp_path: Path) -> None:
+    for how, sentence in (
+        (
+            "library",
+            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'multidrop\[broken\]'",
+        ),
+        ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),
+    ):
+        with (
+            pytest.raises(ValueError, match=sentence),
+            served(tmp_path, f'[serve.mqtt]\nbreaks = "{how}"\n'),
+        ):
+            pass
+    plant = written(tmp_path, '[serve.mqtt]\nbreaks = "somehow"\n[serve.history]\nbreks = 1\n')
+    with pytest.raises(PlantError) as wrong:
+        read_settings(plant, {})
+    assert [one.partition(": ")[2] for one in wrong.value.mistakes] == [
+        "[serve.history]: unknown key 'breks'; did you mean 'breaks'?",
+        "[serve.mqtt]: breaks = 'somehow' is no way to break",
+        "[serve.mqtt]: nor would another one be",
+    ]
+
+
+def test_a_part_that_this_version_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = Part("multidrop.gateway.nosuch", "Settings", "build", "")
+    monkeypatch.setitem(parts.PARTS, "mqtt", missing)  # type: ignore[arg-type]
+    plant = written(tmp_path, "[serve.mqtt]\n")
+    with pytest.raises(PlantError, match=r"\[serve.mqtt\]: this version of multidrop has no such part"):
+        read_settings(plant, {})
+
+
+def test_nothing_is_left_open_where_a_port_is_missing(tmp_path: Path) -> None:
+    plant = written(tmp_path, port=str(tmp_path / "nosuch"))
+    settings = read_settings(plant, {})
+    gateway = Gateway(plant, settings)
+    with pytest.raises(OSError, match="nosuch"), running(gateway):
+        pass
+    assert gateway.listener.fileno() == -1
