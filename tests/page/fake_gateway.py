@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import socket
 import threading
 import time
@@ -171,11 +172,12 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
 
 
 def drive(name: str, gateway: FakeGateway) -> dict[str, Any]:
+    counts = [[i, int(900 * math.exp(-((i - 4) ** 2) / 3))] for i in range(16)]
     hour = int((gateway.began - 3600) * 1000)
     return {
-        "drive": name, "delays": {"replies": 5116, "p50_ms": 4.1, "p99_ms": 6.1, "longest_ms": 9.3},
-        "misses": {"no reply": 3, "bad CRC": 1}, "exchanges": 5120, "timeout_ms": 30.0,
-        "ledger": [{"register": "acceleration_time", "writes": 12, "this_year": 2}],
+        "delays": {"p50": 4.1, "p99": 6.1, "longest": 9.3, "counts": counts},
+        "misses": {"no reply": 3, "bad CRC": 1},
+        "asked": 5120, "ledger": [{"register": "acceleration_time", "year": 2, "budget": 100, "total": 12}],
         "values": {
             "acceleration_time": [20.0, hour, "ok"],
             "run_hours": [4012, int(time.time() * 1000), "ok"],
@@ -189,20 +191,21 @@ def plant(handler: Any, gateway: FakeGateway, _: object) -> None:
 
 def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
     start = int(gateway.began // 60 * 60 - 3540) * 1000
-    hour = [
-        {"time": start + 60000 * m, "misses": {"no reply": 14 if m > 40 else 0, "bad CRC": m % 7 // 5}}
+    noisy = [
+        {
+            "time": start + 60000 * m, "asked": 1480,
+            "misses": {"no reply": 14 if m > 40 else 0, "bad CRC": m % 7 // 5},
+        }
         for m in range(60)
-    ]
-    quiet = [{"time": start + 60000 * m, "misses": {}} for m in range(60)]
-    asked = int(10 * (time.time() - gateway.began + 500))
+    ]  # fmt: skip
+    quiet = [{"time": start + 60000 * m, "asked": 6060, "misses": {}} for m in range(60)]
     told = {}
     for n, line in enumerate(fake_plant.plant(gateway.renamed)["lines"]):
-        told[line["name"]] = fake_plant.lines()[line["name"]] | {
-            "hour": hour if n == 1 else quiet,
+        told[line["name"]] = {
+            "minutes": noisy if n == 1 else quiet,
             "drives": {
                 d["name"]: {
-                    "p50_ms": 3 + i % 4, "p99_ms": 6 + i % 5, "exchanges": asked,
-                    "misses": asked * ((n, i) == (1, 5)) + asked * 31 // 1000 * ((n, i) == (2, 1)),
+                    "p50": 3 + i % 4, "p99": 6 + i % 5, "asked": 5120, "missed": 3 * ((n, i) == (1, 5)),
                 }
                 for i, d in enumerate(line["drives"])
             },
@@ -236,6 +239,12 @@ def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> 
     handler.tell({"step_ms": step, "series": series})
 
 
+def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> None:
+    start, end = float(asked["from"][0]), float(asked["to"][0])
+    found = fake_plant.alarms(gateway.renamed, gateway.began)
+    handler.tell({"alarms": [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]})
+
+
 def audit(handler: Any, gateway: FakeGateway, _: object) -> None:
     def entry(age: float, **more: object) -> dict[str, object]:
         at = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(gateway.began - age))
@@ -245,12 +254,12 @@ def audit(handler: Any, gateway: FakeGateway, _: object) -> None:
             "address": 1, "sent": "01 06 20 01 01 F4 D2 1D", **more,
         }  # fmt: skip
 
-    handler.tell([
+    handler.tell({"more": False, "entries": [
         entry(300, write="frequency_setpoint = 38.0", outcome="confirmed", held=38.0,
               by="anna by page from 10.0.0.14"),
         entry(900, write="stop", outcome="confirmed", by="anna by page from 10.0.0.14"),
         entry(7300, write="start", outcome="unconfirmed", why="no reply", by="scada by http from 10.0.0.2"),
-    ])  # fmt: skip
+    ]})  # fmt: skip
 
 
 def export(handler: Any, _: object, asked: dict[str, list[str]]) -> None:
@@ -259,6 +268,6 @@ def export(handler: Any, _: object, asked: dict[str, list[str]]) -> None:
 
 
 ANSWERS = {
-    "/api/plant": plant, "/api/lines": lines, "/api/history": history, "/api/audit": audit,
-    "/api/export": export,
+    "/api/plant": plant, "/api/lines": lines, "/api/history": history, "/api/alarms": alarms,
+    "/api/audit": audit, "/api/export": export,
 }  # fmt: skip

@@ -135,13 +135,14 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
         if name in SILENT:
             seen = began - SILENT[name]
             old = values(name, number, seen)
-            rows = {r: [old[r], ms(seen), "no reply"] for r in polled}
+            rows = {r: [None, ms(now), "no reply", old[r], ms(seen)] for r in polled}
         else:
             seen = at
             rows = {r: [held[r], ms(at), "ok"] for r in polled}
         drives[renamed.get(name, name)] = {
             "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": ms(seen),
             "values": rows, "why": "no reply" if name in SILENT else None,
+            "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
         }  # fmt: skip
     return {
         "n": n, "revision": 1, "time": str(int(now * 1e9)), "drives": drives, "lines": lines(),
@@ -151,7 +152,11 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
 
 def lines() -> dict[str, Any]:
     used, planned, misses = (0.72, 0.94, 0.61), (0.71, 0.93, 0.62), (0, 14, 0)
+    rate, p99 = (101.3, 24.8, 92.4), (6.1, 11.9, 5.4)
     return {
-        f"hall-{n + 1}": {"used": used[n], "planned": planned[n], "misses": misses[n], "lost": None}
+        f"hall-{n + 1}": {
+            "used": used[n], "planned": planned[n], "misses": misses[n], "lost": None, "rate": rate[n],
+            "p99": p99[n],
+        }
         for n in range(3)
-    }
+    }  # fmt: skip

@@ -11,7 +11,6 @@ import * as lines from "./lines.js";
 import { run } from "./link.js";
 import * as markers from "./markers.js";
 import * as plots from "./panel_plots.js";
-import * as rates from "./rates.js";
 import * as settings from "./settings.js";
 import { stopOne } from "./stop.js";
 import { onPlant, store, takePlant } from "./store.js";
@@ -87,7 +86,6 @@ function tick() {
   if (view === "faults" && beat % 10 === 0) safely(faults.show);
   if (view === "lines" && beat % 30 === 0) lines.show();
   if (view === "drives" && beat % 20 === 0) drive.refresh();
-  if (view === "drives" && beat % 50 === 10) rates.keepUp();
 }
 
 // Make plots anew: their size, colours or times are others.

@@ -4,7 +4,7 @@ import { get, query } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named } from "./dom.js";
 
-const FULL = 200; // of an answer: where there are fewer, there are no older ones
+const COUNT = 100;
 const DONE = /^(ok|confirmed|done|written|unchanged)/i;
 
 let entries = [],
@@ -35,9 +35,9 @@ const older = () => fetchMore(entries.length ? entries[entries.length - 1].time 
 async function fetchMore(before) {
   const list = find("#log-list");
   try {
-    const told = await get(`api/audit${before && `?${query({ before })}`}`);
-    entries = before ? entries.concat(told) : told;
-    more = told.length === FULL;
+    const told = await get(`api/audit?${query({ ...(before && { before }), count: COUNT })}`);
+    entries = before ? entries.concat(told.entries) : told.entries;
+    more = Boolean(told.more);
     fill(
       list,
       entries.length ? auditRows(entries, true) : make("p", { class: "note" }, "Nothing was written yet."),

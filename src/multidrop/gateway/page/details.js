@@ -4,7 +4,7 @@ import { get } from "./api.js";
 import { auditRows } from "./audit.js";
 import { fill, find, make } from "./dom.js";
 import { takeOthers } from "./registers.js";
-import { milliseconds, share, words } from "./values.js";
+import { UNKNOWN, milliseconds, share, words } from "./values.js";
 
 let name = null;
 
@@ -24,7 +24,7 @@ export async function refresh() {
   const asked = name;
   const [told, log] = await Promise.allSettled([
     get(`api/drive/${encodeURIComponent(asked)}`),
-    get("api/audit"),
+    get("api/audit?count=200"),
   ]);
   if (asked !== name || !find("#delays")) return;
   if (told.status === "fulfilled") takeOthers(told.value.values);
@@ -42,15 +42,15 @@ export async function refresh() {
   );
 }
 
-function delays({ delays, misses, exchanges: asked, ledger }) {
+function delays({ delays, misses, asked, ledger }) {
   const total = Object.values(misses ?? {}).reduce((sum, n) => sum + n, 0);
   return [
     make(
       "p",
       { class: "note" },
-      `Response delay: half within ${milliseconds(delays?.p50_ms)}, 99 % within ` +
-        `${milliseconds(delays?.p99_ms)}, all within ${milliseconds(delays?.longest_ms)}.`,
+      `Response delay: half within ${milliseconds(delays?.p50)}, 99 % within ${milliseconds(delays?.p99)}.`,
     ),
+    delays?.counts?.length ? histogram(delays.counts) : null,
     make(
       "p",
       { class: "note" },
@@ -78,16 +78,43 @@ function delays({ delays, misses, exchanges: asked, ledger }) {
       ? make(
           "p",
           { class: "note" },
-          "EEPROM writes, and this year's: " +
-            ledger.map(l => `${words(l.register)} ${l.writes}, ${l.this_year}`).join("; "),
+          "EEPROM writes of the last year: " +
+            ledger.map(l => `${words(l.register)} ${l.year} of ${l.budget ?? UNKNOWN}`).join(", "),
         )
       : null,
   ].filter(Boolean);
 }
 
-function writes(entries, drive) {
-  const own = entries.filter(entry => entry.drive === drive);
+// Draw counts by delay as bars, each with its span and number as a text.
+function histogram(counts) {
+  const most = Math.max(...counts.map(([, n]) => n)),
+    last = counts[counts.length - 1][0];
+  const bars = counts.map(([from, n], i) => {
+    const end = i + 1 < counts.length ? `to ${milliseconds(counts[i + 1][0])}` : "and more";
+    const bar = make("i", { title: `${milliseconds(from)} ${end}: ${n}` });
+    bar.style.height = `${most ? Math.max(n ? 4 : 0, (n / most) * 100) : 0}%`;
+    return bar;
+  });
+  return make(
+    "div",
+    {
+      class: "histogram",
+      role: "img",
+      "aria-label": `Replies by response delay, ${milliseconds(counts[0][0])} to ${milliseconds(last)}`,
+    },
+    make("div", { class: "bars" }, bars),
+    make(
+      "div",
+      { class: "ends" },
+      make("span", {}, milliseconds(counts[0][0])),
+      make("span", {}, milliseconds(last)),
+    ),
+  );
+}
+
+function writes({ entries }, drive) {
+  const own = (entries ?? []).filter(entry => entry.drive === drive);
   return own.length
     ? auditRows(own.slice(0, 20), false)
-    : make("p", { class: "note" }, "None among the newest of the log.");
+    : make("p", { class: "note" }, "None among the newest 200 of the log.");
 }

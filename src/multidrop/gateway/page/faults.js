@@ -1,15 +1,28 @@
 // Faults, silences and lost ports: those that last, and those that ended.
 
+import { get, query } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named } from "./dom.js";
 import { now } from "./link.js";
 import { alarms } from "./store.js";
 
 const WORDS = { fault: "fault", silent: "silent", port: "port lost" };
+const SPAN_MS = 30 * 86400e3;
 const AROUND_MS = 15 * 60e3;
 
 let shown = "",
   shownAt = 0;
+
+// Return what was wrong between two times, newest first: as the gateway remembers it, or as the frame has it.
+export async function read(from, to) {
+  const known = alarms();
+  try {
+    const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
+    return known.filter(alarm => alarm.kind === "port").concat(told.alarms);
+  } catch {
+    return known.filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to);
+  }
+}
 
 export function begin() {
   fill(
@@ -18,15 +31,19 @@ export function begin() {
       "div",
       { class: "card" },
       make("h2", {}, "Faults and silences"),
-      make("p", { class: "note" }, "What lasts, and the newest that ended since the daemon began."),
+      make(
+        "p",
+        { class: "note" },
+        "What lasts, and what ended in the last 30 days since the daemon began.",
+      ),
       make("div", { id: "fault-list", class: "scroll" }),
     ),
   );
 }
 
 // Draw the list anew, where it is another one.
-export function show() {
-  const found = alarms(),
+export async function show() {
+  const found = await read(now() - SPAN_MS, now()),
     sign = JSON.stringify([found, clock.zoneName()]),
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;

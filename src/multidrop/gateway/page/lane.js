@@ -1,20 +1,24 @@
 // Faults and silences as bars over the time that the trends show.
 
 import { fill, glyph, make, named } from "./dom.js";
+import { read } from "./faults.js";
 import { now } from "./link.js";
-import { alarms as known } from "./store.js";
 
 const KINDS = [
   ["fault", "faults"],
   ["silent", "silent"],
 ];
+let serial = 0;
+
 // Draw the alarms of these drives between two times into a place.
-export function draw(place, from, to, drives) {
+export async function draw(place, from, to, drives) {
+  const mine = ++serial;
   if (!drives.length) {
     fill(place);
     return;
   }
-  const alarms = known().filter(alarm => drives.includes(alarm.drive));
+  const alarms = (await read(from, to)).filter(alarm => drives.includes(alarm.drive));
+  if (mine !== serial) return;
   fill(
     place,
     KINDS.map(([kind, title]) => {

@@ -1,9 +1,9 @@
 // The lines: wire used against plan, misses by reason over the last hour, delays of each drive.
 
+import { get } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named } from "./dom.js";
 import { misses } from "./misses.js";
-import * as rates from "./rates.js";
 import { isLive, store } from "./store.js";
 import { now } from "./link.js";
 import { milliseconds, share, UNKNOWN } from "./values.js";
@@ -16,7 +16,7 @@ export async function show() {
   let told = {},
     error = null;
   try {
-    told = await rates.fetchLines();
+    told = await get("api/lines");
   } catch (problem) {
     error = problem.message;
   }
@@ -42,13 +42,13 @@ function card(line, told) {
       `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${line.drives.length} drives`,
     ),
     frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
-    figures(frame, rates.line(line.name)),
-    misses(told?.hour ?? []),
+    figures(frame),
+    misses(told?.minutes ?? []),
     delays(line, told?.drives ?? {}),
   );
 }
 
-function figures({ used = null, planned = null, misses: missed = null }, rate) {
+function figures({ used = null, planned = null, rate = null, p99 = null, misses: missed = null }) {
   const isOver = used !== null && planned !== null && used > planned + 0.05;
   const bar = make("span", {
     class: "use",
@@ -67,6 +67,7 @@ function figures({ used = null, planned = null, misses: missed = null }, rate) {
       [share(planned), isOver ? make("small", { class: "warn" }, " more is used than planned") : null],
     ],
     ["Exchanges", [rate === null ? UNKNOWN : `${rate.toFixed(1)} /s`]],
+    ["Delay, 99 % within", [milliseconds(p99)]],
     [
       "Missed in the last minute",
       [make("span", { class: missed > 0 ? "warn" : "" }, missed === null ? UNKNOWN : String(missed))],
@@ -80,7 +81,7 @@ function figures({ used = null, planned = null, misses: missed = null }, rate) {
 }
 
 function delays(line, told) {
-  const most = Math.max(1, ...Object.values(told).map(d => d?.p99_ms ?? 0));
+  const most = Math.max(1, ...Object.values(told).map(d => d?.p99 ?? 0));
   return make(
     "section",
     {},
@@ -110,9 +111,9 @@ function delays(line, told) {
               half = make("i"),
               tail = make("u"),
               bar = make("span", { class: "delay", "aria-hidden": "true" }, half, tail);
-            half.style.width = `${((d.p50_ms ?? 0) / most) * 100}%`;
-            tail.style.left = `${((d.p99_ms ?? 0) / most) * 100}%`;
-            bar.hidden = typeof d.p99_ms !== "number";
+            half.style.width = `${((d.p50 ?? 0) / most) * 100}%`;
+            tail.style.left = `${((d.p99 ?? 0) / most) * 100}%`;
+            bar.hidden = d.p99 === null || d.p99 === undefined;
             return make(
               "tr",
               {},
@@ -121,13 +122,13 @@ function delays(line, told) {
                 { scope: "row" },
                 make("a", { href: `#/drives/${encodeURIComponent(name)}` }, named(name)),
               ),
-              make("td", {}, milliseconds(d.p50_ms)),
-              make("td", {}, milliseconds(d.p99_ms)),
+              make("td", {}, milliseconds(d.p50)),
+              make("td", {}, milliseconds(d.p99)),
               make("td", {}, bar),
               make(
                 "td",
-                { class: d.misses ? "warn" : "" },
-                d.exchanges ? `${d.misses} of ${d.exchanges}, ${share(d.misses / d.exchanges)}` : UNKNOWN,
+                { class: d.missed ? "warn" : "" },
+                d.asked ? `${d.missed} of ${d.asked}, ${share(d.missed / d.asked)}` : UNKNOWN,
               ),
             );
           }),

@@ -2,19 +2,22 @@
 
 import * as clock from "./clock.js";
 import { colour, make } from "./dom.js";
+import { share } from "./values.js";
 
 const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
 
 // Draw one bar for each minute, stacked by reason, and the hour's sums as a table.
 export function misses(minutes) {
   const sums = new Map();
+  let asked = 0;
   for (const minute of minutes) {
+    asked += minute.asked ?? 0;
     for (const [reason, n] of Object.entries(minute.misses)) sums.set(reason, (sums.get(reason) ?? 0) + n);
   }
   const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
     total = [...sums.values()].reduce((a, b) => a + b, 0);
   if (!minutes.length) return make("p", { class: "note" }, "No misses counted yet.");
-  const head = make("h3", {}, `Missed in the last hour: ${total}`);
+  const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
   if (!total) return make("section", {}, head);
   const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));
   return make(
@@ -42,7 +45,7 @@ export function misses(minutes) {
         make(
           "tr",
           {},
-          ["Reason", "Missed"].map(h => make("th", { scope: "col" }, h)),
+          ["Reason", "Missed", "Share"].map(h => make("th", { scope: "col" }, h)),
         ),
       ),
       make(
@@ -54,6 +57,7 @@ export function misses(minutes) {
             {},
             make("th", { scope: "row" }, swatch(i), reason),
             make("td", {}, String(sums.get(reason))),
+            make("td", {}, share(asked ? sums.get(reason) / asked : null)),
           ),
         ),
       ),

@@ -1,7 +1,6 @@
 // One row of the table for each drive, and one above each line's.
 
 import * as clock from "./clock.js";
-import * as rates from "./rates.js";
 import { fill, glyph, make, named, put, setClass } from "./dom.js";
 import { driveAge, isLive, key, reading, state, store } from "./store.js";
 import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
@@ -106,7 +105,7 @@ export function drawRow(r, t) {
   r.set.hidden = !(s && s.value !== null && !s.isOld);
   if (!r.set.hidden) r.set.style.left = `${Math.min(100, (s.value / full) * 100)}%`;
   put(r.age, age === null ? UNKNOWN : clock.lasting(age));
-  const missed = rates.missed(own.line.name, r.name);
+  const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
   setClass(r.missed, "warn", missed > 0);
   return changed;
@@ -128,8 +127,7 @@ function drawState(r, is, drive, age, t) {
 
 export function drawHead(h) {
   const line = store.frame?.lines[h.line.name];
-  const rate = rates.line(h.line.name);
-  const { used = null, planned = null, misses = null, lost = null } = line ?? {};
+  const { used = null, rate = null, planned = null, misses = null, lost = null } = line ?? {};
   h.used.style.width = `${Math.min(1, used ?? 0) * 100}%`;
   h.planned.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
   h.planned.hidden = planned === null;

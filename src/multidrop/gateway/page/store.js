@@ -50,12 +50,14 @@ export function takeFrame(frame) {
   }
 }
 
-// A row is the newest good value, its time, and what became of the newest request.
-function keep(drive, register, [value, ms, status]) {
+// A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] where the newest request failed.
+function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
   if (value !== null) drive.good.set(register, { value, ms });
+  else if (lastMs > (drive.good.get(register)?.ms ?? 0))
+    drive.good.set(register, { value: lastValue, ms: lastMs });
   if (!drive.pasts.has(register)) drive.pasts.set(register, new Ring(most()));
   const isGood = status === "ok" && value !== null;
-  drive.pasts.get(register).add(isGood ? ms : store.time, isGood ? value : NaN);
+  drive.pasts.get(register).add(ms, isGood ? value : NaN);
 }
 
 function most() {
