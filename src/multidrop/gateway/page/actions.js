@@ -9,6 +9,7 @@ import { text, unit, withUnit, words } from "./values.js";
 
 const MOST = 20; // outcomes that are kept on the page; the log has all
 const outcomes = [];
+const WITH_HZ = new Set(["set_frequency"]);
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
 // Make the verbs that the page's user may give, and the place where outcomes stand.
@@ -77,23 +78,35 @@ async function deliver(drive, what, path, body) {
   }
 }
 
-// Ask, and give a verb.
+// Ask, and give a verb: with a frequency where it takes one.
 export async function act(drive, verb) {
-  const turns = TURNS.some(word => verb.includes(word));
+  const turns = TURNS.some(word => verb.includes(word)),
+    field = WITH_HZ.has(verb) ? hertz() : null;
   const warning = turns
     ? "The motor will turn. Make sure that nobody is near what it drives."
     : "It is sent once.";
-  const title = [`${words(verb)}: `, named(drive), "?"];
-  if (
-    await confirm(
-      title,
-      [make("p", { class: turns ? "bad" : "" }, warning)],
-      [`${words(verb)} `, named(drive)],
-    )
-  ) {
-    await deliver(drive, words(verb), "api/act", { drive, verb, options: {} });
-  }
+  const contents = [make("p", { class: turns ? "bad" : "" }, warning)];
+  if (field) contents.push(make("label", { class: "field", for: field.id }, "Frequency, Hz", field));
+  const asks = field ? confirmForm : confirm;
+  if (!(await asks([`${words(verb)}: `, named(drive), "?"], contents, [`${words(verb)} `, named(drive)])))
+    return;
+  const options = field ? { hz: Number(field.value) } : {};
+  await deliver(drive, field ? `${words(verb)} ${options.hz} Hz` : words(verb), "api/act", {
+    drive,
+    verb,
+    options,
+  });
 }
+
+const hertz = () =>
+  make("input", {
+    id: "new-value",
+    type: "number",
+    min: 0,
+    step: "any",
+    required: true,
+    "data-first": true,
+  });
 
 // Ask for a value, and write it.
 export async function change(drive, register) {

@@ -3,7 +3,7 @@
 import { change } from "./actions.js";
 import * as clock from "./clock.js";
 import { make, put } from "./dom.js";
-import { mayWrite, reading, store } from "./store.js";
+import { key, mayWrite, reading, store } from "./store.js";
 import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
 
 const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
@@ -51,7 +51,7 @@ function row({ register, value, age }) {
       "td",
       {},
       value.whole,
-      mayWrite(name, register.name)
+      isOffered(register)
         ? make(
             "button",
             {
@@ -67,6 +67,10 @@ function row({ register, value, age }) {
     age,
   );
 }
+
+// Commands are given by verbs, but for the setpoint.
+const isOffered = ({ name: register, access }) =>
+  (access === "setting" || register === key(name, "setpoint")) && mayWrite(name, register);
 
 // Return the register's place in the manual, and what may be asked of it.
 function about({ place, access, least, most, step, period_s: period, ...register }) {

@@ -99,7 +99,8 @@ export function drawRow(r, t) {
   showValue(r.frequency, f, own.registers.get(frequency));
   showValue(r.current, current && reading(r.name, current, t), own.registers.get(current), false);
   const full = own.registers.get(setpoint)?.most ?? FULL_HZ;
-  const isBar = Boolean(f && f.value !== null && !f.isOld);
+  const isHertz = own.registers.get(frequency)?.unit === "Hz";
+  const isBar = Boolean(isHertz && f && f.value !== null && !f.isOld);
   r.bars.hidden = !isBar;
   if (isBar) r.bar.style.width = `${Math.min(100, (Math.abs(f.value) / full) * 100)}%`;
   r.set.hidden = !(s && s.value !== null && !s.isOld);

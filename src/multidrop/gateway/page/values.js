@@ -52,11 +52,13 @@ export function makeValue() {
 }
 
 // Show a reading (see store.reading) in what `makeValue` made.
-export function showValue(parts, reading, register, isDated = true) {
+export function showValue(parts, reading, register, isDated = true, isNamed = isDated) {
   const isThere = reading !== null && reading.value !== null;
   const isOld = isThere && reading.isOld;
   set(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
-  set(parts.unit, isThere ? unit(register) : "");
+  // a number without a unit says what it is
+  const isBare = !unit(register) && register?.kind === "number" && isNamed;
+  set(parts.unit, isThere ? (isBare ? words(register.name) : unit(register)) : "");
   set(parts.age, isOld && isDated ? `${clock.lasting(reading.age)} old` : "");
   setClass(parts.whole, "old", isOld);
   const why = reason(reading);
