@@ -1,4 +1,4 @@
-"""What is shown is what the drives said last, and how old it is."""
+"""The page shows what the drives said last, and how old that is."""
 
 from __future__ import annotations
 

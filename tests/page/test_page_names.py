@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from test_page_stop import AT_ITS_PLACE, VIEWS
+from watching import AT_ITS_PLACE, VIEWS
 
 MARKUP = '<img src=x onerror="window.hit=1"><script>window.hit=1</script>&amp;'
 RIGHT_TO_LEFT = "\u202epots\u202c \u05d0\u05d1\u05d2 \u0645\u0636\u062e\u0629"
@@ -23,7 +23,7 @@ def hostile(gateway: FakeGateway) -> FakeGateway:
 
 
 def elements(page: Any) -> list[int]:
-    return page.evaluate("[document.images.length, document.scripts.length, window.hit ?? 0]")  # type: ignore[no-any-return]
+    return list(page.evaluate("[document.images.length, document.scripts.length, window.hit ?? 0]"))
 
 
 @pytest.mark.usefixtures("hostile")

@@ -8,16 +8,7 @@ from typing import Any
 import pytest
 from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
-from watching import LIVE, until
-
-VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
-AT_ITS_PLACE = """() => {
-  const box = document.querySelector('#stopall').getBoundingClientRect();
-  const points = [[0.02, 0.5], [0.5, 0.1], [0.5, 0.5], [0.5, 0.9], [0.98, 0.5]];
-  const seen = points.every(([x, y]) =>
-    document.elementFromPoint(box.x + box.width * x, box.y + box.height * y)?.id === 'stopall');
-  return [seen, box.x, box.y, box.width, box.height];
-}"""
+from watching import AT_ITS_PLACE, LIVE, VIEWS, until
 
 
 def title(page: Any) -> Any:

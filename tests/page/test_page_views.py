@@ -1,4 +1,4 @@
-"""What each view is for: a drive, trends, faults, lines, and the log."""
+"""Each view: a drive, trends, faults, lines, and the log."""
 
 from __future__ import annotations
 
@@ -90,7 +90,8 @@ def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
 def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
-    assert page.locator("#span").inner_text() == "25 Nov 2025, 13:00:00 – 25 Nov 2025, 14:00:00 UTC"  # noqa: RUF001
+    span = "25 Nov 2025, 13:00:00 \u2013 25 Nov 2025, 14:00:00 UTC"
+    assert page.locator("#span").inner_text() == span
     for name in ("A", "B"):
         page.get_by_role("button", name=f"Marker {name}").focus()
         page.keyboard.press("Enter")

@@ -7,6 +7,14 @@ from typing import Any
 
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
+VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
+AT_ITS_PLACE = """() => {
+  const box = document.querySelector('#stopall').getBoundingClientRect();
+  const points = [[0.02, 0.5], [0.5, 0.1], [0.5, 0.5], [0.5, 0.9], [0.98, 0.5]];
+  const seen = points.every(([x, y]) =>
+    document.elementFromPoint(box.x + box.width * x, box.y + box.height * y)?.id === 'stopall');
+  return [seen, box.x, box.y, box.width, box.height];
+}"""
 
 
 def until(page: Any, expression: str, within: float = 30) -> float:

@@ -88,7 +88,9 @@ export function begin(drive) {
   const rest = numbers.filter(r => ![frequency, setpoint, current].includes(r.name));
   if (!rest.some(r => r.name === third))
     third = (rest.find(r => /torque|power/.test(r.name)) ?? rest[0])?.name ?? null;
-  const stack = [[frequency, setpoint], [current], [third]]
+  const isOneUnit = unitOf(frequency) === unitOf(setpoint);
+  const first = isOneUnit ? [[frequency, setpoint]] : [[frequency], [setpoint]];
+  const stack = [...first, [current], [third]]
     .map(names => names.filter(Boolean))
     .filter(names => names.length);
   plots = stack.map((names, i) =>
@@ -98,6 +100,8 @@ export function begin(drive) {
   fetchPast();
   draw();
 }
+
+const unitOf = name => spec.registers.find(r => r.name === name)?.unit;
 
 function one(place, names, index, isLast, choices) {
   const specs = names.map(name => spec.registers.find(r => r.name === name));

@@ -84,6 +84,18 @@ function stateWord(is, drive, age) {
   return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
 }
 
+// Draw frequency and setpoint as a bar, as far as both are hertz and of now.
+function drawBar(r, actual, set, register, setRegister) {
+  const isNew = found => Boolean(found && found.value !== null && !found.isOld);
+  const isSet = setRegister?.unit === "Hz",
+    full = (isSet && setRegister.most) || FULL_HZ;
+  const width = value => `${Math.min(100, (Math.abs(value) / full) * 100)}%`;
+  r.bars.hidden = !(register?.unit === "Hz" && isNew(actual));
+  r.set.hidden = !(isSet && isNew(set));
+  if (!r.bars.hidden) r.bar.style.width = width(actual.value);
+  if (!r.set.hidden) r.set.style.left = width(set.value);
+}
+
 // Draw a row anew. Return true where the state is another one.
 export function drawRow(r, t) {
   const drive = store.frame?.drives[r.name],
@@ -98,13 +110,7 @@ export function drawRow(r, t) {
     s = setpoint && reading(r.name, setpoint, t);
   showValue(r.frequency, f, own.registers.get(frequency));
   showValue(r.current, current && reading(r.name, current, t), own.registers.get(current), false);
-  const full = own.registers.get(setpoint)?.most ?? FULL_HZ;
-  const isHertz = own.registers.get(frequency)?.unit === "Hz";
-  const isBar = Boolean(isHertz && f && f.value !== null && !f.isOld);
-  r.bars.hidden = !isBar;
-  if (isBar) r.bar.style.width = `${Math.min(100, (Math.abs(f.value) / full) * 100)}%`;
-  r.set.hidden = !(s && s.value !== null && !s.isOld);
-  if (!r.set.hidden) r.set.style.left = `${Math.min(100, (s.value / full) * 100)}%`;
+  drawBar(r, f, s, own.registers.get(frequency), own.registers.get(setpoint));
   put(r.age, age === null ? UNKNOWN : clock.lasting(age));
   const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
