@@ -1,0 +1,46 @@
+// Requests to the gateway. What goes wrong is an Error whose message is a sentence for a person.
+
+export class Refused extends Error {
+  constructor(status, message) {
+    super(message);
+    this.status = status;
+  }
+}
+
+const PATIENCE_MS = 15000;
+
+async function ask(path, options, patience) {
+  let response;
+  try {
+    response = await fetch(path, { cache: "no-store", signal: AbortSignal.timeout(patience), ...options });
+  } catch (error) {
+    throw new Refused(
+      0,
+      error.name === "TimeoutError"
+        ? `The daemon has not answered for ${Math.round(patience / 1000)} s.`
+        : "The daemon cannot be reached.",
+    );
+  }
+  const body = await response.json().catch(() => null);
+  if (!response.ok)
+    throw new Refused(response.status, body?.error ?? `The daemon answers ${response.status}.`);
+  return body;
+}
+
+export const get = (path, patience = PATIENCE_MS) => ask(path, {}, patience);
+
+// Browsers open six connections to a host for all tabs together, which other tabs' waiting frames may hold:
+// a command goes ahead of what is queued for them.
+export const post = (path, body, patience = PATIENCE_MS) =>
+  ask(
+    path,
+    {
+      method: "POST",
+      priority: "high",
+      headers: { "content-type": "application/json" },
+      body: JSON.stringify(body),
+    },
+    patience,
+  );
+
+export const query = pairs => new URLSearchParams(pairs).toString();

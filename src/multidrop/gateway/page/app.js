@@ -1,0 +1,165 @@
+// The page's views, its keys and its beat: texts and plots five times a second, sparklines once.
+
+import { get } from "./api.js";
+import { askToken } from "./ask.js";
+import * as audit from "./audit.js";
+import * as clock from "./clock.js";
+import { find } from "./dom.js";
+import * as drive from "./drive.js";
+import * as faults from "./faults.js";
+import * as lines from "./lines.js";
+import { run } from "./link.js";
+import * as markers from "./markers.js";
+import * as plots from "./panel_plots.js";
+import * as settings from "./settings.js";
+import { stopOne } from "./stop.js";
+import { onPlant, store, takePlant } from "./store.js";
+import * as table from "./table.js";
+import { drawTop, showPlant } from "./top.js";
+import * as trends from "./trends.js";
+
+const VIEWS = ["drives", "trends", "faults", "lines", "log"];
+const BEAT_MS = 100;
+const WIDE = 1000; // px: from here the panel stands beside the table
+
+let view = "drives",
+  chosen = null,
+  beat = 0;
+
+// Show what the address names: "#/drives/pump-1", "#/trends?drive=pump-1".
+function route() {
+  const [path, options] = location.hash.replace(/^#\/?/, "").split("?");
+  const [name, rest] = path.split("/");
+  const before = view;
+  view = VIEWS.includes(name) ? name : "drives";
+  for (const other of VIEWS) {
+    find(`#${other}`).hidden = other !== view;
+    const link = find(`nav a[href="#/${other}"]`);
+    if (other === view) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+  if (before === "trends" && view !== "trends") trends.hide();
+  if (view === "drives") showDrive(rest ? decoded(rest) : null, Boolean(rest));
+  if (view === "trends") trends.show(new URLSearchParams(options ?? ""));
+  if (view === "faults") faults.show();
+  if (view === "lines") lines.show();
+  if (view === "log") audit.show();
+}
+
+function decoded(text) {
+  try {
+    return decodeURIComponent(text);
+  } catch {
+    return text;
+  }
+}
+
+function showDrive(name, isOpen) {
+  const wasOpen = find("#panel").classList.contains("open");
+  chosen = name ?? (innerWidth > WIDE ? (chosen ?? store.drives.keys().next().value ?? null) : null);
+  table.choose(chosen);
+  drive.show(chosen, isOpen);
+  if (isOpen && innerWidth <= WIDE) find("#panel h2")?.focus();
+  else if (wasOpen && !isOpen) table.focusChosen();
+}
+
+// Draw one part; where it breaks, the others go on.
+function safely(what) {
+  try {
+    what();
+  } catch (error) {
+    console.error(error);
+  }
+}
+
+function tick() {
+  beat++;
+  if (beat % 2 === 0) {
+    safely(drawTop);
+    if (view === "drives") {
+      safely(table.drawRows);
+      safely(drive.draw);
+    }
+  }
+  if (view === "drives" && beat % 2 === 0) safely(drive.drawPlots);
+  if (view === "drives" && beat % 10 === 0) safely(table.drawSparks);
+  if (view === "faults" && beat % 10 === 0) safely(faults.show);
+  if (view === "lines" && beat % 30 === 0) lines.show();
+  if (view === "drives" && beat % 20 === 0) drive.refresh();
+}
+
+// Make plots anew: their size, colours or times are others.
+function redraw() {
+  if (view === "drives" && store.drives.has(chosen))
+    safely(() => plots.begin(store.drives.get(chosen).spec));
+  if (view === "trends") safely(trends.draw);
+  if (view === "lines") lines.show();
+  safely(audit.redraw);
+  safely(table.fit);
+  safely(drawTop);
+}
+
+function keys(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || find("#ask").open) return;
+  if (event.target.matches("input, select, textarea")) {
+    if (event.key === "Escape") event.target.blur();
+    return;
+  }
+  if (view === "trends") {
+    if (event.key === "a" || event.key === "b") markers.place(event.key.toUpperCase());
+    if (event.key === "Escape") trends.back();
+  }
+  if (view === "drives") driveKeys(event);
+  if (event.key === "u") clock.switchZone();
+  if (event.key >= "1" && event.key <= String(VIEWS.length)) location.hash = `#/${VIEWS[event.key - 1]}`;
+}
+
+function driveKeys(event) {
+  const inPanel = event.target.closest("#panel");
+  if ((event.key === "ArrowDown" || event.key === "ArrowUp") && !inPanel) {
+    const link = table.neighbour(event.key === "ArrowDown" ? 1 : -1);
+    link?.focus();
+    if (link && innerWidth > WIDE) (history.replaceState(null, "", link.hash), route(), link.focus());
+    event.preventDefault();
+  } else if (event.key === "/") {
+    find("#filter").focus();
+    event.preventDefault();
+  } else if (event.key === "s" && chosen !== null) stopOne(chosen);
+  else if (event.key === "Escape" && find("#panel").classList.contains("open")) location.hash = "#/drives";
+}
+
+let resized = null;
+addEventListener("resize", () => {
+  clearTimeout(resized);
+  resized = setTimeout(redraw, 150);
+});
+addEventListener("hashchange", route);
+addEventListener("keydown", keys);
+addEventListener("theme", redraw);
+addEventListener("timezone", redraw);
+addEventListener(
+  "stranger",
+  () => find("#ask").open || askToken("This gateway wants a token to look, too."),
+);
+addEventListener("written", () => drive.refresh());
+addEventListener("signed", () => get("api/plant").then(takePlant, () => {}));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+find(".skip").addEventListener("click", event => {
+  event.preventDefault();
+  find("#main").focus();
+});
+
+settings.begin();
+table.begin();
+drive.begin();
+trends.begin();
+faults.begin();
+audit.begin();
+onPlant(showPlant);
+onPlant(() => {
+  if (view === "drives") route();
+});
+route();
+document.body.dataset.begun = "yes";
+setInterval(tick, BEAT_MS);
+run();

@@ -1,0 +1,117 @@
+// The page's one dialog: it asks before anything is sent, asks for a token, and tells what became of it.
+
+import { post } from "./api.js";
+import { find, fill, make } from "./dom.js";
+
+let answer = null; // settles the question that stands now
+
+const dialog = () => find("#ask");
+
+// Show the dialog and return what was chosen: a button's name, or null for cancelled. `buttons` are
+// [name, text, class]; Cancel comes first and has the focus, so that Enter alone does nothing.
+function open(title, contents, buttons, cancel = "Cancel") {
+  answer?.(null);
+  const close = choice => {
+    answer?.(choice);
+    answer = null;
+    if (dialog().open) dialog().close();
+  };
+  const first = make("button", { type: "button", class: "calm", onclick: () => close(null) }, cancel);
+  const others = buttons.map(([name, text, kind]) =>
+    make(
+      "button",
+      {
+        type: name === "submit" ? "submit" : "button",
+        class: kind,
+        onclick: event => {
+          if (name === "submit" && !find("form", dialog()).reportValidity()) return;
+          event.preventDefault();
+          close(name);
+        },
+      },
+      text,
+    ),
+  );
+  const form = make(
+    "form",
+    { onsubmit: event => event.preventDefault() },
+    make("h2", { id: "ask-title", tabindex: "-1" }, title),
+    contents,
+    make(
+      "menu",
+      {},
+      [first, ...others].map(b => make("li", {}, b)),
+    ),
+  );
+  fill(dialog(), form);
+  dialog().oncancel = event => {
+    event.preventDefault();
+    close(null);
+  };
+  if (dialog().open) dialog().close(); // opened anew, it is read out
+  dialog().showModal();
+  (find("[data-first]", form) ?? first).focus();
+  return new Promise(done => {
+    answer = done;
+  });
+}
+
+// Ask for a confirmation. Return true where it is given.
+export const confirm = async (title, contents, yes) =>
+  (await open(title, contents, [["yes", yes, "danger"]])) === "yes";
+
+// Ask for what a form in `contents` holds. Return true where it is to be sent.
+export const confirmForm = async (title, contents, yes) =>
+  (await open(title, contents, [["submit", yes, "danger"]])) === "submit";
+
+// Show something until it is closed. Return the name of the other button where that was pressed.
+export const tell = (title, contents, buttons = []) => open(title, contents, buttons, "Close");
+
+// Put other contents into the dialog that `tell` opened.
+export function retell(title, contents, buttons = []) {
+  return open(title, contents, buttons, "Close");
+}
+
+// Ask for a token until one is right. Return true where the gateway took it.
+export async function askToken(why, yes = "Sign in") {
+  let wrong = null;
+  for (;;) {
+    const field = make("input", {
+      type: "password",
+      id: "token",
+      required: true,
+      autocomplete: "current-password",
+      "data-first": true,
+      "aria-describedby": wrong ? "token-wrong" : null,
+    });
+    const contents = [
+      make("p", {}, why),
+      make("label", { for: "token", class: "field" }, "Token", field),
+      wrong && make("p", { id: "token-wrong", class: "bad" }, wrong),
+    ];
+    if (!(await confirmForm("Who are you?", contents, yes))) return false;
+    try {
+      await post("api/token", { token: field.value });
+      dispatchEvent(new Event("signed"));
+      return true;
+    } catch (error) {
+      wrong = error.message;
+    }
+  }
+}
+
+// Send what the person confirmed, and once more after a sign-in where the right to it was missing.
+// Return the answer. Raises Refused.
+export async function send(path, body, patience) {
+  dispatchEvent(new Event("command"));
+  try {
+    return await post(path, body, patience);
+  } catch (error) {
+    if (error.status !== 401 && error.status !== 403) throw error;
+    if (
+      !(await askToken(`${error.message} A token with the right to it is needed.`, "Sign in and send it"))
+    )
+      throw error;
+    return await post(path, body, patience);
+  }
+}

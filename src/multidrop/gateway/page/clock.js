@@ -1,0 +1,81 @@
+// Times as people read them: UTC or local by a switch, 24 hours always.
+
+const KEY = "multidrop-times";
+let zone = kept() === "local" ? "local" : "UTC";
+let formats = {};
+
+function kept() {
+  try {
+    return localStorage.getItem(KEY);
+  } catch {
+    return null;
+  } // a browser may forbid storage
+}
+
+export const isUtc = () => zone === "UTC";
+
+// Switch between UTC and local time, and keep the choice in this browser.
+export function switchZone() {
+  zone = isUtc() ? "local" : "UTC";
+  formats = {};
+  try {
+    localStorage.setItem(KEY, zone);
+  } catch {
+    /* it lasts as long as the page, then */
+  }
+  dispatchEvent(new Event("timezone"));
+}
+
+function formatted(ms, name, options) {
+  formats[name] ??= new Intl.DateTimeFormat("en-GB", {
+    hourCycle: "h23",
+    timeZone: isUtc() ? "UTC" : undefined,
+    ...options,
+  });
+  return formats[name].format(ms);
+}
+
+const TIME = { hour: "2-digit", minute: "2-digit", second: "2-digit" };
+const DAY = { day: "numeric", month: "short" };
+
+export const time = ms => formatted(ms, "time", TIME);
+export const minute = ms => formatted(ms, "minute", { hour: "2-digit", minute: "2-digit" });
+export const day = ms => formatted(ms, "day", DAY);
+export const milli = ms =>
+  `${time(ms)}.${String(((Math.floor(ms) % 1000) + 1000) % 1000).padStart(3, "0")}`;
+
+// Return the day and the time, the day with its year where it is not this one.
+export function moment(ms) {
+  const far = Math.abs(Date.now() - ms) > 300 * 86400e3;
+  return `${formatted(ms, far ? "year" : "day", far ? { ...DAY, year: "numeric" } : DAY)}, ${time(ms)}`;
+}
+
+// Return the time alone for today, else the day too.
+export const when = ms => (day(ms) === day(Date.now()) ? time(ms) : moment(ms));
+
+export const zoneName = () => (isUtc() ? "UTC" : "local");
+
+// Return a duration in its largest whole unit: "0.4 s", "42 s", "7 min", "3.5 h", "12 days".
+export function lasting(ms) {
+  const s = Math.max(0, ms) / 1000;
+  if (s < 10) return `${s.toFixed(1)} s`;
+  if (s < 120) return `${Math.round(s)} s`;
+  if (s < 7200) return `${Math.round(s / 60)} min`;
+  if (s < 48 * 3600) return `${(s / 3600).toFixed(1)} h`;
+  return `${Math.round(s / 86400)} days`;
+}
+
+// Return texts for a plot's time axis, as fine as its ticks lie apart. uPlot counts in seconds.
+export function ticks(splits, step) {
+  return splits.map(s => {
+    const ms = s * 1000;
+    if (step >= 86400) return day(ms);
+    if (time(ms) === "00:00:00") return day(ms);
+    if (step >= 60) return minute(ms);
+    return step >= 1 ? time(ms) : milli(ms).slice(0, -2);
+  });
+}
+
+// Return the date whose local fields uPlot may lay its ticks by.
+export const tickDate = s =>
+  isUtc() ? globalThis.uPlot.tzDate(new Date(s * 1000), "Etc/UTC") : new Date(s * 1000);

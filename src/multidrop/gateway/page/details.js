@@ -1,0 +1,120 @@
+// What frames do not hold of the chosen drive: response delays, misses by reason, EEPROM budgets, its writes.
+
+import { get } from "./api.js";
+import { auditRows } from "./audit.js";
+import { fill, find, make } from "./dom.js";
+import { takeOthers } from "./registers.js";
+import { UNKNOWN, milliseconds, share, words } from "./values.js";
+
+let name = null;
+
+export function build(spec) {
+  name = spec.name;
+  refresh();
+  return make(
+    "div",
+    {},
+    make("section", { id: "delays", "aria-label": "Delays and misses" }),
+    make("section", { id: "writes", "aria-label": "Writes" }),
+  );
+}
+
+// Ask anew. What cannot be had is said in its place.
+export async function refresh() {
+  const asked = name;
+  const [told, log] = await Promise.allSettled([
+    get(`api/drive/${encodeURIComponent(asked)}`),
+    get("api/audit?count=200"),
+  ]);
+  if (asked !== name || !find("#delays")) return;
+  if (told.status === "fulfilled") takeOthers(told.value.values);
+  fill(
+    find("#delays"),
+    make("h3", {}, "Delays and misses"),
+    told.status === "fulfilled" ? delays(told.value) : make("p", { class: "note" }, told.reason.message),
+  );
+  fill(
+    find("#writes"),
+    make("h3", {}, "Writes to this drive"),
+    log.status === "fulfilled"
+      ? writes(log.value, asked)
+      : make("p", { class: "note" }, log.reason.message),
+  );
+}
+
+function delays({ delays, misses, asked, ledger }) {
+  const total = Object.values(misses ?? {}).reduce((sum, n) => sum + n, 0);
+  return [
+    make(
+      "p",
+      { class: "note" },
+      `Response delay: half within ${milliseconds(delays?.p50)}, 99 % within ${milliseconds(delays?.p99)}.`,
+    ),
+    delays?.counts?.length ? histogram(delays.counts) : null,
+    make(
+      "p",
+      { class: "note" },
+      asked ? `Missed ${total} of ${asked} requests, ${share(total / asked)}.` : "Nothing was asked yet.",
+    ),
+    total
+      ? make(
+          "table",
+          { class: "plain" },
+          make(
+            "thead",
+            {},
+            make("tr", {}, make("th", { scope: "col" }, "Reason"), make("th", { scope: "col" }, "Missed")),
+          ),
+          make(
+            "tbody",
+            {},
+            Object.entries(misses).map(([reason, n]) =>
+              make("tr", {}, make("th", { scope: "row" }, reason), make("td", {}, String(n))),
+            ),
+          ),
+        )
+      : null,
+    ledger?.length
+      ? make(
+          "p",
+          { class: "note" },
+          "EEPROM writes of the last year: " +
+            ledger.map(l => `${words(l.register)} ${l.year} of ${l.budget ?? UNKNOWN}`).join(", "),
+        )
+      : null,
+  ].filter(Boolean);
+}
+
+// Draw counts by delay as bars, each with its span and number as a text.
+function histogram(counts) {
+  const most = Math.max(...counts.map(([, n]) => n)),
+    last = counts[counts.length - 1][0];
+  const bars = counts.map(([from, n], i) => {
+    const end = i + 1 < counts.length ? `to ${milliseconds(counts[i + 1][0])}` : "and more";
+    const bar = make("i", { title: `${milliseconds(from)} ${end}: ${n}` });
+    bar.style.height = `${most ? Math.max(n ? 4 : 0, (n / most) * 100) : 0}%`;
+    return bar;
+  });
+  return make(
+    "div",
+    {
+      class: "histogram",
+      role: "img",
+      "aria-label": `Replies by response delay, ${milliseconds(counts[0][0])} to ${milliseconds(last)}`,
+    },
+    make("div", { class: "bars" }, bars),
+    make(
+      "div",
+      { class: "ends" },
+      make("span", {}, milliseconds(counts[0][0])),
+      make("span", {}, milliseconds(last)),
+    ),
+  );
+}
+
+function writes({ entries }, drive) {
+  const own = (entries ?? []).filter(entry => entry.drive === drive);
+  return own.length
+    ? auditRows(own.slice(0, 20), false)
+    : make("p", { class: "note" }, "None among the newest 200 of the log.");
+}

@@ -1,0 +1,61 @@
+// Elements made of names and texts. A text is always a text node: no name of a drive can become markup.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+// Return an element. `attributes` are set one by one, those that begin with "on" as listeners, `class` as
+// the class; null and false leave an attribute away. Children are elements, texts, or null for none.
+export function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined) continue;
+    if (name.startsWith("aria-")) element.setAttribute(name, String(value));
+    else if (value === false) continue;
+    else if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else element.setAttribute(name, value === true ? "" : String(value));
+  }
+  for (const child of children.flat()) if (child !== null && child !== undefined) element.append(child);
+  return element;
+}
+
+// Return a name from outside, which cannot change the order of the text around it.
+export const named = (text, attributes = {}) => make("bdi", attributes, String(text));
+
+// Return one of the shapes in index.html.
+export function glyph(name) {
+  const svg = document.createElementNS(SVG, "svg"),
+    use = document.createElementNS(SVG, "use");
+  svg.setAttribute("class", "glyph");
+  svg.setAttribute("aria-hidden", "true");
+  use.setAttribute("href", `#glyph-${name}`);
+  svg.append(use);
+  return svg;
+}
+
+// Set a text, where it is another one than before: most cells stay as they are.
+export function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function setClass(element, name, is) {
+  if (element.classList.contains(name) !== is) element.classList.toggle(name, is);
+}
+
+export const fill = (element, ...children) =>
+  element.replaceChildren(...children.flat().filter(c => c !== null));
+
+export const find = (selector, at = document) => at.querySelector(selector);
+
+// Return a colour of style.css as the canvas takes it, in the theme that is shown.
+export function colour(name) {
+  const probe = make("i", { class: "hidden" });
+  document.body.append(probe);
+  probe.style.color = `var(--${name})`;
+  const found = getComputedStyle(probe).color;
+  probe.remove();
+  return found;
+}
+
+// Say a sentence to who listens to the page.
+export function say(text) {
+  put(find("#said"), text);
+}

@@ -1,0 +1,121 @@
+// One drive: what it does now, its plots, registers, delays, and what became of writes.
+
+import * as actions from "./actions.js";
+import * as clock from "./clock.js";
+import * as details from "./details.js";
+import { fill, find, glyph, make, named, put } from "./dom.js";
+import { now } from "./link.js";
+import * as plots from "./panel_plots.js";
+import * as registers from "./registers.js";
+import { driveAge, isLive, onPlant, state, store } from "./store.js";
+import { stopOne } from "./stop.js";
+import { STATES, makeValue, showValue } from "./values.js";
+
+const KEYS = [
+  ["frequency", "Frequency"],
+  ["setpoint", "Setpoint"],
+  ["current", "Current"],
+];
+
+let chosen = null,
+  parts = null;
+
+export const panel = () => find("#panel");
+
+export function begin() {
+  onPlant(() => show(chosen, false));
+}
+
+// Show this drive, or say that there is none of this name. `isOpen`: on a small screen, over all else.
+export function show(name, isOpen) {
+  chosen = name;
+  const drive = store.drives.get(name);
+  panel().classList.toggle("open", isOpen && name !== null);
+  plots.clear();
+  parts = null;
+  if (!drive) {
+    fill(
+      panel(),
+      make(
+        "p",
+        { class: "empty" },
+        name === null || !store.plant
+          ? "Choose a drive to see its plots and registers."
+          : ["There is no drive ", named(name), " in this plant."],
+      ),
+    );
+    return;
+  }
+  build(drive);
+  draw();
+  drawPlots();
+}
+
+function build({ spec, line }) {
+  parts = { shape: make("span"), word: make("span"), age: make("span", { class: "sub-age" }), keys: [] };
+  const where = [
+    `${spec.family} · address ${spec.address} on `,
+    named(line.name),
+    line.speed ? ` · ${line.speed}` : "",
+  ];
+  const keys = KEYS.filter(([part]) => spec.key?.[part]).map(([part, title]) => {
+    const value = makeValue();
+    parts.keys.push([spec.key[part], value]);
+    return make("div", {}, make("dt", {}, title), make("dd", {}, value.whole));
+  });
+  fill(
+    panel(),
+    make(
+      "div",
+      { class: "panelhead" },
+      make("h2", { tabindex: "-1" }, named(spec.name)),
+      make("p", {}, where),
+      make("p", { class: "stateline" }, parts.shape, parts.word, parts.age),
+      make(
+        "div",
+        { class: "acts" },
+        make(
+          "button",
+          {
+            type: "button",
+            class: "danger",
+            onclick: () => stopOne(spec.name),
+            "aria-label": `Stop ${spec.name}`,
+          },
+          "Stop",
+        ),
+        make("a", { class: "button close", href: "#/drives", "aria-label": "Close" }, "✕"),
+      ),
+    ),
+    keys.length ? make("dl", { class: "keys" }, keys) : null,
+    actions.build(spec),
+    plots.build(spec),
+    registers.build(spec),
+    details.build(spec),
+  );
+  plots.begin(spec);
+}
+
+// Draw texts anew, a few times a second.
+export function draw() {
+  if (!parts) return;
+  const t = now(),
+    drive = store.drives.get(chosen),
+    is = state(chosen),
+    age = driveAge(chosen, t);
+  for (const [register, value] of parts.keys)
+    showValue(value, registers.known(chosen, register, t), drive.registers.get(register));
+  if (parts.state !== is) fill(parts.shape, glyph(STATES[is] ? is : "unknown"));
+  parts.state = is;
+  const words_ =
+    is === "fault" ? `fault: ${store.frame.drives[chosen].fault ?? "unknown"}` : (STATES[is] ?? is);
+  put(parts.word, isLive(t) || !store.frame ? words_ : `last: ${words_}`);
+  parts.word.className = `stateword ${is}`;
+  put(parts.age, age === null ? "never answered" : `last reply ${clock.lasting(age)} ago`);
+  registers.draw(t);
+}
+
+export const drawPlots = () => parts && plots.draw();
+
+// Ask the gateway for what frames do not hold.
+export const refresh = () => parts && details.refresh();

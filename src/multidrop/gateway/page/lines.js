@@ -1,0 +1,139 @@
+// The lines: wire used against plan, misses by reason over the last hour, delays of each drive.
+
+import { get } from "./api.js";
+import * as clock from "./clock.js";
+import { fill, find, glyph, make, named } from "./dom.js";
+import { misses } from "./misses.js";
+import { isLive, store } from "./store.js";
+import { now } from "./link.js";
+import { milliseconds, share, UNKNOWN } from "./values.js";
+
+let shown = "";
+
+// Ask for the hour and draw everything anew.
+export async function show() {
+  if (!store.plant) return;
+  let told = {},
+    error = null;
+  try {
+    told = await get("api/lines");
+  } catch (problem) {
+    error = problem.message;
+  }
+  const sign = JSON.stringify([told, error, clock.zoneName(), store.frame?.lines, isLive(now())]);
+  if (sign === shown) return;
+  shown = sign;
+  fill(
+    find("#lines"),
+    error ? make("p", { class: "card note bad" }, error) : null,
+    store.plant.lines.map(line => card(line, told[line.name])),
+  );
+}
+
+function card(line, told) {
+  const frame = store.frame?.lines[line.name] ?? {};
+  return make(
+    "article",
+    { class: "card line", "aria-label": line.name },
+    make("h2", {}, named(line.name)),
+    make(
+      "p",
+      { class: "note" },
+      `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${line.drives.length} drives`,
+    ),
+    frame.lost ? make("p", { class: "bad" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
+    figures(frame),
+    misses(told?.minutes ?? []),
+    delays(line, told?.drives ?? {}),
+  );
+}
+
+function figures({ used = null, planned = null, rate = null, p99 = null, misses: missed = null }) {
+  const isOver = used !== null && planned !== null && used > planned + 0.05;
+  const bar = make("span", {
+    class: "use",
+    role: "img",
+    "aria-label": `${share(used)} used of ${share(planned)} planned`,
+  });
+  const [part, mark] = [make("i"), make("u")];
+  part.style.width = `${Math.min(1, used ?? 0) * 100}%`;
+  mark.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
+  mark.hidden = planned === null;
+  bar.append(part, mark);
+  const pairs = [
+    ["Wire used", [share(used), bar]],
+    [
+      "Planned",
+      [share(planned), isOver ? make("small", { class: "warn" }, " more is used than planned") : null],
+    ],
+    ["Exchanges", [rate === null ? UNKNOWN : `${rate.toFixed(1)} /s`]],
+    ["Delay, 99 % within", [milliseconds(p99)]],
+    [
+      "Missed in the last minute",
+      [make("span", { class: missed > 0 ? "warn" : "" }, missed === null ? UNKNOWN : String(missed))],
+    ],
+  ];
+  return make(
+    "dl",
+    { class: "keys" },
+    pairs.map(([title, value]) => make("div", {}, make("dt", {}, title), make("dd", {}, value))),
+  );
+}
+
+function delays(line, told) {
+  const most = Math.max(1, ...Object.values(told).map(d => d?.p99 ?? 0));
+  return make(
+    "section",
+    {},
+    make("h3", {}, "Response delay of each drive"),
+    make(
+      "div",
+      { class: "scroll" },
+      make(
+        "table",
+        { class: "plain delays" },
+        make(
+          "thead",
+          {},
+          make(
+            "tr",
+            {},
+            ["Drive", "Half within", "99 % within", "", "Missed"].map((h, i) =>
+              i === 3 ? make("td", {}) : make("th", { scope: "col" }, h),
+            ),
+          ),
+        ),
+        make(
+          "tbody",
+          {},
+          line.drives.map(({ name }) => {
+            const d = told[name] ?? {},
+              half = make("i"),
+              tail = make("u"),
+              bar = make("span", { class: "delay", "aria-hidden": "true" }, half, tail);
+            half.style.width = `${((d.p50 ?? 0) / most) * 100}%`;
+            tail.style.left = `${((d.p99 ?? 0) / most) * 100}%`;
+            bar.hidden = d.p99 === null || d.p99 === undefined;
+            return make(
+              "tr",
+              {},
+              make(
+                "th",
+                { scope: "row" },
+                make("a", { href: `#/drives/${encodeURIComponent(name)}` }, named(name)),
+              ),
+              make("td", {}, milliseconds(d.p50)),
+              make("td", {}, milliseconds(d.p99)),
+              make("td", {}, bar),
+              make(
+                "td",
+                { class: d.missed ? "warn" : "" },
+                d.asked ? `${d.missed} of ${d.asked}, ${share(d.missed / d.asked)}` : UNKNOWN,
+              ),
+            );
+          }),
+        ),
+      ),
+    ),
+  );
+}

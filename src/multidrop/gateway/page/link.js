@@ -1,0 +1,81 @@
+// The way to the daemon: one request for a frame under way, and how old what it brought is.
+
+import { get } from "./api.js";
+import { store, takeFrame, takePlant } from "./store.js";
+
+const PATIENCE_MS = 25000; // the daemon answers after 20 s where there is nothing new
+const AGAIN_MS = 500;
+const HIDDEN_MS = 1000; // a tab that nobody sees asks once a second, and holds no connection
+
+export const link = { why: "" };
+let under = null; // what cancels the request under way
+
+// The daemon's clock less ours, in ms, as far as its answers' Date headers prove a difference. Date is cut to
+// whole seconds: the truth lies between `least` and `most`, and no correction is made where 0 does too.
+const skew = { least: -Infinity, most: Infinity };
+
+function learnSkew(date, sent, received) {
+  const told = Date.parse(date ?? "");
+  if (Number.isNaN(told)) return;
+  const least = told - received,
+    most = told + 1000 - sent;
+  if (least > skew.most || most < skew.least)
+    Object.assign(skew, { least, most }); // a clock was set
+  else Object.assign(skew, { least: Math.max(least, skew.least), most: Math.min(most, skew.most) });
+}
+
+export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
+
+// Return the daemon's time in ms.
+export const now = () => Date.now() + correction();
+
+const pause = ms => new Promise(done => setTimeout(done, ms));
+
+// A command is about to be sent: give the connection free, and ask for the next frame behind it.
+addEventListener("command", () => under?.abort());
+
+// Ask for frames until the page is closed.
+export async function run() {
+  let n = 0,
+    isKnown = false;
+  for (;;) {
+    try {
+      if (!isKnown) {
+        takePlant(await get("api/plant"));
+        [n, isKnown] = [0, true];
+      }
+      const frame = await newer(document.hidden ? 0 : n);
+      [store.isLost, link.why] = [false, ""];
+      if (frame) {
+        isKnown = frame.revision === store.plant.revision && frame.n >= n;
+        n = frame.n;
+        takeFrame(frame);
+      }
+      if (document.hidden) await pause(HIDDEN_MS);
+    } catch (error) {
+      if (error.name === "AbortError") continue;
+      [store.isLost, link.why, isKnown] = [true, error.message, false];
+      if (error.status === 401) dispatchEvent(new Event("stranger"));
+      await pause(AGAIN_MS);
+    }
+  }
+}
+
+// Return the frame after `n`, or null where there is none yet.
+async function newer(n) {
+  const sent = Date.now();
+  under = new AbortController();
+  let response;
+  try {
+    const signal = AbortSignal.any([under.signal, AbortSignal.timeout(PATIENCE_MS)]);
+    response = await fetch(`api/frame?after=${n}`, { signal, cache: "no-store", priority: "low" });
+    learnSkew(response.headers.get("date"), sent, Date.now());
+    if (response.status === 304) return null;
+    if (response.ok) return await response.json();
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new Error(error.name === "TimeoutError" ? "does not answer" : "cannot be reached");
+  }
+  const body = await response.json().catch(() => null);
+  throw new Error(body?.error ?? `answers ${response.status}`);
+}

@@ -1,0 +1,135 @@
+// Two markers in the trends, A and B: values at each, and what lies between.
+
+import * as clock from "./clock.js";
+import { colour, fill, find, make, named } from "./dom.js";
+import { label } from "./history.js";
+
+const marks = { A: null, B: null }; // ms
+let plots = () => [],
+  view = () => ({ from: 0, to: 0 });
+
+// `getPlots` returns trends' plots, `getView` the span that is shown.
+export function begin(getPlots, getView) {
+  [plots, view] = [getPlots, getView];
+}
+
+// Return the buttons. One puts its marker under the cursor, or into the span; arrow keys move it.
+export const buttons = () =>
+  ["A", "B"].map(name =>
+    make(
+      "button",
+      {
+        type: "button",
+        title: `Marker ${name}: at the cursor; arrow keys move it; Delete takes it away`,
+        "aria-label": `Marker ${name}`,
+        id: `mark-${name}`,
+        onclick: () => place(name),
+        onkeydown: event => move(event, name),
+      },
+      name,
+    ),
+  );
+
+// Put a marker under the cursor. Called by the button and by the keys a and b.
+export function place(name) {
+  const { from, to } = view(),
+    u = plots()[0]?.plot,
+    i = u?.cursor.idx;
+  const under = u && u.cursor.left >= 0 && i !== null && i !== undefined ? u.data[0][i] * 1000 : null;
+  set(name, under ?? from + (to - from) * (name === "A" ? 1 / 3 : 2 / 3));
+}
+
+function move(event, name) {
+  const { from, to } = view(),
+    step = (to - from) / (event.shiftKey ? 20 : 200);
+  if (event.key === "ArrowLeft" || event.key === "ArrowRight") {
+    set(
+      name,
+      Math.max(
+        from,
+        Math.min(to, (marks[name] ?? (from + to) / 2) + (event.key === "ArrowLeft" ? -step : step)),
+      ),
+    );
+  } else if (event.key === "Delete" || event.key === "Backspace") set(name, null);
+  else return;
+  event.preventDefault();
+}
+
+function set(name, ms) {
+  marks[name] = ms;
+  for (const { plot } of plots()) plot.redraw(false);
+  draw();
+}
+
+// Draw the markers into a plot: uPlot calls this when it has drawn.
+export function mark(u) {
+  for (const [name, ms] of Object.entries(marks)) {
+    if (ms === null || ms < view().from || ms > view().to) continue;
+    const x = Math.round(u.valToPos(ms / 1000, "x", true)),
+      { top, height } = u.bbox,
+      pen = u.ctx,
+      scale = devicePixelRatio;
+    pen.save();
+    [pen.strokeStyle, pen.fillStyle, pen.lineWidth] = [colour("text"), colour("text"), scale];
+    pen.beginPath();
+    pen.moveTo(x, top);
+    pen.lineTo(x, top + height);
+    pen.stroke();
+    pen.font = `bold ${11 * scale}px system-ui, sans-serif`;
+    [pen.textAlign, pen.textBaseline] = ["left", "top"];
+    pen.fillText(name, x + 3 * scale, top + 2 * scale);
+    pen.restore();
+  }
+}
+
+// Return the mean of a column at a time: of the point nearest to it, or null in a gap.
+function at(u, column, ms) {
+  if (ms === null || !u.data[0].length) return null;
+  return u.data[column][u.valToIdx(ms / 1000)] ?? null;
+}
+
+// Write the table of what the markers stand on.
+export function draw() {
+  const place = find("#marks");
+  if (marks.A === null && marks.B === null) {
+    fill(place);
+    return;
+  }
+  const rows = plots().flatMap(({ plot, drives, spec, register }) =>
+    drives.map((drive, k) => {
+      const [a, b] = [at(plot, 3 + 3 * k, marks.A), at(plot, 3 + 3 * k, marks.B)],
+        write = v => (v === null ? "–" : v.toFixed(spec.digits ?? 0));
+      return make(
+        "tr",
+        {},
+        make("th", { scope: "row" }, named(label(drive, register))),
+        make("td", {}, write(a)),
+        make("td", {}, write(b)),
+        make("td", {}, a === null || b === null ? "–" : write(b - a)),
+        make("td", {}, spec.unit ?? ""),
+      );
+    }),
+  );
+  const told = ms => (ms === null ? "–" : clock.milli(ms));
+  const between = marks.A === null || marks.B === null ? "–" : clock.lasting(Math.abs(marks.B - marks.A));
+  fill(
+    place,
+    make(
+      "table",
+      { class: "plain" },
+      make("caption", { class: "hidden" }, "Values at the markers"),
+      make(
+        "thead",
+        {},
+        make(
+          "tr",
+          {},
+          ["", `A ${told(marks.A)}`, `B ${told(marks.B)}`, `B − A, ${between}`, "unit"].map((h, i) =>
+            i ? make("th", { scope: "col" }, h) : make("td", {}),
+          ),
+        ),
+      ),
+      make("tbody", {}, rows),
+    ),
+  );
+}

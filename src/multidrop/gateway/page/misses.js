@@ -1,0 +1,87 @@
+// Misses of a line in the last hour, by minute and by reason.
+
+import * as clock from "./clock.js";
+import { colour, make } from "./dom.js";
+import { share } from "./values.js";
+
+const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"];
+
+// Draw one bar for each minute, stacked by reason, and the hour's sums as a table.
+export function misses(minutes) {
+  const sums = new Map();
+  let asked = 0;
+  for (const minute of minutes) {
+    asked += minute.asked ?? 0;
+    for (const [reason, n] of Object.entries(minute.misses)) sums.set(reason, (sums.get(reason) ?? 0) + n);
+  }
+  const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
+    total = [...sums.values()].reduce((a, b) => a + b, 0);
+  if (!minutes.length) return make("p", { class: "note" }, "No misses counted yet.");
+  const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
+  if (!total) return make("section", {}, head);
+  const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));
+  return make(
+    "section",
+    {},
+    head,
+    make(
+      "div",
+      { class: "minutes", role: "img", "aria-label": `Missed each minute, at most ${most}` },
+      minutes.map(minute => column(minute, reasons, most)),
+    ),
+    make(
+      "div",
+      { class: "ends" },
+      make("span", {}, `${clock.minute(minutes[0].time)} ${clock.zoneName()}`),
+      make("span", {}, `at most ${most} a minute`),
+      make("span", {}, clock.minute(minutes[minutes.length - 1].time)),
+    ),
+    make(
+      "table",
+      { class: "plain" },
+      make(
+        "thead",
+        {},
+        make(
+          "tr",
+          {},
+          ["Reason", "Missed", "Share"].map(h => make("th", { scope: "col" }, h)),
+        ),
+      ),
+      make(
+        "tbody",
+        {},
+        reasons.map((reason, i) =>
+          make(
+            "tr",
+            {},
+            make("th", { scope: "row" }, swatch(i), reason),
+            make("td", {}, String(sums.get(reason))),
+            make("td", {}, share(asked ? sums.get(reason) / asked : null)),
+          ),
+        ),
+      ),
+    ),
+  );
+}
+
+function column(minute, reasons, most) {
+  const parts = reasons.map((reason, i) => {
+    const part = make("i");
+    part.style.height = `${((minute.misses[reason] ?? 0) / most) * 100}%`;
+    part.style.background = colour(REASONS[i % REASONS.length]);
+    return part;
+  });
+  const words =
+    reasons
+      .filter(r => minute.misses[r])
+      .map(r => `${r} ${minute.misses[r]}`)
+      .join(", ") || "none";
+  return make("div", { title: `${clock.minute(minute.time)}: ${words}` }, parts);
+}
+
+function swatch(i) {
+  const mark = make("i", { class: "swatch", "aria-hidden": "true" });
+  mark.style.background = colour(REASONS[i % REASONS.length]);
+  return mark;
+}

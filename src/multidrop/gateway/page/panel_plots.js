@@ -1,0 +1,242 @@
+// The stacked plots of the chosen drive on one cursor: setpoint against actual, current, one register more.
+
+import * as clock from "./clock.js";
+import { colour, fill, find, make, put } from "./dom.js";
+import { exportLink, label, read } from "./history.js";
+import { now } from "./link.js";
+import { COLOURS, isThere, join, line, makePlot, summary, wide } from "./plots.js";
+import { isLive, store } from "./store.js";
+import { text, unit, words } from "./values.js";
+
+const RANGES = [
+  [10, "10 s"],
+  [60, "1 min"],
+  [600, "10 min"],
+  [3600, "1 h"],
+  [86400, "24 h"],
+];
+const FROM_HISTORY = 600; // seconds: longer ranges are asked for, shorter ones are drawn from frames
+const ANEW_MS = 5000;
+const POINTS = 400;
+const SYNC = "panel";
+
+let range = 60,
+  spec = null,
+  plots = [],
+  third = null,
+  past = null,
+  serial = 0;
+
+export function clear() {
+  for (const { plot } of plots) plot?.destroy();
+  [plots, spec, past] = [[], null, null];
+  serial++;
+}
+
+// Make ranges and places; the plots themselves follow when they are in the document.
+export function build(drive) {
+  const ranges = make(
+    "div",
+    { class: "ranges", role: "group", "aria-label": "Time range" },
+    RANGES.map(([seconds, name]) =>
+      make(
+        "button",
+        {
+          type: "button",
+          "data-seconds": seconds,
+          "aria-pressed": seconds === range,
+          onclick: () => choose(seconds),
+        },
+        name,
+      ),
+    ),
+    make("a", { id: "panel-csv", download: true }, "CSV"),
+    make("a", { href: `#/trends?drive=${encodeURIComponent(drive.name)}` }, "Trends"),
+  );
+  return make(
+    "section",
+    { "aria-label": "Plots" },
+    ranges,
+    make("p", { class: "note", id: "past-note", hidden: true }),
+    make("div", { id: "plots" }),
+  );
+}
+
+function choose(seconds) {
+  range = seconds;
+  for (const button of document.querySelectorAll(".panel .ranges button"))
+    button.setAttribute("aria-pressed", Number(button.dataset.seconds) === range);
+  past = null;
+  fetchPast();
+  draw();
+}
+
+// Make the plots. Called when the panel is in the document, and when size, theme or times change.
+export function begin(drive) {
+  for (const { plot } of plots) plot?.destroy();
+  spec = drive;
+  plots = [];
+  const place = find("#plots");
+  if (!place) return;
+  if (!isThere()) {
+    fill(place, make("p", { class: "note" }, "Plots could not be loaded."));
+    return;
+  }
+  fill(place);
+  const { frequency, setpoint, current } = spec.key ?? {};
+  const numbers = spec.registers.filter(r => r.kind === "number" && r.period_s !== null);
+  const rest = numbers.filter(r => ![frequency, setpoint, current].includes(r.name));
+  if (!rest.some(r => r.name === third))
+    third = (rest.find(r => /torque|power/.test(r.name)) ?? rest[0])?.name ?? null;
+  const isOneUnit = unitOf(frequency) === unitOf(setpoint);
+  const first = isOneUnit ? [[frequency, setpoint]] : [[frequency], [setpoint]];
+  const stack = [...first, [current], [third]]
+    .map(names => names.filter(Boolean))
+    .filter(names => names.length);
+  plots = stack.map((names, i) =>
+    one(place, names, i, i === stack.length - 1, names[0] === third ? rest : null),
+  );
+  past = null;
+  fetchPast();
+  draw();
+}
+
+const unitOf = name => spec.registers.find(r => r.name === name)?.unit;
+
+function one(place, names, index, isLast, choices) {
+  const specs = names.map(name => spec.registers.find(r => r.name === name));
+  const out = make("output"),
+    box = make("div", { class: "plotbox", role: "img" });
+  const heads = specs.map((register, i) =>
+    choices
+      ? picker(choices)
+      : make(
+          "span",
+          { class: "legend" },
+          swatch(i ? null : index),
+          `${words(register.name)}${unit(register) ? `, ${unit(register)}` : ""}`,
+        ),
+  );
+  place.append(
+    make(
+      "div",
+      { class: "plot" },
+      make("div", { class: "plothead" }, choices ? swatch(index) : null, heads, out),
+      box,
+    ),
+  );
+  const first = line(index, specs[0].name);
+  const band = { stroke: "transparent", points: { show: false } };
+  const series = [
+    first,
+    ...specs.slice(1).map(r => ({ ...line(0, r.name), stroke: colour("dim"), dash: [5, 4], width: 1.2 })),
+    band,
+    band,
+  ];
+  const plot = makePlot(box, [[], ...series.map(() => [])], {
+    series,
+    height: index === 0 ? 118 : isLast ? 112 : 92,
+    hasTimes: isLast,
+    range: wide(specs[0].unit === "Hz" ? 0.5 : 1),
+    sync: SYNC,
+    bands: [{ series: [series.length - 1, series.length], fill: translucent(index) }],
+    window: () => [(until() - range * 1000) / 1000, until() / 1000],
+    hooks: { setCursor: [u => put(out, under(u, specs))] },
+  });
+  return { plot, specs, box };
+}
+
+const translucent = index =>
+  colour(COLOURS[index % COLOURS.length])
+    .replace("rgb(", "rgba(")
+    .replace(")", ", 0.2)");
+
+function swatch(index) {
+  const mark = make("i", { class: index === null ? "swatch dashed" : "swatch", "aria-hidden": "true" });
+  if (index !== null) mark.style.background = colour(COLOURS[index]);
+  return mark;
+}
+
+function picker(choices) {
+  const select = make(
+    "select",
+    {
+      "aria-label": "Third plot",
+      onchange: event => {
+        third = event.target.value;
+        begin(spec);
+      },
+    },
+    choices.map(r => make("option", { value: r.name }, `${words(r.name)}${unit(r) ? `, ${unit(r)}` : ""}`)),
+  );
+  select.value = third;
+  return select;
+}
+
+function under(u, specs) {
+  const i = u.cursor.idx;
+  if (i === null || i === undefined || u.data[0][i] === undefined) return "";
+  const values = specs.map((r, k) => text(u.data[k + 1][i], r)).join(" / ");
+  return `${clock.time(u.data[0][i] * 1000)}  ${values}`;
+}
+
+const until = () => (isLive(now()) ? store.time : now());
+const needsHistory = () => range > FROM_HISTORY;
+
+// Ask for the recorded past: all of a long range, or what was before this page's first frame.
+async function fetchPast() {
+  const mine = ++serial,
+    to = until(),
+    from = to - range * 1000,
+    asked = spec;
+  const labels = plots.flatMap(({ specs }) => specs).map(r => label(asked.name, r.name));
+  link(labels, from, to);
+  let note = "";
+  try {
+    const told = await read(labels, from, to, POINTS);
+    if (mine === serial) past = { series: told.series, until: to };
+  } catch (error) {
+    if (needsHistory()) note = error.message;
+  }
+  if (mine !== serial) return;
+  const place = find("#past-note");
+  put(place, note);
+  place.hidden = note === "";
+  draw();
+  if (needsHistory())
+    setTimeout(() => {
+      if (mine === serial && spec === asked) fetchPast();
+    }, ANEW_MS);
+}
+
+function link(labels, from, to) {
+  const csv = find("#panel-csv");
+  if (csv && labels.length) csv.href = exportLink(labels, from, to, "csv");
+}
+
+// Draw the newest samples; ranges that are asked for are drawn when they come.
+export function draw() {
+  for (const { plot, specs, box } of plots) {
+    const tables = specs.map(r => samples(r));
+    const joined = join(
+      tables.map(t => t.slice(0, 2)).concat([[tables[0][0], tables[0][2], tables[0][3]]]),
+    );
+    plot.setData(joined);
+    const words_ = summary(words(specs[0].name), tables[0][1], unit(specs[0]), specs[0].digits ?? 0);
+    if (box.getAttribute("aria-label") !== words_) box.setAttribute("aria-label", words_);
+  }
+}
+
+// Return [times, values, most, least] of a register over the range that is shown.
+function samples(register) {
+  const from = until() - range * 1000;
+  const told = past?.series?.[label(spec.name, register.name)];
+  if (needsHistory()) return told ? [told.time, told.mean, told.most, told.least] : [[], [], [], []];
+  const [times, values] = store.drives.get(spec.name)?.pasts.get(register.name)?.since(from) ?? [[], []];
+  const first = times[0] ?? Infinity,
+    earlier = (told?.time ?? []).findLastIndex(ms => ms < first) + 1;
+  const before = [told?.time ?? [], told?.mean ?? []].map(column => column.slice(0, earlier));
+  const joined = before[0].concat(times),
+    none = joined.map(() => null);
+  return [joined, before[1].concat(values), none, none];
+}

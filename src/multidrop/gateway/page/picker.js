@@ -1,0 +1,150 @@
+// The choice of drives and quantities for trends.
+
+import { colour, fill, find, make, named } from "./dom.js";
+import { COLOURS, DASHES } from "./plots.js";
+import { key, state, store } from "./store.js";
+import { unit, words } from "./values.js";
+
+const MOST_DRIVES = COLOURS.length * DASHES.length;
+
+const NOTE =
+  "The band is the least and the largest value of each point, the line their mean: nothing between two " +
+  "points is left out. A gap is where no value came. Drag to look closer.";
+
+let chosen = [],
+  registers = [],
+  faults = true,
+  query = "",
+  changed = () => {},
+  place = null;
+
+export function begin(into, what) {
+  [place, changed] = [into, what];
+}
+
+let wanted = null; // named by an address before the plant was known
+
+// Keep what is chosen as far as this plant has it, and choose something where nothing is.
+export function takePlant() {
+  chosen = chosen.filter(name => store.drives.has(name));
+  if (wanted !== null) choose(wanted);
+  wanted = null;
+  const all = [...store.drives.keys()];
+  if (!chosen.length) chosen = [...all.filter(name => state(name) === "runs"), ...all].slice(0, 1);
+  if (!registers.length)
+    registers = [...new Set(chosen.flatMap(name => [key(name, "frequency"), key(name, "current")]))].filter(
+      Boolean,
+    );
+  draw();
+}
+
+// Choose this drive, in the place of those before.
+export function choose(name) {
+  if (!store.plant) wanted = name;
+  if (!store.drives.has(name)) return;
+  chosen = [name];
+  registers = [...new Set([...registers, key(name, "frequency"), key(name, "current")])].filter(
+    r => r && store.drives.get(name).registers.has(r),
+  );
+  draw();
+}
+
+export const drives = () => chosen;
+export const quantities = () => registers;
+export const showsFaults = () => faults;
+export const index = name => chosen.indexOf(name);
+
+function numbers() {
+  const found = new Map();
+  for (const name of chosen)
+    for (const r of store.drives.get(name).spec.registers)
+      if (r.kind === "number" && r.period_s !== null) found.set(r.name, r);
+  return [...found.values()];
+}
+
+export function draw() {
+  const filter = make("input", {
+    type: "search",
+    placeholder: "Find a drive",
+    "aria-label": "Find a drive",
+    autocomplete: "off",
+    oninput: event => {
+      query = event.target.value.toLowerCase();
+      show();
+    },
+  });
+  filter.value = query;
+  const names = [...store.drives.keys()];
+  const list = make("div", { class: "choices", role: "group", "aria-label": "Drives" }, names.map(choice));
+  const show = () => {
+    for (const label of list.children) label.hidden = !label.textContent.toLowerCase().includes(query);
+  };
+  fill(
+    place,
+    make(
+      "details",
+      { open: innerWidth > 1000 },
+      make("summary", {}, "What is shown"),
+      make("h2", {}, "Drives"),
+      names.length > 8 ? filter : null,
+      list,
+      make("h2", {}, "Quantities"),
+      make(
+        "div",
+        { class: "choices", role: "group", "aria-label": "Quantities" },
+        numbers().map(r =>
+          check(`${words(r.name)}${unit(r) ? `, ${unit(r)}` : ""}`, registers.includes(r.name), is => {
+            registers = toggled(registers, r.name, is);
+            changed();
+          }),
+        ),
+        check("faults and silence", faults, is => {
+          faults = is;
+          changed();
+        }),
+      ),
+      make("p", { class: "note" }, NOTE),
+    ),
+  );
+  show();
+}
+
+const toggled = (list, name, is) => (is ? [...list, name] : list.filter(other => other !== name));
+
+function choice(name) {
+  const at = chosen.indexOf(name);
+  return check(
+    named(name),
+    at >= 0,
+    is => {
+      if (is && chosen.length >= MOST_DRIVES) return;
+      chosen = toggled(chosen, name, is);
+      draw();
+      find(`input[data-name="${CSS.escape(name)}"]`, place)?.focus();
+      changed();
+    },
+    name,
+    at,
+  );
+}
+
+function check(title, is, what, name = null, at = -1) {
+  const box = make("input", {
+    type: "checkbox",
+    "data-name": name,
+    onchange: event => what(event.target.checked),
+  });
+  box.checked = is;
+  const mark =
+    at >= 0 ? make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }) : null;
+  if (mark) {
+    const pen = mark.getContext("2d");
+    [pen.strokeStyle, pen.lineWidth] = [colour(COLOURS[at % COLOURS.length]), 3];
+    pen.setLineDash(DASHES[Math.floor(at / COLOURS.length) % DASHES.length]);
+    pen.beginPath();
+    pen.moveTo(0, 3);
+    pen.lineTo(28, 3);
+    pen.stroke();
+  }
+  return make("label", {}, box, mark, make("span", {}, title));
+}

@@ -1,0 +1,79 @@
+// Plots made by uPlot: its theme, its axes, and series of different times on one.
+
+import * as clock from "./clock.js";
+import { colour } from "./dom.js";
+
+export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
+export const DASHES = [[], [6, 4], [2, 3], [10, 3, 2, 3]]; // a series has a shape too, not its colour alone
+const FONT = "11px system-ui, DejaVu Sans, sans-serif";
+
+export const isThere = () => Boolean(globalThis.uPlot);
+
+// Return the range of an axis with a margin, at least so wide that noise does not fill the plot.
+export const wide = least => (_, low, high) => {
+  if (low === null || high === null) return [0, 1];
+  const margin = Math.max((high - low) * 0.12, least);
+  return [low - margin, high + margin];
+};
+
+// Return a plot. `options` may have series, height, bands, range, hasTimes, cursor, hooks; times are seconds.
+export function makePlot(
+  into,
+  data,
+  { series, height, bands = [], range = wide(0.5), hasTimes = true, cursor = {}, hooks = {}, sync, window },
+) {
+  const line = { stroke: colour("grid"), width: 1 };
+  const axis = { stroke: colour("dim"), grid: line, ticks: line, font: FONT };
+  return new globalThis.uPlot(
+    {
+      width: Math.max(120, into.clientWidth),
+      height,
+      padding: [6, 12, hasTimes ? 0 : 6, 0],
+      legend: { show: false },
+      bands,
+      hooks,
+      tzDate: clock.tickDate,
+      cursor: { sync: { key: sync }, points: { size: 6 }, drag: { x: false, y: false }, ...cursor },
+      scales: { x: { time: true, range: window }, y: { range } },
+      axes: [
+        {
+          ...axis,
+          show: hasTimes,
+          size: 26,
+          space: 76,
+          values: (_, splits, _axis, _space, step) => clock.ticks(splits, step),
+        },
+        { ...axis, size: 48, space: 26 },
+      ],
+      series: [{}, ...series],
+    },
+    data,
+    into,
+  );
+}
+
+// Return a visible line. `index` gives colour and dashes.
+export const line = (index, label, extra = {}) => ({
+  label,
+  stroke: colour(COLOURS[index % COLOURS.length]),
+  width: 1.5,
+  dash: DASHES[Math.floor(index / COLOURS.length) % DASHES.length],
+  points: { show: false },
+  ...extra,
+});
+
+// Return one table of times (s) and columns from several [times in ms, column, column …].
+export function join(tables) {
+  const there = tables.map(([times, ...columns]) => [times.map(ms => ms / 1000), ...columns]);
+  return there.length === 1 ? there[0] : globalThis.uPlot.join(there);
+}
+
+// Return a sentence about a series for who does not see the plot.
+export function summary(what, values, unit, digits) {
+  const there = values.filter(value => value !== null && value !== undefined);
+  if (!there.length) return `${what}: no values`;
+  const low = there.reduce((a, b) => Math.min(a, b)),
+    high = there.reduce((a, b) => Math.max(a, b));
+  const [from, to, last] = [low, high, there[there.length - 1]].map(value => value.toFixed(digits));
+  return `${what}: ${from} to ${to} ${unit}, last ${last} ${unit}`;
+}

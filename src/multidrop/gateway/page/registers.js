@@ -1,0 +1,117 @@
+// All registers of the chosen drive: value, unit, place in the manual, and a way to write where it may be.
+
+import { change } from "./actions.js";
+import * as clock from "./clock.js";
+import { make, put } from "./dom.js";
+import { key, mayWrite, reading, store } from "./store.js";
+import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
+
+const LOOK_MS = 60000; // in which the gateway looks at all registers of a drive that somebody looks at
+
+let name = null,
+  rows = [],
+  others = {};
+
+// Make the table for a drive.
+export function build(spec) {
+  name = spec.name;
+  others = {};
+  rows = spec.registers.map(register => ({
+    register,
+    value: makeValue(),
+    age: make("td", { class: "age" }),
+  }));
+  return make(
+    "section",
+    { "aria-label": "Registers" },
+    make("h3", {}, "Registers"),
+    make(
+      "table",
+      { class: "registers" },
+      make(
+        "thead",
+        {},
+        make(
+          "tr",
+          {},
+          ["Register", "Value", "Age"].map(h => make("th", { scope: "col" }, h)),
+        ),
+      ),
+      make("tbody", {}, rows.map(row)),
+    ),
+  );
+}
+
+function row({ register, value, age }) {
+  return make(
+    "tr",
+    {},
+    make("th", { scope: "row" }, words(register.name), make("small", {}, about(register))),
+    make(
+      "td",
+      {},
+      value.whole,
+      isOffered(register)
+        ? make(
+            "button",
+            {
+              type: "button",
+              class: "change",
+              "aria-label": `Change ${words(register.name)}`,
+              onclick: () => change(name, register),
+            },
+            "Change",
+          )
+        : null,
+    ),
+    age,
+  );
+}
+
+// Commands are given by verbs, but for the setpoint.
+const isOffered = ({ name: register, access }) =>
+  (access === "setting" || register === key(name, "setpoint")) && mayWrite(name, register);
+
+// Return the register's place in the manual, and what may be asked of it.
+function about({ place, access, least, most, step, period_s: period, ...register }) {
+  const isLimited = typeof least === "number" && typeof most === "number";
+  return [
+    place,
+    access === "reading" ? null : access,
+    isLimited ? withUnit(`${least} to ${most}`, register) + (step ? ` by ${step}` : "") : null,
+    period ? `every ${clock.lasting(period * 1000)}` : null,
+  ]
+    .filter(Boolean)
+    .join(" · ");
+}
+
+// Take the newest values of registers that are not polled: {register: [value, ms, status]}.
+export function takeOthers(values) {
+  others = values ?? {};
+}
+
+// Return the reading of a register, polled or looked at.
+export function known(drive, register, t) {
+  const polled = reading(drive, register, t),
+    row = drive === name ? others[register] : undefined;
+  if (polled || !row) return polled;
+  const [value, ms, status] = row,
+    age = t - ms;
+  return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS };
+}
+
+export function draw(t) {
+  for (const { register, value, age } of rows) {
+    const found = known(name, register.name, t);
+    showValue(value, found, store.drives.get(name).registers.get(register.name), false);
+    put(
+      age,
+      found === null || found.value === null
+        ? (found?.status ?? "not read")
+        : found.isOld
+          ? clock.when(found.ms)
+          : clock.lasting(found.age),
+    );
+    if (age.textContent === "") put(age, UNKNOWN);
+  }
+}

@@ -1,0 +1,157 @@
+// One row of the table for each drive, and one above each line's.
+
+import * as clock from "./clock.js";
+import { fill, glyph, make, named, put, setClass } from "./dom.js";
+import { driveAge, isLive, key, reading, state, store } from "./store.js";
+import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
+
+export const COLUMNS = 8;
+const FULL_HZ = 50; // a bar's full length where no largest setpoint is stated
+
+// Return a line's row and its parts.
+export function makeHead(line) {
+  const parts = {
+    line,
+    used: make("i"),
+    planned: make("u"),
+    share: make("span"),
+    rate: make("span", { class: "wide" }),
+    missed: make("span"),
+  };
+  parts.bar = make("span", { class: "use", role: "img" }, parts.used, parts.planned);
+  parts.row = make(
+    "tr",
+    { class: "head" },
+    make(
+      "th",
+      { colspan: COLUMNS, scope: "rowgroup" },
+      make(
+        "div",
+        { class: "linehead" },
+        named(line.name, { class: "linename" }),
+        make("span", { class: "wide port" }, [line.port, line.speed].filter(Boolean).join(" · ")),
+        make("span", { class: "wire" }, "wire ", parts.bar, parts.share),
+        parts.rate,
+        parts.missed,
+      ),
+    ),
+  );
+  return parts;
+}
+
+// Return a drive's row and its parts.
+export function makeRow(drive) {
+  const parts = {
+    name: drive.name,
+    frequency: makeValue(),
+    current: makeValue(),
+    bar: make("i"),
+    set: make("u"),
+    canvas: make("canvas", { "aria-hidden": "true" }),
+    shape: make("span", { class: "shape" }),
+    word: make("span", { class: "word" }),
+    age: make("td", { class: "age" }),
+    missed: make("td", { class: "missed" }),
+  };
+  parts.link = make(
+    "a",
+    { href: `#/drives/${encodeURIComponent(drive.name)}`, tabindex: "-1", title: drive.name },
+    named(drive.name),
+  );
+  parts.bars = make("span", { class: "bar", "aria-hidden": "true" }, parts.bar, parts.set);
+  parts.row = make(
+    "tr",
+    { class: "drive" },
+    make("td", { class: "name" }, parts.link),
+    make("td", { class: "model" }, `${drive.family} ${drive.address}`),
+    make("td", { class: "state" }, make("span", { class: "st" }, parts.shape, parts.word)),
+    make("td", { class: "frequency" }, parts.bars, parts.frequency.whole),
+    make("td", { class: "current" }, parts.current.whole),
+    make("td", { class: "minute" }, parts.canvas),
+    parts.age,
+    parts.missed,
+  );
+  parts.row.addEventListener("click", event => {
+    if (!event.target.closest("a")) location.hash = parts.link.hash;
+  });
+  parts.text = `${drive.name} ${drive.family} ${drive.address}`.toLowerCase();
+  return parts;
+}
+
+function stateWord(is, drive, age) {
+  if (is === "fault") return drive.fault ?? "fault";
+  if (is !== "silent") return STATES[is] ?? is;
+  return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
+}
+
+// Draw frequency and setpoint as a bar, as far as both are hertz and of now.
+function drawBar(r, actual, set, register, setRegister) {
+  const isNew = found => Boolean(found && found.value !== null && !found.isOld);
+  const isSet = setRegister?.unit === "Hz",
+    full = (isSet && setRegister.most) || FULL_HZ;
+  const width = value => `${Math.min(100, (Math.abs(value) / full) * 100)}%`;
+  r.bars.hidden = !(register?.unit === "Hz" && isNew(actual));
+  r.set.hidden = !(isSet && isNew(set));
+  if (!r.bars.hidden) r.bar.style.width = width(actual.value);
+  if (!r.set.hidden) r.set.style.left = width(set.value);
+}
+
+// Draw a row anew. Return true where the state is another one.
+export function drawRow(r, t) {
+  const drive = store.frame?.drives[r.name],
+    is = state(r.name),
+    age = driveAge(r.name, t),
+    own = store.drives.get(r.name);
+  const changed = drawState(r, is, drive, age, t);
+  const [frequency, current, setpoint] = ["frequency", "current", "setpoint"].map(part =>
+    key(r.name, part),
+  );
+  const f = frequency && reading(r.name, frequency, t),
+    s = setpoint && reading(r.name, setpoint, t);
+  showValue(r.frequency, f, own.registers.get(frequency));
+  showValue(r.current, current && reading(r.name, current, t), own.registers.get(current), false);
+  drawBar(r, f, s, own.registers.get(frequency), own.registers.get(setpoint));
+  put(r.age, age === null ? UNKNOWN : clock.lasting(age));
+  const missed = drive?.missed ?? null;
+  put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
+  setClass(r.missed, "warn", missed > 0);
+  return changed;
+}
+
+function drawState(r, is, drive, age, t) {
+  const changed = r.state !== is;
+  if (changed) {
+    fill(r.shape, glyph(STATES[is] ? is : "unknown"));
+    r.row.classList.remove(...Object.keys(STATES));
+    r.row.classList.add(STATES[is] ? is : "unknown");
+    r.state = is;
+  }
+  const word = stateWord(is, drive, age);
+  put(r.word, isLive(t) || !store.frame ? word : `last: ${word}`);
+  if (r.word.title !== word) r.word.title = word;
+  return changed;
+}
+
+export function drawHead(h) {
+  const line = store.frame?.lines[h.line.name];
+  const { used = null, rate = null, planned = null, misses = null, lost = null } = line ?? {};
+  h.used.style.width = `${Math.min(1, used ?? 0) * 100}%`;
+  h.planned.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
+  h.planned.hidden = planned === null;
+  const words = `${share(used)} of ${share(planned)} planned`;
+  put(h.share, ` ${words}`);
+  if (h.bar.getAttribute("aria-label") !== words) h.bar.setAttribute("aria-label", words);
+  put(h.rate, rate === null ? "" : `${rate.toFixed(1)} exchanges/s`);
+  put(
+    h.missed,
+    lost
+      ? `port lost: ${lost}`
+      : misses === null
+        ? ""
+        : misses
+          ? `${misses} missed in the last minute`
+          : "none missed",
+  );
+  setClass(h.missed, "fault", Boolean(lost));
+  setClass(h.missed, "warn", !lost && misses > 0);
+}

@@ -1,0 +1,112 @@
+// Times, theme, rights and keys: what a person sets for this browser.
+
+import { post } from "./api.js";
+import { askToken, tell } from "./ask.js";
+import * as clock from "./clock.js";
+import { find, make } from "./dom.js";
+import { store } from "./store.js";
+
+const THEME = "multidrop-theme";
+const THEMES = [
+  ["", "as the system"],
+  ["light", "light"],
+  ["dark", "dark"],
+];
+const KEYS = [
+  ["↑ ↓", "another drive"],
+  ["Enter", "open it"],
+  ["/", "filter"],
+  ["1 to 5", "views"],
+  ["s", "stop the chosen drive (asks)"],
+  ["Shift S", "stop all drives (asks)"],
+  ["u", "UTC or local time"],
+  ["a, b", "markers in the trends"],
+  ["Esc", "close; back from a zoom"],
+];
+
+export function begin() {
+  setTheme(kept());
+  find("#more").addEventListener("click", show);
+  find("#role").addEventListener("click", show);
+  find("#clock").addEventListener("click", clock.switchZone);
+  labelClock();
+  addEventListener("timezone", labelClock);
+}
+
+function kept() {
+  try {
+    return localStorage.getItem(THEME) ?? "";
+  } catch {
+    return "";
+  }
+}
+
+function labelClock() {
+  find("#clock").title = clock.isUtc()
+    ? "All times are UTC. Press for local time."
+    : "All times are this device's local time. Press for UTC.";
+}
+
+function setTheme(name) {
+  if (name) document.documentElement.dataset.theme = name;
+  else delete document.documentElement.dataset.theme;
+  try {
+    localStorage.setItem(THEME, name);
+  } catch {
+    /* it lasts as long as the page, then */
+  }
+  dispatchEvent(new Event("theme"));
+}
+
+async function show() {
+  const radio = (group, value, title, is, what) => {
+    const box = make("input", { type: "radio", name: group, value, onchange: what });
+    box.checked = is;
+    return make("label", {}, box, title);
+  };
+  const may = store.plant?.may ?? {};
+  const contents = [
+    make(
+      "fieldset",
+      {},
+      make("legend", {}, "Times"),
+      radio("zone", "UTC", "UTC", clock.isUtc(), () => clock.isUtc() || clock.switchZone()),
+      radio(
+        "zone",
+        "local",
+        `local (${Intl.DateTimeFormat().resolvedOptions().timeZone})`,
+        !clock.isUtc(),
+        () => clock.isUtc() && clock.switchZone(),
+      ),
+    ),
+    make(
+      "fieldset",
+      {},
+      make("legend", {}, "Theme"),
+      THEMES.map(([value, title]) => radio("theme", value, title, kept() === value, () => setTheme(value))),
+    ),
+    make(
+      "p",
+      {},
+      `You may ${may.role ?? "look"}; ${may.write?.length ?? 0} registers may be written here. ` +
+        `Version ${store.plant?.version ?? "–"}.`,
+    ),
+    make(
+      "dl",
+      { class: "help" },
+      KEYS.flatMap(([key, what]) => [make("dt", {}, make("kbd", {}, key)), make("dd", {}, what)]),
+    ),
+  ];
+  const choice = await tell("Settings", contents, [
+    ["token", "Enter a token", "calm"],
+    ["forget", "Sign out", "calm"],
+  ]);
+  if (choice === "token")
+    await askToken("A token gives the right to stop or to write. The gateway's keeper makes them.");
+  if (choice === "forget") {
+    await post("api/forget", {}).catch(error =>
+      tell("Not signed out", make("p", { class: "bad" }, error.message)),
+    );
+    dispatchEvent(new Event("signed"));
+  }
+}

@@ -1,0 +1,128 @@
+// The plant and its newest values, as the gateway sends them, and a short past of each for plots.
+// A value is never without its time, and never new where it is not.
+
+import { Ring } from "./ring.js";
+
+const SAMPLES = 2e6; // of all registers together
+const UNPLANNED_LIMIT_MS = 5000; // how old a value may be whose period is not known
+const FAILED_LIMIT_MS = 1000; // and one whose newest request failed
+export const LIVE_MS = 1500; // a frame comes each second at least
+
+export const store = { plant: null, frame: null, time: 0, isLost: false, drives: new Map() };
+store.lines = new Map();
+const watchers = [];
+
+// Call `what` when there is another plant.
+export function onPlant(what) {
+  watchers.push(what);
+  if (store.plant) what();
+}
+
+// Take a plant description. Pasts go on where drive and register still exist.
+export function takePlant(plant) {
+  const before = store.drives;
+  store.plant = plant;
+  store.drives = new Map();
+  store.lines = new Map(plant.lines.map(line => [line.name, line]));
+  for (const line of plant.lines) {
+    for (const spec of line.drives) {
+      const registers = new Map(spec.registers.map(r => [r.name, r]));
+      const old = before.get(spec.name);
+      store.drives.set(spec.name, {
+        spec,
+        line,
+        registers,
+        good: old?.good ?? new Map(),
+        pasts: old?.pasts ?? new Map(),
+      });
+    }
+  }
+  for (const watcher of watchers) watcher();
+}
+
+// Take a frame: keep each value that is newer than the one before.
+export function takeFrame(frame) {
+  store.frame = frame;
+  store.time = Number(BigInt(frame.time) / 1000000n);
+  for (const [name, drive] of store.drives) {
+    const values = frame.drives[name]?.values ?? {};
+    for (const [register, row] of Object.entries(values)) keep(drive, register, row);
+  }
+}
+
+// A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] where the newest request failed.
+function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
+  if (value !== null) drive.good.set(register, { value, ms });
+  else if (lastMs > (drive.good.get(register)?.ms ?? 0))
+    drive.good.set(register, { value: lastValue, ms: lastMs });
+  if (!drive.pasts.has(register)) drive.pasts.set(register, new Ring(most()));
+  const isGood = status === "ok" && value !== null;
+  drive.pasts.get(register).add(ms, isGood ? value : NaN);
+}
+
+function most() {
+  let registers = 0;
+  for (const drive of store.drives.values()) registers += Math.max(1, drive.pasts.size);
+  return Math.max(120, Math.min(6000, Math.floor(SAMPLES / registers)));
+}
+
+// Return what is known of a register now, or null where nothing ever was:
+// {value, ms, status, age (ms), isOld}. `now` is the daemon's time; a value is old when it is older than
+// three periods, than a second where the newest request failed, or when the frame itself is old.
+export function reading(name, register, now) {
+  const drive = store.drives.get(name),
+    row = store.frame?.drives[name]?.values?.[register];
+  const good = drive?.good.get(register);
+  if (!good)
+    return row ? { value: null, ms: row[1], status: row[2], age: now - row[1], isOld: true } : null;
+  const status = row ? row[2] : "no more polled";
+  const age = (isLive(now) ? store.time : now) - good.ms;
+  return {
+    value: good.value,
+    ms: good.ms,
+    status,
+    age,
+    isOld: age > (status === "ok" ? limit(drive, register) : FAILED_LIMIT_MS) || !isLive(now),
+  };
+}
+
+function limit(drive, register) {
+  const period = drive.registers.get(register)?.period_s;
+  return period ? Math.max(3000 * period, 1000) : UNPLANNED_LIMIT_MS;
+}
+
+export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
+
+// Return the age of the drive's newest good reply in ms, or null where there never was one.
+export function driveAge(name, now) {
+  const seen = store.frame?.drives[name]?.seen ?? null;
+  return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
+}
+
+export const state = name => store.frame?.drives[name]?.state ?? "unknown";
+
+// Return the register that has this part in the drive, "frequency" for one, or null.
+export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
+
+const KINDS = ["fault", "silent", "port"];
+
+// Return what is and was wrong, newest first; lines whose port is gone come before.
+export function alarms() {
+  const { alarms: told = [], lines = {} } = store.frame ?? {};
+  const gone = Object.entries(lines)
+    .filter(([, line]) => line.lost)
+    .map(([line, { lost }]) => ({ kind: "port", line, text: lost, time: null, ended: null }));
+  return gone.concat(told.map(alarm => ({ ...alarm, kind: kindOf(alarm) })));
+}
+
+function kindOf({ kind, drive, ended }) {
+  if (KINDS.includes(kind)) return kind;
+  return ended === null && state(drive) === "silent" ? "silent" : "fault";
+}
+
+export const lasting = () => alarms().filter(alarm => alarm.ended === null);
+
+// Return whether the page's user may do this here: a register or a verb of a drive.
+export const mayWrite = (drive, register) =>
+  store.plant?.may?.write?.includes(`${drive}.${register}`) ?? false;
+export const mayAct = (drive, verb) => store.plant?.may?.verbs?.includes(`${drive}.${verb}`) ?? false;

@@ -1,0 +1,165 @@
+// The drives by line: which rows there are, which are shown, and which one is chosen.
+
+import { colour, fill, find, make, put, setClass } from "./dom.js";
+import { now } from "./link.js";
+import { drawHead, drawRow, makeHead, makeRow } from "./rows.js";
+import { spark } from "./spark.js";
+import { isLive, key, onPlant, state, store } from "./store.js";
+
+const HEADS = [
+  ["Drive", "name"],
+  ["Model", "model"],
+  ["State", "state"],
+  ["Frequency", "frequency"],
+  ["Current", "current"],
+  ["Last minute", "minute"],
+  ["Age", "age"],
+  ["Missed", "missed"],
+];
+const SHOWN = {
+  all: ["All", () => true],
+  runs: ["Running", s => s === "runs"],
+  stands: ["Stopped", s => s === "stands"],
+  bad: ["Fault, silent, unknown", s => s === "fault" || s === "silent" || s === "unknown"],
+};
+
+let rows = [],
+  heads = [],
+  show = "all",
+  query = "",
+  chosen = null;
+
+// Build the table for the plant, and its filter.
+export function begin() {
+  onPlant(build);
+  const filter = find("#filter");
+  filter.addEventListener("input", () => {
+    query = filter.value.trim().toLowerCase();
+    drawFilter();
+  });
+  fill(
+    find("#chips"),
+    Object.entries(SHOWN).map(([name, [title]]) =>
+      make(
+        "button",
+        {
+          type: "button",
+          "data-show": name,
+          "aria-pressed": name === show,
+          onclick: () => {
+            show = name;
+            drawFilter();
+          },
+        },
+        `${title} `,
+        make("b", {}, ""),
+      ),
+    ),
+  );
+}
+
+function build() {
+  rows = [];
+  heads = [];
+  const table = make(
+    "table",
+    {},
+    make("caption", { class: "hidden" }, "Drives by line"),
+    make(
+      "thead",
+      {},
+      make(
+        "tr",
+        {},
+        HEADS.map(([title, kind]) => make("th", { scope: "col", class: kind }, title)),
+      ),
+    ),
+    store.plant.lines.map(line =>
+      make(
+        "tbody",
+        {},
+        keepHead(makeHead(line)),
+        line.drives.map(drive => keepRow(makeRow(drive))),
+      ),
+    ),
+  );
+  fill(find("#table"), table);
+  fit();
+  choose(chosen);
+  drawRows();
+  drawFilter();
+}
+
+function keepHead(head) {
+  heads.push(head);
+  return head.row;
+}
+
+function keepRow(row) {
+  rows.push(row);
+  return row.row;
+}
+
+// Let the heads of lines span the columns that this width shows.
+export function fit() {
+  const count = [...document.querySelectorAll("#table thead th")].filter(
+    th => getComputedStyle(th).display !== "none",
+  ).length;
+  for (const th of document.querySelectorAll("#table tr.head th")) th.colSpan = Math.max(1, count);
+}
+
+// Mark the chosen drive; Tab leads to it.
+export function choose(name) {
+  chosen = name;
+  const first = rows.find(r => r.name === name) ?? rows[0];
+  for (const r of rows) {
+    r.link.tabIndex = r === first ? 0 : -1;
+    if (r.name === name) r.link.setAttribute("aria-current", "true");
+    else r.link.removeAttribute("aria-current");
+    setClass(r.row, "chosen", r.name === name);
+  }
+}
+
+// Return the link of the drive that lies so many rows below the one that has the focus, or null.
+export function neighbour(step) {
+  const there = rows.filter(r => !r.row.hidden);
+  const focused = there.findIndex(r => r.link === document.activeElement);
+  const at = focused >= 0 ? focused : there.findIndex(r => r.name === chosen);
+  return there[Math.max(0, Math.min(there.length - 1, at < 0 ? 0 : at + step))]?.link ?? null;
+}
+
+// Give the focus to the chosen drive's row.
+export const focusChosen = () => rows.find(r => r.name === chosen)?.link.focus();
+
+export function drawRows() {
+  const t = now();
+  const changed = rows.map(row => drawRow(row, t)).includes(true);
+  if (changed) drawFilter();
+  for (const h of heads) drawHead(h);
+}
+
+export function drawSparks() {
+  const run = colour("run"),
+    dim = colour("bar"),
+    t = now(),
+    isNow = isLive(t);
+  for (const r of rows) {
+    const register = key(r.name, "frequency");
+    spark(
+      r.canvas,
+      store.drives.get(r.name).pasts.get(register),
+      isNow ? store.time : t,
+      state(r.name) === "runs" && isNow ? run : dim,
+    );
+  }
+}
+
+function drawFilter() {
+  for (const r of rows)
+    r.row.hidden = !(SHOWN[show][1](state(r.name)) && (r.text + " " + r.word.textContent).includes(query));
+  for (const button of find("#chips").children) {
+    const is = SHOWN[button.dataset.show][1];
+    button.setAttribute("aria-pressed", button.dataset.show === show);
+    put(find("b", button), String(rows.filter(r => is(state(r.name))).length));
+  }
+}

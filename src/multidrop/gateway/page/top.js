@@ -1,0 +1,125 @@
+// The head of the page: plant, views, how old the frame is, clock, rights, and the strip of what is wrong.
+
+import * as clock from "./clock.js";
+import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
+import { correction, link, now } from "./link.js";
+import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
+
+const DEAD_MS = 3000;
+const SKEW_MS = 2000; // a viewer's clock that is so wrong is told of
+let told = "";
+let shownStrip = "",
+  ages = []; // [element, time in ms or null] of what the strip shows
+
+// Say what the plant file holds, wherever the head shows it.
+export function showPlant() {
+  const { plant } = store;
+  const name = plant.name.replace(/\.toml$/, "");
+  put(find("#plant"), name);
+  document.title = `${name} – multidrop`;
+  const stopall = find("#stopall");
+  stopall.dataset.drives = store.drives.size;
+  stopall.dataset.lines = store.lines.size;
+  put(find("#role"), `${plant.demo ? "simulated, " : ""}may ${plant.may?.role ?? "look"}`);
+}
+
+// Draw the head anew. Called a few times a second.
+export function drawTop() {
+  const t = now(),
+    age = t - store.time,
+    isNow = isLive(t);
+  const words =
+    store.frame === null
+      ? store.isLost
+        ? "no connection"
+        : "connecting"
+      : isNow
+        ? "live"
+        : `${Math.max(1, Math.round(age / 1000))} s old`;
+  put(find("#link span"), age < 120000 || store.frame === null ? words : `${clock.lasting(age)} old`);
+  setClass(find("#link"), "stale", !isNow);
+  setClass(document.body, "stale", store.frame !== null && !isNow);
+  setClass(document.body, "dead", store.frame !== null && (store.isLost || age > DEAD_MS));
+  put(find("#clock"), `${clock.time(t)} ${clock.zoneName()}`);
+  drawNotice(isNow, age);
+  tellChange(isNow);
+  drawStrip(t);
+}
+
+function drawNotice(isNow, age) {
+  const parts = [];
+  if (store.isLost) parts.push(`The daemon ${lostWords()}.`);
+  else if (store.frame && age > LIVE_MS) parts.push("The daemon sends no new values.");
+  if (store.frame && !isNow)
+    parts.push(`What is shown is of ${clock.when(store.time)} ${clock.zoneName()}.`);
+  const off = correction();
+  if (Math.abs(off) > SKEW_MS) {
+    parts.push(
+      `This device's clock is ${clock.lasting(Math.abs(off))} ${off > 0 ? "slow" : "fast"}; ` +
+        "times here are the daemon's.",
+    );
+  }
+  const notice = find("#notice");
+  put(notice, parts.join(" "));
+  notice.hidden = parts.length === 0;
+  setClass(notice, "bad", !isNow);
+}
+
+const lostWords = () => (link.why.endsWith(".") ? link.why.slice(0, -1) : link.why);
+
+function tellChange(isNow) {
+  const words = store.frame === null && !store.isLost ? "" : isNow ? "live" : "old";
+  if (words && words !== told && (told || words === "old"))
+    say(words === "live" ? "Values are live again." : "Values are old: no new ones come.");
+  told = words || told;
+}
+
+// Show what is wrong, newest first, each with its full text; a click opens the drive.
+function drawStrip(t) {
+  const alarms = lasting(),
+    most = innerWidth < 641 ? 2 : 5;
+  const count = find("#count");
+  put(count, String(alarms.length || ""));
+  count.hidden = alarms.length === 0;
+  const shown = alarms.slice(0, most);
+  const sign = JSON.stringify([shown, alarms.length, calm()]);
+  if (sign !== shownStrip) buildStrip(shown, alarms.length - shown.length);
+  shownStrip = sign;
+  for (const [age, time] of ages) put(age, time === null ? "" : `, ${clock.lasting(t - time)}`);
+}
+
+// Return the words for a plant where no alarm lasts.
+function calm() {
+  if (!store.frame) return "No values yet.";
+  const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;
+  const others = unknown ? `, ${unknown} of unknown state` : "";
+  return `${store.drives.size} drives, no fault known, none silent${others}.`;
+}
+
+function buildStrip(alarms, more) {
+  const strip = find("#strip");
+  ages = [];
+  setClass(
+    strip,
+    "bad",
+    alarms.some(alarm => alarm.kind === "fault"),
+  );
+  if (!alarms.length) fill(strip, make("li", {}, calm()));
+  else
+    fill(
+      strip,
+      alarms.map(item),
+      more ? make("li", {}, make("a", { href: "#/faults" }, `and ${more} more`)) : null,
+    );
+}
+
+function item({ kind, drive, line, text, time }) {
+  const age = make("span");
+  ages.push([age, time]);
+  const href = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
+  return make(
+    "li",
+    {},
+    make("a", { class: kind, href }, glyph(kind), named(drive ?? line), ": ", named(text), age),
+  );
+}

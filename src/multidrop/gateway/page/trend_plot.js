@@ -1,0 +1,87 @@
+// One quantity of several drives over recorded time, each with the band of its least and largest value.
+
+import * as clock from "./clock.js";
+import { colour, fill, make, named } from "./dom.js";
+import { label } from "./history.js";
+import * as markers from "./markers.js";
+import * as picker from "./picker.js";
+import { COLOURS, join, line, makePlot, summary, wide } from "./plots.js";
+import { store } from "./store.js";
+import { unit, words } from "./values.js";
+
+// Make the plot of one quantity of all chosen drives. `set` shows the span that was dragged over.
+export function makeTrend(place, register, told, { view, set, count }) {
+  const drives = picker.drives().filter(name => told[label(name, register)]);
+  const spec = store.drives.get(drives[0]).registers.get(register);
+  const out = make("output"),
+    box = make("div", { class: "plotbox", role: "img" });
+  place.append(
+    make(
+      "div",
+      { class: "plot" },
+      make(
+        "div",
+        { class: "plothead" },
+        make("b", {}, `${words(register)}${unit(spec) ? `, ${unit(spec)}` : ""}`),
+        out,
+      ),
+      box,
+    ),
+  );
+  const series = [],
+    bands = [],
+    tables = [],
+    said = [];
+  for (const name of drives) {
+    const { time, least, mean, most } = told[label(name, register)],
+      index = picker.index(name),
+      k = series.length + 1;
+    const bare = { stroke: "transparent", points: { show: false } };
+    series.push(bare, bare, line(index, name, { points: { show: time.length < 3 } }));
+    bands.push({
+      series: [k, k + 1],
+      fill: colour(COLOURS[index % COLOURS.length])
+        .replace("rgb(", "rgba(")
+        .replace(")", ", 0.22)"),
+    });
+    tables.push([time, most, least, mean]);
+    said.push(summary(name, mean, unit(spec), spec.digits ?? 0));
+  }
+  const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
+  const plot = makePlot(box, join(tables), {
+    series,
+    bands,
+    height,
+    range: wide(spec.unit === "Hz" ? 0.5 : 1),
+    sync: "trends",
+    cursor: { drag: { x: true, y: false, setScale: false } },
+    window: () => [view.from / 1000, view.to / 1000],
+    hooks: {
+      setCursor: [u => fill(out, under(u, drives, spec))],
+      setSelect: [
+        u => {
+          if (u.select.width > 4)
+            set(
+              u.posToVal(u.select.left, "x") * 1000,
+              u.posToVal(u.select.left + u.select.width, "x") * 1000,
+              false,
+            );
+        },
+      ],
+      draw: [u => markers.mark(u)],
+    },
+  });
+  box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
+  return { plot, drives, spec, register };
+}
+
+function under(u, drives, spec) {
+  const i = u.cursor.idx;
+  if (i === null || i === undefined || u.data[0][i] === undefined) return [];
+  return [
+    make("span", {}, clock.time(u.data[0][i] * 1000)),
+    ...drives.map((name, k) =>
+      make("span", {}, named(name), ` ${u.data[3 + 3 * k][i]?.toFixed(spec.digits ?? 0) ?? "–"}`),
+    ),
+  ];
+}

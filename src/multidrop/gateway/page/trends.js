@@ -1,0 +1,194 @@
+// Recorded values over any time: zoom, markers, faults beside them, and files to take away.
+
+import * as clock from "./clock.js";
+import { fill, find, make, put } from "./dom.js";
+import { exportLink, label, read } from "./history.js";
+import { draw as drawLane } from "./lane.js";
+import { now } from "./link.js";
+import * as markers from "./markers.js";
+import { isThere } from "./plots.js";
+import * as picker from "./picker.js";
+import { onPlant, store } from "./store.js";
+import { makeTrend } from "./trend_plot.js";
+
+const RANGES = [
+  [900, "15 min"],
+  [3600, "1 h"],
+  [8 * 3600, "8 h"],
+  [86400, "24 h"],
+  [7 * 86400, "7 days"],
+];
+const LEAST_MS = 1000;
+const ANEW_MS = 5000;
+const SETTLE_MS = 150; // of several clicks the last one is asked for
+
+const view = { from: 0, to: 0, follows: true, back: [] };
+let plots = [],
+  told = null,
+  waiting = null,
+  serial = 0,
+  isShown = false;
+
+export function begin() {
+  onPlant(() => {
+    picker.takePlant();
+    if (isShown) ask();
+  });
+  const buttons = RANGES.map(([seconds, name]) =>
+    make("button", { type: "button", "data-seconds": seconds, onclick: () => last(seconds) }, name),
+  );
+  const steps = [
+    ["◀", "Earlier", () => pan(-0.5)],
+    ["▶", "Later", () => pan(0.5)],
+    ["−", "Zoom out", () => zoom(2)],
+    ["+", "Zoom in", () => zoom(0.5)],
+    ["Back", "Back to the span before", back],
+  ];
+  fill(
+    find("#trends"),
+    make("div", { class: "card picker", id: "picker" }),
+    make(
+      "div",
+      { class: "card plots" },
+      make(
+        "div",
+        { class: "ranges", role: "group", "aria-label": "Span of time" },
+        buttons,
+        steps.map(([sign, name, what]) =>
+          make("button", { type: "button", "aria-label": name, title: name, onclick: what }, sign),
+        ),
+        markers.buttons(),
+        make("span", { class: "span", id: "span" }),
+        make("a", { id: "csv", download: true }, "CSV"),
+        make("a", { id: "parquet", download: true }, "Parquet"),
+      ),
+      make("p", { class: "note", id: "trend-note", hidden: true }),
+      make("div", { id: "lane" }),
+      make("div", { id: "trend-plots" }),
+      make("div", { id: "marks" }),
+    ),
+  );
+  picker.begin(find("#picker"), ask);
+  markers.begin(
+    () => plots,
+    () => view,
+  );
+}
+
+// Show the view; a link may name a drive and a span.
+export function show(options) {
+  isShown = true;
+  if (options.get("drive")) picker.choose(options.get("drive"));
+  if (options.get("from")) set(Number(options.get("from")), Number(options.get("to")), false);
+  else if (!view.to || view.follows) last((view.to - view.from) / 1000 || 3600);
+  ask();
+}
+
+export function hide() {
+  isShown = false;
+  serial++;
+}
+
+function set(from, to, follows) {
+  const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
+  if (isSame && !follows) return; // each plot tells of a drag
+  if (view.to) view.back.push([view.from, view.to, view.follows]);
+  view.back.splice(0, view.back.length - 50);
+  Object.assign(view, { from, to: Math.max(to, from + LEAST_MS), follows });
+  ask();
+}
+
+const last = seconds => set(now() - seconds * 1000, now(), true);
+const pan = part => {
+  const by = (view.to - view.from) * part;
+  set(view.from + by, view.to + by, false);
+};
+const zoom = by => {
+  const middle = (view.from + view.to) / 2,
+    half = ((view.to - view.from) / 2) * by;
+  set(middle - half, middle + half, false);
+};
+
+export function back() {
+  const before = view.back.pop();
+  if (!before) return;
+  [view.from, view.to, view.follows] = before;
+  ask();
+}
+
+// Ask for what is chosen, soon; a later question makes an earlier one's answer void.
+function ask() {
+  clearTimeout(waiting);
+  showSpan();
+  waiting = setTimeout(fetchAll, SETTLE_MS);
+}
+
+function showSpan() {
+  put(find("#span"), `${clock.moment(view.from)} – ${clock.moment(view.to)} ${clock.zoneName()}`);
+  const length = Math.round((view.to - view.from) / 1000);
+  for (const button of document.querySelectorAll("#trends .ranges [data-seconds]")) {
+    button.setAttribute("aria-pressed", view.follows && Number(button.dataset.seconds) === length);
+  }
+  const labels = wanted();
+  for (const format of ["csv", "parquet"]) {
+    const anchor = find(`#${format}`);
+    if (labels.length) anchor.href = exportLink(labels, view.from, view.to, format);
+    else anchor.removeAttribute("href");
+  }
+}
+
+const wanted = () =>
+  picker.quantities().flatMap(register =>
+    picker
+      .drives()
+      .filter(name => store.drives.get(name).registers.has(register))
+      .map(name => label(name, register)),
+  );
+
+async function fetchAll() {
+  const mine = ++serial,
+    labels = wanted();
+  if (!isShown || !store.plant) return;
+  drawLane(find("#lane"), view.from, view.to, picker.showsFaults() ? picker.drives() : []);
+  let note = labels.length ? "" : "Choose a drive and a quantity.";
+  told = { series: {} };
+  try {
+    if (labels.length)
+      told = await read(labels, view.from, view.to, Math.max(200, find("#trend-plots").clientWidth));
+  } catch (error) {
+    note = error.message;
+  }
+  if (mine !== serial || !isShown) return;
+  put(find("#trend-note"), note);
+  find("#trend-note").hidden = note === "";
+  draw();
+  if (view.follows) {
+    waiting = setTimeout(
+      () => {
+        const length = view.to - view.from;
+        if (view.follows && isShown) {
+          [view.from, view.to] = [now() - length, now()];
+          showSpan();
+          fetchAll();
+        }
+      },
+      Math.max(ANEW_MS, told.step_ms ?? 0),
+    );
+  }
+}
+
+// Draw what was told last; on another size, theme or time zone too.
+export function draw() {
+  for (const { plot } of plots) plot.destroy();
+  plots = [];
+  const place = find("#trend-plots");
+  fill(place);
+  if (!isShown || !told || !isThere()) return;
+  const names = picker
+    .quantities()
+    .filter(register => picker.drives().some(name => told.series[label(name, register)]));
+  names.forEach(register =>
+    plots.push(makeTrend(place, register, told.series, { view, set, count: names.length })),
+  );
+  markers.draw();
+}

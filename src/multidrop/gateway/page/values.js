@@ -1,0 +1,91 @@
+// Values as texts. What is not known is a dash, never a nought; what is old carries its time.
+
+import * as clock from "./clock.js";
+import { make, setClass } from "./dom.js";
+
+export const STATES = {
+  runs: "runs",
+  stands: "stopped",
+  fault: "fault",
+  silent: "silent",
+  unknown: "unknown",
+};
+export const UNKNOWN = "–";
+const MOST_BITS = 32;
+
+export const words = name => name.replaceAll("_", " ");
+
+// Return the number or word of a value, without its unit.
+export function text(value, register) {
+  if (value === null || value === undefined || Number.isNaN(value)) return UNKNOWN;
+  if (register?.kind === "words")
+    return register.words?.[value] ? `${words(register.words[value])} (${value})` : String(value);
+  if (register?.kind === "bits") return bits(value, register.words ?? {});
+  return Number(value).toFixed(register?.digits ?? 0);
+}
+
+function bits(value, names) {
+  const set = [];
+  for (let bit = 0; bit < MOST_BITS; bit++)
+    if (Math.floor(value / 2 ** bit) % 2) set.push(words(names[2 ** bit] ?? `bit ${bit}`));
+  return set.length ? set.join(", ") : "none set";
+}
+
+export const unit = register =>
+  register?.unit && register.kind !== "words" && register.kind !== "bits" ? register.unit : "";
+
+// Return a text with the register's unit, where it has one.
+export const withUnit = (told, register) => (unit(register) ? `${told} ${unit(register)}` : String(told));
+
+// Return a register's name with its unit, as the head of a plot or a field.
+export const title = register => words(register.name) + (unit(register) ? `, ${unit(register)}` : "");
+
+// Make a cell's inside once: the number, its unit, and since when it is old.
+export function makeValue() {
+  const parts = {
+    number: make("span", { class: "number" }),
+    unit: make("span", { class: "u" }),
+    age: make("small", { class: "dated" }),
+  };
+  parts.whole = make("span", { class: "value" }, parts.number, parts.unit, parts.age);
+  return parts;
+}
+
+// Show a reading (see store.reading) in what `makeValue` made.
+export function showValue(parts, reading, register, isDated = true, isNamed = isDated) {
+  const isThere = reading !== null && reading.value !== null;
+  const isOld = isThere && reading.isOld;
+  set(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
+  // a number without a unit says what it is
+  const isBare = !unit(register) && register?.kind === "number" && isNamed;
+  set(parts.unit, isThere ? (isBare ? words(register.name) : unit(register)) : "");
+  set(parts.age, isOld && isDated ? `${clock.lasting(reading.age)} old` : "");
+  setClass(parts.whole, "old", isOld);
+  const why = reason(reading);
+  if (parts.whole.title !== why) parts.whole.title = why;
+}
+
+// Return why a value is not there or old, or "" for a good one.
+function reason(reading) {
+  if (reading === null) return "never read";
+  if (reading.value === null) return `never read: ${reading.status}`;
+  if (!reading.isOld) return "";
+  const since = reading.status === "ok" ? "" : `; since then: ${reading.status}`;
+  return `of ${clock.moment(reading.ms)} ${clock.zoneName()}${since}`;
+}
+
+function set(element, value) {
+  if (element.textContent !== value) element.textContent = value;
+}
+
+// Return a share as per cent, or a dash for unknown; a small share is never shown as none.
+export function share(part) {
+  if (part === null || part === undefined) return UNKNOWN;
+  const percent = part * 100;
+  if (percent === 0) return "0 %";
+  if (percent < 0.1) return "< 0.1 %";
+  return percent < 10 ? `${percent.toFixed(1)} %` : `${Math.round(percent)} %`;
+}
+
+export const milliseconds = ms =>
+  ms === null || ms === undefined ? UNKNOWN : `${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms`;

@@ -1,0 +1,76 @@
+"""Chromium, a gateway with invented values, and pages of it. Without Chromium these tests are skipped."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
+
+import pytest
+from fake_gateway import FakeGateway
+from watching import LIVE, until
+
+SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
+PATIENCE_MS = 30000  # a busy machine is no failure of the page
+Opener = Callable[..., Any]
+
+
+def missing(what: str) -> NoReturn:
+    """Skip on a user's machine; fail where everything must run."""
+    if os.environ.get("CI") == "true":
+        pytest.fail(what)
+    pytest.skip(what)
+
+
+# Not for the session: playwright keeps a loop running in this thread, which other files' tests may not have.
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        missing("pip install '.[test]' brings playwright, which is not here")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        missing("no Chromium is installed")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def gateway() -> Iterator[FakeGateway]:
+    gateway = FakeGateway()
+    yield gateway
+    gateway.kill()
+
+
+@pytest.fixture
+def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
+    """Open a view of the page, and fail at the end where the page broke or broke its CSP."""
+    contexts, problems = [], []
+
+    def open_page(view: str = "#/drives", size: str = "desk", live: bool = True, **options: Any) -> Any:
+        width, height = SIZES[size]
+        context = browser.new_context(viewport={"width": width, "height": height}, **options)
+        context.set_default_timeout(PATIENCE_MS)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+        page.on("requestfailed", lambda request: print("failed:", request.url, request.failure))
+        page.goto(gateway.url + view)
+        if live:
+            until(page, LIVE)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert problems == []
+
+
+def is_problem(said: Any) -> bool:
+    """Return True for errors but those of requests, which tests let fail."""
+    return said.type in ("error", "warning") and "Failed to load resource" not in said.text

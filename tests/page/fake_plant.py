@@ -1,0 +1,162 @@
+"""A plant of three lines and 31 drives with values that move, shaped as the gateway's answers."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+NAMES = (
+    "pump-1 pump-2 pump-3 pump-4 fan-north fan-south mixer-1 mixer-2 conveyor-1 conveyor-2 screw",
+    "filler-1 filler-2 filler-3 capper-1 capper-2 labeller infeed outfeed accumulator rinser",
+    "tower-fan-1 tower-fan-2 tower-fan-3 chilled-1 chilled-2 booster-1 booster-2 exhaust-1 exhaust-2 "
+    "compressor",
+)
+FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-220")
+STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
+FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}
+SILENT = {"labeller": 42}
+SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
+
+
+def register(name: str, unit: str, digits: int, place: str, **more: Any) -> dict[str, Any]:
+    return {
+        "name": name, "unit": unit, "digits": digits, "kind": "number", "words": {}, "access": "reading",
+        "place": place, "period_s": 0.1, "least": None, "most": None, "step": 10.0**-digits, **more,
+    }  # fmt: skip
+
+
+REGISTERS = [
+    register("output_frequency", "Hz", 2, "section 7.2, 1000H"),
+    register("frequency_setpoint", "Hz", 1, "section 7.1, 2001H", access="setting", least=0, most=50),
+    register("output_current", "A", 1, "section 7.2, 1001H"),
+    register("dc_bus_voltage", "V", 0, "section 7.2, 1002H"),
+    register("output_torque", "%", 1, "section 7.2, 1005H"),
+    register("output_power", "kW", 1, "section 7.2, 1006H"),
+    register("heatsink_temperature", "°C", 0, "section 7.2, 1007H", period_s=1.0),
+    register("run_state", "", 0, "table 9-2, 3000H", kind="words", words={"1": "runs", "3": "standby"}),
+    register("status_bits", "", 0, "table 9-3, 3001H", kind="bits", words={"1": "ready", "4": "at_setpoint"}),
+    register("acceleration_time", "s", 1, "P0.11", access="setting", least=0, most=3600, period_s=None),
+    register("run_hours", "h", 0, "P7.11", period_s=None),
+]
+KEY = {"frequency": "output_frequency", "current": "output_current", "setpoint": "frequency_setpoint"}
+
+
+def plant(renamed: dict[str, str]) -> dict[str, Any]:
+    """Return `GET /api/plant`; drives of `renamed` have other names."""
+    lines = [
+        {
+            "name": f"hall-{n + 1}", "port": f"/dev/ttyUSB{n}", "speed": SPEEDS[n],
+            "drives": [
+                {
+                    "name": renamed.get(name, name), "family": FAMILIES[(2 * n + (i > 5)) % 5],
+                    "address": i + 1, "key": KEY, "registers": REGISTERS,
+                    "verbs": ["start", "stop", "reset_fault"],
+                }
+                for i, name in enumerate(names.split())
+            ],
+        }
+        for n, names in enumerate(NAMES)
+    ]  # fmt: skip
+    return {
+        "revision": 1, "version": "0.2", "name": "bottling plant.toml", "demo": False, "lines": lines,
+        "may": {
+            "role": "write",
+            "write": ["pump-1.frequency_setpoint"],
+            "verbs": ["pump-1.start", "pump-1.reset_fault"],
+        },
+    }  # fmt: skip
+
+
+def state(name: str) -> str:
+    if name in FAULTS:
+        return "fault"
+    if name in SILENT:
+        return "silent"
+    return "stands" if name in STANDING else "runs"
+
+
+def values(name: str, number: int, now: float) -> dict[str, float]:
+    """Return all registers of a drive at this time (s)."""
+    runs = state(name) == "runs"
+    set_to = 20 + number * 7 % 28
+    swing = math.sin(now / 9 + number * 1.7)
+    load = (0.55 + 0.25 * math.sin(now / 23 + number * 3)) if runs else 0
+    frequency = set_to + 0.35 * swing if runs else 0
+    return {
+        "output_frequency": round(frequency, 2),
+        "frequency_setpoint": set_to if state(name) != "fault" else 0,
+        "output_current": round(load * 22 + 2 * runs, 1),
+        "dc_bus_voltage": round(538 + 4 * math.sin(now / 31 + number)),
+        "output_torque": round(load * 92, 1),
+        "output_power": round(frequency * load * 0.21, 1),
+        "heatsink_temperature": round(33 + 16 * load + number % 6),
+        "run_state": 1 if runs else 3,
+        "status_bits": 5 if runs else 1,
+        "acceleration_time": 20,
+        "run_hours": 4012 + 37 * number,
+    }
+
+
+def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
+    """Return those that last and two that ended, newest first."""
+    since = {**{name: (text, age, "fault") for name, (text, age) in FAULTS.items()}}
+    since |= {name: ("no reply", age, "silent") for name, age in SILENT.items()}
+    lasting = [
+        {"time": ms(now - age), "drive": renamed.get(name, name), "text": text, "ended": None, "kind": kind}
+        for name, (text, age, kind) in since.items()
+    ]
+    ended = [
+        ("pump-1", "overheating of the heatsink", "fault", 1900, 400),
+        ("filler-2", "no reply", "silent", 2900, 90),
+    ]
+    past = [
+        {
+            "time": ms(now - ago), "drive": renamed.get(name, name), "text": text, "kind": kind,
+            "ended": ms(now - ago + lasted),
+        }
+        for name, text, kind, ago, lasted in ended
+    ]  # fmt: skip
+    return sorted(lasting + past, key=lambda alarm: -float(str(alarm["time"])))
+
+
+def ms(seconds: float) -> int:
+    return int(seconds * 1000)
+
+
+def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
+    """Return a frame. A drive of `stuck` has not had a new value since that time (s)."""
+    now = time.time()
+    drives = {}
+    for number, name in enumerate(" ".join(NAMES).split()):
+        at = stuck.get(name, now)
+        held = values(name, number, at)
+        polled = [r["name"] for r in REGISTERS if r["period_s"]]
+        if name in SILENT:
+            seen = began - SILENT[name]
+            old = values(name, number, seen)
+            rows = {r: [None, ms(now), "no reply", old[r], ms(seen)] for r in polled}
+        else:
+            seen = at
+            rows = {r: [held[r], ms(at), "ok"] for r in polled}
+        drives[renamed.get(name, name)] = {
+            "state": state(name), "fault": FAULTS[name][0] if name in FAULTS else None, "seen": ms(seen),
+            "values": rows, "why": "no reply" if name in SILENT else None,
+            "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
+        }  # fmt: skip
+    return {
+        "n": n, "revision": 1, "time": str(int(now * 1e9)), "drives": drives, "lines": lines(),
+        "alarms": alarms(renamed, began),
+    }  # fmt: skip
+
+
+def lines() -> dict[str, Any]:
+    used, planned, misses = (0.72, 0.94, 0.61), (0.71, 0.93, 0.62), (0, 14, 0)
+    rate, p99 = (101.3, 24.8, 92.4), (6.1, 11.9, 5.4)
+    return {
+        f"hall-{n + 1}": {
+            "used": used[n], "planned": planned[n], "misses": misses[n], "lost": None, "rate": rate[n],
+            "p99": p99[n],
+        }
+        for n in range(3)
+    }  # fmt: skip

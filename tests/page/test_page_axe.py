@@ -1,0 +1,51 @@
+"""Nobody is shut out: axe-core finds nothing in any view, at any size, in either theme."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import pytest
+from conftest import SIZES, Opener, missing
+
+VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/log", "settings", "stop")
+SHORT = {("desk", "light"), ("phone", "dark")}
+TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+
+
+@pytest.fixture(scope="module")
+def axe() -> str:
+    try:
+        return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
+    except ImportError:
+        missing("pip install '.[test]' brings axe-core, which is not here")
+
+
+def violations(page: Any) -> list[str]:
+    found = page.evaluate("tags => axe.run(document, { runOnly: tags })", TAGS)["violations"]
+    return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]
+
+
+@pytest.mark.parametrize(
+    ("size", "theme"),
+    [
+        pytest.param(size, theme, marks=() if (size, theme) in SHORT else pytest.mark.long)
+        for size in SIZES
+        for theme in ("light", "dark")
+    ],
+)
+def test_axe_finds_nothing(opened: Opener, axe: str, size: str, theme: str) -> None:
+    page = opened(size=size, color_scheme=theme)
+    page.evaluate(axe)
+    found = {}
+    for view in VIEWS:
+        if view == "settings":
+            page.get_by_role("button", name="Settings").click()
+        elif view == "stop":
+            page.keyboard.press("Escape")
+            page.locator("#stopall").click()
+        else:
+            page.evaluate("view => { location.hash = view }", view)
+        page.wait_for_timeout(700)
+        found[view] = violations(page)
+    assert {view: some for view, some in found.items() if some} == {}

@@ -1,0 +1,49 @@
+"""The page's files: nothing that a text could turn into markup, nothing that its CSP forbids, all there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from fake_gateway import PAGE
+
+FILES = sorted(path for path in Path(str(PAGE)).iterdir() if path.is_file())
+OURS = [path for path in FILES if path.suffix in (".js", ".css", ".html")]
+SCRIPTS = [path for path in OURS if path.suffix == ".js"]
+MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextualFragment|DOMParser|srcdoc"
+CODE = r"\beval\(|new Function|javascript:|setAttribute\(\s*[\"']style|cssText"
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
+def test_no_text_can_become_markup_or_code(path: Path) -> None:
+    assert re.findall(f"{MARKUP}|{CODE}", path.read_text("utf-8")) == []
+
+
+def test_the_page_has_no_inline_style_script_or_handler() -> None:
+    html = Path(str(PAGE / "index.html")).read_text("utf-8")
+    assert re.findall(r"\sstyle\s*=|<style|\son\w+\s*=|<script(?![^>]*\ssrc=)|https?://|data:", html) == []
+
+
+@pytest.mark.parametrize("path", OURS, ids=lambda path: path.name)
+def test_a_file_has_one_job_and_short_lines(path: Path) -> None:
+    lines = path.read_text("utf-8").splitlines()
+    assert len(lines) <= 250
+    assert max(map(len, lines)) <= 110 or path.suffix == ".html"
+    assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0])
+
+
+def test_whatever_is_named_is_there_and_whatever_is_there_is_named() -> None:
+    text = "".join(path.read_text("utf-8") for path in OURS)
+    named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
+    there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}
+    assert there - named == {"index.html", "vendor/uPlot-LICENSE"}
+    assert named - there == set()
+
+
+def test_the_vendored_plots_come_with_their_licence() -> None:
+    licence = Path(str(PAGE / "vendor" / "uPlot-LICENSE")).read_text("utf-8")
+    script = Path(str(PAGE / "vendor" / "uPlot.iife.min.js")).read_text("utf-8")
+    assert "The MIT License" in licence
+    assert "Leon Sorokin" in licence
+    assert "(v1.6.32)" in script[:80]

@@ -1,0 +1,85 @@
+"""The page with the gateway itself: a simulated plant, polled and stopped through it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import PATIENCE_MS, is_problem
+from gateways import served
+from lines import until as until_here
+from watching import LIVE, STALE, cell, until
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    page, problems = context.new_page(), []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+    yield page
+    context.close()
+    assert problems == []
+
+
+def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
+    with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        assert page.locator("tr.drive").count() == 2
+        until(page, "document.querySelectorAll('tr.drive.stands').length === 2")
+        assert cell(page, "pump-1", "frequency").inner_text().strip() == "0.00Hz"
+        for view, text in (
+            ("lines", "Wire used"),
+            ("faults", "Lasting: 0"),
+            ("log", "Nothing was written yet."),
+        ):
+            page.evaluate("view => { location.hash = `#/${view}` }", view)
+            page.locator(f"#{view}").get_by_text(text).first.wait_for()
+        page.locator("#stopall").click()
+        page.get_by_role("button", name="Stop all 2 drives").click()
+        page.get_by_role("heading", name="All 2 drives are stopped").wait_for()
+        page.keyboard.press("Escape")
+        until_here(lambda: gateway.get("/api/audit").json["entries"])
+        page.evaluate("location.hash = '#/drives'")
+        page.evaluate("location.hash = '#/log'")
+        page.locator("#log-list tbody tr").first.wait_for()
+
+
+def test_a_stop_asks_for_the_token_that_the_gateway_wants(page: Any, tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        page.keyboard.press("Shift+S")
+        page.get_by_role("button", name="Stop all 2 drives").click()
+        page.get_by_label("Token").fill(
+            next(s for right, s in gateway.secrets.items() if right.name == "STOP")
+        )
+        page.get_by_role("button", name="Sign in and send it").click()
+        page.get_by_role("heading", name="All 2 drives are stopped").wait_for()
+        until(page, "document.querySelector('#role').textContent === 'may stop'")
+
+
+def test_a_killed_gateway_is_told_within_two_seconds(page: Any) -> None:
+    command = [sys.executable, "-m", "multidrop", "serve", "--demo", "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert process.stdout is not None
+        url = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line)))
+        page.goto(url)
+        until(page, LIVE)
+        assert page.locator("tr.drive").count() == 8
+        process.send_signal(signal.SIGKILL)
+        assert until(page, STALE) < 2.0
+        assert "cannot be reached" in page.locator("#notice").inner_text()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()

@@ -1,0 +1,170 @@
+"""The page shows what the drives said last, and how old that is."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Any
+
+import pytest
+from conftest import Opener
+from fake_gateway import FakeGateway
+from watching import LIVE, STALE, cell, link, until
+
+DASH = "\u2013"
+LATE_S = 2.0  # within which the page says that the daemon is gone
+
+
+def test_all_drives_are_live_and_at_most_half_a_second_old(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.clocked = "pump-1"  # its frequency is the time
+    page = opened()
+    assert page.locator("tr.drive").count() == 31
+    ages = []
+    for _ in range(20):
+        shown = float(cell(page, "pump-1", "frequency").locator(".number").inner_text())
+        ages.append((time.time() - shown) % 1000)
+        page.wait_for_timeout(70)
+    assert sorted(ages)[17] < 0.5  # a stall of a busy machine is not the page's
+    assert page.locator("tr.drive .old").count() == 2  # frequency and current of the silent drive
+
+
+def test_a_killed_daemon_is_told_within_two_seconds(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/pump-1")
+    gateway.kill()
+    assert until(page, STALE) < LATE_S
+    assert re.fullmatch(r"\d+ s old", link(page))
+    notice = page.locator("#notice").inner_text()
+    assert "cannot be reached" in notice
+    assert re.search(r"What is shown is of \d\d:\d\d:\d\d UTC\.", notice)
+    page.wait_for_timeout(400)
+    assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 0
+    assert re.search(
+        r"^\d+\.\d+Hz\d+\.\d s old$", cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
+    )
+    assert cell(page, "pump-1", "state").inner_text().strip() == "last: runs"
+    assert page.locator("#said").inner_text() == "Values are old: no new ones come."
+
+
+def test_a_daemon_that_hangs_is_told_of(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened()
+    gateway.is_silent = True
+    assert until(page, STALE) < LATE_S + 0.5
+    assert link(page) == "2 s old"
+    assert "sends no new values" in page.locator("#notice").inner_text()
+    gateway.is_silent = False
+    until(page, f"!{STALE}")
+    assert link(page) == "live"
+    assert page.locator("#notice").is_hidden()
+
+
+def test_the_page_lives_again_when_the_daemon_does(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened()
+    gateway.kill()
+    until(page, "document.body.classList.contains('dead')")
+    again = FakeGateway(gateway.port)  # its frames are numbered from 1 again
+    try:
+        until(page, LIVE)
+        assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 30
+    finally:
+        again.kill()
+
+
+def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.stuck = {"pump-2": time.time()}
+    page = opened("#/drives/pump-2")
+    until(
+        page,
+        """[...document.querySelectorAll('tr.drive')].some(row => row.querySelector('a').title === 'pump-2'
+           && row.querySelector('td.frequency .value').classList.contains('old'))""",
+    )
+    shown = cell(page, "pump-2", "frequency")
+    assert re.search(r"\d\.\d s old", shown.inner_text())
+    style = shown.locator(".value").evaluate(
+        "e => [getComputedStyle(e).fontStyle, getComputedStyle(e).color]"
+    )
+    fresh = cell(page, "pump-1", "frequency").locator(".value")
+    assert style[0] == "italic"
+    assert fresh.evaluate("e => getComputedStyle(e).fontStyle") == "normal"
+    assert style[1] != fresh.evaluate("e => getComputedStyle(e).color")
+    assert page.locator(".keys .value.old").count() == 3
+    assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
+
+
+def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
+    page = opened("#/drives/labeller")
+    assert cell(page, "labeller", "state").inner_text().strip().startswith("silent for ")
+    assert re.search(r"Hz\d\d s old", cell(page, "labeller", "frequency").inner_text().replace("\n", ""))
+    assert "since then: no reply" in cell(page, "labeller", "frequency").locator(".value").get_attribute(
+        "title"
+    )
+
+
+def test_what_is_not_known_is_a_dash_and_never_a_nought(opened: Opener, gateway: FakeGateway) -> None:
+    now = int(time.time() * 1000)
+    rows = {"output_frequency": [None, now, "no reply"], "output_current": [None, None, "not asked yet"]}
+    drive = {"state": "unknown", "fault": None, "seen": None, "values": rows}
+    gateway.changes = {"drives": {"pump-1": drive}, "lines": {}}
+    page = opened("#/drives/pump-1")
+    for part in ("frequency", "current", "age", "missed"):
+        assert cell(page, "pump-1", part).inner_text().strip() == DASH
+    assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
+    assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
+    shown = set(page.locator(".registers .number").all_inner_texts())
+    assert shown == {DASH, "20.0", "4012"}  # two that are looked at
+    assert page.locator("tr.head .wire").first.inner_text().split() == ["wire", DASH, "of", DASH, "planned"]
+
+
+@pytest.mark.parametrize("off_s", [-90, 90])
+def test_a_wrong_clock_of_the_viewer_is_told_and_ages_stay_right(opened: Opener, off_s: int) -> None:
+    page = opened(live=False)
+    page.add_init_script(f"const now = Date.now; Date.now = () => now() + {off_s * 1000}")
+    page.reload()
+    until(page, LIVE)
+    notice = page.locator("#notice")
+    notice.wait_for()
+    assert re.search(r"clock is (89|90|91) s (slow|fast); times", notice.inner_text())
+    assert ("slow" in notice.inner_text()) == (off_s < 0)
+    assert page.locator("tr.drive td.frequency .value:not(.old)").count() == 30
+
+
+def test_times_are_of_24_hours_in_utc_or_local_by_a_switch(opened: Opener) -> None:
+    page = opened(timezone_id="Asia/Kolkata", locale="en-US")
+    clock = page.locator("#clock")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d UTC", clock.inner_text())
+    utc = int(clock.inner_text()[:2]) * 60 + int(clock.inner_text()[3:5])
+    page.keyboard.press("u")
+    until(page, "document.querySelector('#clock').textContent.endsWith('local')")
+    local = int(clock.inner_text()[:2]) * 60 + int(clock.inner_text()[3:5])
+    assert (local - utc) % 1440 in (330, 331)
+    afternoon = 1764075600  # 2025-11-25 13:00 UTC, 18:30 in Kolkata
+    asked = f"[c.ticks([{afternoon}], 3600), c.moment({afternoon}000), c.isUtc()]"
+    tick = f"import('/page/clock.js').then(c => {asked})"
+    assert page.evaluate(tick)[0] == ["18:30"]
+    clock.click()
+    ticks, moment, is_utc = page.evaluate(tick)
+    assert (ticks, is_utc) == (["13:00"], True)
+    assert "13:00:00" in moment
+    assert not re.search(r"\b[ap]m\b", page.locator("body").inner_text(), re.IGNORECASE)
+    page.keyboard.press("u")
+    page.reload()
+    until(page, "document.querySelector('#clock').textContent.endsWith('local')")  # it is kept
+
+
+@pytest.mark.long
+def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
+    """Browsers open six connections to a host for all tabs together."""
+    gateway.clocked = "pump-1"
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    pages = [context.new_page() for _ in range(9)]
+    for page in pages:
+        page.goto(gateway.url)
+    for page in pages:
+        until(page, LIVE)
+    pages[0].wait_for_timeout(3000)
+    for page in pages:
+        page.bring_to_front()
+        page.wait_for_timeout(400)
+        assert link(page) == "live"
+        shown = float(cell(page, "pump-1", "frequency").locator(".number").inner_text())
+        assert (time.time() - shown) % 1000 < 1.0
+    context.close()

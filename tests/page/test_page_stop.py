@@ -1,0 +1,173 @@
+"""A stop is at the same place always, asks once, is sent at once, and is told of as it was."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from conftest import SIZES, Opener
+from fake_gateway import FakeGateway
+from watching import AT_ITS_PLACE, LIVE, VIEWS, until
+
+
+def title(page: Any) -> Any:
+    return page.locator("#ask-title")
+
+
+def told(page: Any, title: str) -> None:
+    """Wait until the dialog says this."""
+    page.get_by_role("heading", name=title, exact=True).wait_for()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener, size: str) -> None:
+    page = opened(size=size)
+    places = set()
+    for view in VIEWS:
+        page.evaluate("view => { location.hash = view }", view)
+        page.wait_for_timeout(300)  # the panel slides in
+        seen, *place = page.evaluate(AT_ITS_PLACE)
+        assert seen, view
+        places.add(tuple(place))
+    assert len(places) == 1
+    x, y, width, height = places.pop()
+    assert min(width, height) >= (30 if size == "desk" else 40)
+    assert 0 <= x <= x + width <= SIZES[size][0]
+    assert 0 <= y <= y + height <= SIZES[size][1]
+
+
+def test_stop_all_with_a_panel_open_on_a_phone(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/drives/filler-2", "phone", has_touch=True)
+    page.locator("#panel.open h2").wait_for()
+    page.locator("#stopall").tap()
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    page.get_by_role("button", name="Stop all 31 drives").tap()
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened()
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.closest('tr.drive') !== null"):
+            break
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("s")
+    assert title(page).inner_text() == "Stop pump-2?"
+    page.keyboard.press("Enter")  # Cancel has the focus
+    assert gateway.posts == []
+    page.keyboard.press("s")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    told(page, "The drive is stopped")
+    assert gateway.posts == [("/api/stop", {"drives": ["pump-2"]})]
+    page.keyboard.press("Escape")
+    assert not page.locator("#ask").evaluate("dialog => dialog.open")
+
+
+def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened("#/log")
+    page.keyboard.press("Shift+S")
+    page.keyboard.press("Enter")
+    assert gateway.posts == []
+    page.keyboard.press("Shift+S")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGateway) -> None:
+    """A view that cannot be loaded takes all views with it, and no stop."""
+    page = opened(live=False)
+    page.route("**/page/table.js", lambda route: route.abort())
+    page.route("**/page/vendor/*", lambda route: route.abort())
+    page.route("**/api/frame*", lambda route: route.abort())
+    page.reload()
+    page.locator("#notice").get_by_text("could not be loaded whole").wait_for()
+    page.locator("#stopall").click()
+    assert title(page).inner_text() == "Stop all drives?"
+    page.get_by_role("button", name="Stop all drives").click()
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+def test_plots_that_cannot_be_loaded_take_nothing_else_with_them(opened: Opener) -> None:
+    page = opened(live=False)
+    page.route("**/page/vendor/*.js", lambda route: route.abort())
+    page.goto(page.url.partition("#")[0] + "#/drives/pump-1")
+    page.reload()
+    until(page, LIVE)
+    page.get_by_text("Plots could not be loaded.").wait_for()
+    assert page.locator(".registers tbody tr").count() == 11
+
+
+def test_drives_that_did_not_stop_are_named(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.outcomes = {"pump-3": {"done": False, "text": "no reply; it may still run"}}
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    told(page, "1 of 31 drives not known to be stopped")
+    assert page.locator("#ask .outcome li").all_inner_texts() == ["pump-3: no reply; it may still run"]
+    assert "hard stop" in page.locator("#ask").inner_text()
+    gateway.outcomes = {}
+    page.get_by_role("button", name="Send the stop again").click()
+    told(page, "All 31 drives are stopped")
+
+
+def test_a_stop_that_may_not_have_arrived_is_not_called_sent(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened()
+    gateway.kill()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    told(page, "It is not known that the stop was sent")
+    assert "cannot be reached" in page.locator("#ask").inner_text()
+    assert page.get_by_role("button", name="Send the stop again").is_visible()
+
+
+def test_a_stop_without_the_right_asks_for_a_token_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.token = "right"
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    page.get_by_label("Token").fill("wrong")
+    page.keyboard.press("Enter")
+    page.get_by_text("No such token is known.").wait_for()
+    page.get_by_label("Token").fill("right")
+    page.get_by_role("button", name="Sign in and send it").click()
+    told(page, "All 31 drives are stopped")
+    assert gateway.posts == [("/api/stop", {"drives": None})]
+
+
+def test_a_stop_that_is_refused_was_not_sent(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.token = "right"
+    page = opened()
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    page.get_by_role("button", name="Cancel").click()
+    told(page, "The stop was not sent")
+    assert gateway.posts == []
+
+
+@pytest.mark.long
+def test_a_stop_waits_for_no_other_tab(browser: Any, gateway: FakeGateway) -> None:
+    """Nine tabs hold all six connections of the browser for 20 s, because no frame comes."""
+    context = browser.new_context()
+    pages = [context.new_page() for _ in range(9)]
+    for page in pages:
+        page.goto(gateway.url)
+    for page in pages:
+        until(page, LIVE)
+    gateway.is_silent = True
+    pages[0].wait_for_timeout(1000)
+    page = pages[8]
+    page.bring_to_front()
+    page.keyboard.press("Shift+S")
+    page.keyboard.press("Tab")
+    began = time.monotonic()
+    page.keyboard.press("Enter")
+    told(page, "All 31 drives are stopped")
+    assert time.monotonic() - began < 1.0
+    context.close()

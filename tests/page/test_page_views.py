@@ -1,0 +1,171 @@
+"""Each view: a drive, trends, faults, lines, and the log."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from conftest import Opener
+from fake_gateway import FakeGateway
+from watching import cell, until
+
+DRAWN = "document.querySelectorAll('#trend-plots canvas').length === 2"
+
+
+def asked(page: Any) -> list[dict[str, list[str]]]:
+    """Return a list that the page's questions for history are appended to."""
+    questions: list[dict[str, list[str]]] = []
+    page.on(
+        "request",
+        lambda r: questions.append(parse_qs(urlsplit(r.url).query)) if "/api/history" in r.url else None,
+    )
+    return questions
+
+
+def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> None:
+    page = opened()
+    shown = page.locator("tr.drive:visible")
+    page.keyboard.press("/")
+    page.keyboard.type("pump")
+    assert shown.count() == 4
+    page.get_by_label("Filter drives").fill("")
+    page.get_by_role("button", name=re.compile("Fault, silent")).click()
+    assert shown.locator("td.name").all_inner_texts() == ["conveyor-2", "labeller", "booster-1"]
+    page.get_by_role("button", name=re.compile("^All")).click()
+    assert shown.count() == 31
+
+
+def test_what_is_wrong_has_a_shape_and_a_word_beside_its_colour(opened: Opener) -> None:
+    page = opened()
+    state = cell(page, "conveyor-2", "state")
+    assert state.inner_text().strip() == "overcurrent in acceleration"
+    assert state.locator("use").get_attribute("href") == "#glyph-fault"
+    assert cell(page, "labeller", "state").locator("use").get_attribute("href") == "#glyph-silent"
+    first = page.locator("#strip a").first
+    assert re.fullmatch(r"labeller: no reply, \d+ s", first.inner_text().strip())
+    page.locator("#strip a", has_text="booster-1").click()
+    assert page.locator("#panel h2").inner_text() == "booster-1"
+
+
+def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None:
+    page = opened("#/drives/filler-2")
+    rows = page.locator(".registers tbody tr")
+    assert rows.count() == 11
+    assert "section 7.1, 2001H · setting · 0 to 50 Hz by 0.1" in rows.nth(1).inner_text()
+    assert re.search(r"538|53\d|54\d", rows.nth(3).inner_text())
+    assert rows.nth(7).locator(".value").inner_text() == "runs (1)"
+    assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
+    page.get_by_text("half within 4.1 ms, 99 % within 6.1 ms").wait_for()
+    assert "Missed 4 of 5120 requests" in page.locator("#delays").inner_text()
+    assert rows.nth(10).locator(".value").get_attribute("class") == "value"  # looked at just now
+    assert rows.nth(9).locator(".value").get_attribute("class") == "value old"  # read an hour ago
+    assert page.locator("#plots canvas").count() == 3
+
+
+def test_trends_zoom_by_dragging_and_go_back(opened: Opener) -> None:
+    page = opened("#/lines")
+    questions = asked(page)
+    page.evaluate("location.hash = '#/trends?drive=pump-2'")
+    until(page, DRAWN)
+    first = questions[-1]
+    assert first["series"] == ["pump-2.output_frequency", "pump-2.output_current"]
+    width = int(first["to"][0]) - int(first["from"][0])
+    assert abs(width - 3600_000) < 5
+    box = page.locator("#trend-plots .u-over").first.bounding_box()
+    y = box["y"] + 50
+    page.mouse.move(box["x"] + box["width"] * 0.25, y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.5, y, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(600)
+    zoomed = questions[-1]
+    assert abs(int(zoomed["to"][0]) - int(zoomed["from"][0]) - width / 4) < width / 50
+    assert abs(int(zoomed["from"][0]) - int(first["from"][0]) - width / 4) < width / 50
+    page.keyboard.press("Escape")
+    page.wait_for_timeout(600)
+    assert abs(int(questions[-1]["to"][0]) - int(questions[-1]["from"][0]) - width) < 5
+
+
+def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> None:
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    until(page, DRAWN)
+    span = "25 Nov 2025, 13:00:00 \u2013 25 Nov 2025, 14:00:00 UTC"
+    assert page.locator("#span").inner_text() == span
+    for name in ("A", "B"):
+        page.get_by_role("button", name=f"Marker {name}").focus()
+        page.keyboard.press("Enter")
+    page.keyboard.press("Shift+ArrowRight")
+    table = page.locator("#marks")
+    assert "A 13:20:00.000" in table.inner_text()
+    assert "B 13:43:00.000" in table.inner_text()
+    assert "23 min" in table.inner_text()
+    row = table.locator("tbody tr").first.locator("td").all_inner_texts()
+    assert abs(float(row[1]) - float(row[0]) - float(row[2])) < 0.011
+    page.get_by_role("button", name="Zoom in").press("Enter")
+    assert page.locator("#span").inner_text().count(":15:00") == 1
+    assert page.locator("#span").inner_text().count(":45:00") == 1
+
+
+def test_trends_are_exported_as_they_are_shown(opened: Opener) -> None:
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    until(page, DRAWN)
+    for name in ("CSV", "Parquet"):
+        link = parse_qs(urlsplit(page.get_by_role("link", name=name).get_attribute("href")).query)
+        assert link == {
+            "series": ["pump-2.output_frequency", "pump-2.output_current"],
+            "from": ["1764075600000"], "to": ["1764079200000"], "format": [name.lower()],
+        }  # fmt: skip
+    with page.expect_download() as download:
+        page.get_by_role("link", name="CSV").click()
+    assert download.value.suggested_filename == "history.csv"
+
+
+def test_without_history_the_page_says_so_and_goes_on(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.has_history = False
+    page = opened("#/trends")
+    page.locator("#trend-note").get_by_text("No history is kept").wait_for()
+    page.evaluate("location.hash = '#/drives/pump-1'")
+    assert page.locator("#plots canvas").count() == 3
+    page.get_by_role("button", name="1 h", exact=True).click()
+    page.locator("#past-note").get_by_text("No history is kept").wait_for()
+    page.get_by_role("button", name="1 min").click()
+    until(page, "document.querySelector('#past-note').hidden")
+
+
+def test_faults_that_last_and_that_ended(opened: Opener) -> None:
+    page = opened("#/faults")
+    page.get_by_text("Lasting: 3").wait_for()
+    lasting = page.locator("#fault-list section").nth(0).locator("tbody tr")
+    assert [row.split("\t")[1] for row in lasting.all_inner_texts()] == [
+        "labeller",
+        "conveyor-2",
+        "booster-1",
+    ]
+    ended = page.locator("#fault-list section").nth(1).locator("tbody tr")
+    assert re.search(r"pump-1\s+fault\s+overheating of the heatsink\s+7 min\s", ended.first.inner_text())
+    ended.first.get_by_role("link", name="Trend").click()
+    until(page, DRAWN)
+    page.locator("#lane .fault", has_text="overheating").wait_for()
+
+
+def test_lines_show_wire_misses_by_reason_and_delays(opened: Opener) -> None:
+    page = opened("#/lines")
+    line = page.locator("article", has=page.get_by_role("heading", name="hall-2"))
+    line.wait_for()
+    assert "94 %" in line.inner_text()
+    assert "Missed in the last hour: 282 of 88800" in line.inner_text()  # 19 x 14 + 16 by the fake's table
+    rows = line.locator("table").first.locator("tbody tr").all_inner_texts()
+    assert rows == ["no reply\t266\t0.3 %", "bad CRC\t16\t< 0.1 %"]
+    assert line.locator(".minutes > div").count() == 60
+    assert "3 of 5120" in line.locator("tr", has_text="labeller").inner_text()
+
+
+def test_the_log_shows_who_wrote_what_and_what_it_became(opened: Opener) -> None:
+    page = opened("#/log")
+    rows = page.locator("#log-list tbody tr")
+    rows.first.wait_for()
+    assert rows.count() == 3
+    for part in ("pump-1", "frequency_setpoint = 38.0", "the drive holds 38", "anna by page", "01 06 20 01"):
+        assert part in rows.first.inner_text()
+    assert rows.nth(2).locator(".bad").inner_text().strip() == "unconfirmed; no reply"

@@ -1,0 +1,45 @@
+"""Waiting for what a page shows: from outside, because its CSP forbids code that is made of texts."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
+STALE = "document.body.classList.contains('stale')"
+VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
+AT_ITS_PLACE = """() => {
+  const box = document.querySelector('#stopall').getBoundingClientRect();
+  const points = [[0.02, 0.5], [0.5, 0.1], [0.5, 0.5], [0.5, 0.9], [0.98, 0.5]];
+  const seen = points.every(([x, y]) =>
+    document.elementFromPoint(box.x + box.width * x, box.y + box.height * y)?.id === 'stopall');
+  return [seen, box.x, box.y, box.width, box.height];
+}"""
+
+
+def until(page: Any, expression: str, within: float = 30) -> float:
+    """Wait until this is true on the page. Return the seconds. Raises AssertionError."""
+    began = time.monotonic()
+    while not page.evaluate(expression):
+        assert time.monotonic() - began < within, f"not within {within} s: {expression}; {told(page)}"
+        page.wait_for_timeout(20)
+    return time.monotonic() - began
+
+
+def told(page: Any) -> str:
+    """Return what the head says, for who reads of a failure."""
+    return str(
+        page.evaluate("['link', 'notice'].map(id => document.getElementById(id).textContent).join(', ')")
+    )
+
+
+def cell(page: Any, drive: str, part: str) -> Any:
+    """Return a cell of the table of drives."""
+    return page.locator("tr.drive", has=page.get_by_role("link", name=drive, exact=True)).locator(
+        f"td.{part}"
+    )
+
+
+def link(page: Any) -> str:
+    """Return what the head says of the way to the daemon."""
+    return str(page.locator("#link").inner_text().strip())
