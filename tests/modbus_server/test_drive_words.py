@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
-from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading
+from multidrop.drive.declare import reading
+from multidrop.drive.register import Register
 from multidrop.drive.row_field import row_field
+from multidrop.drive.table import COIL, DISCRETE, HOLDING, INPUT
 from multidrop.gateway.drive_words import DriveWords, Lack, exact_data
 from multidrop.plant.model import Polled, PolledDrive
 from multidrop.polling.batch import Batch
