@@ -114,7 +114,7 @@ def test_one_drive_shows_what_is_not_polled_while_somebody_looks(
 
     until(lambda: looked().get("dc_bus_voltage", [None])[0] == 537.0)
     assert "output_current" not in looked()
-    until(lambda: gateway.get("/api/drive/pump-1").json["exchanges"] > 0)
+    until(lambda: gateway.get("/api/drive/pump-1").json["asked"] > 0)
     asked = gateway.get("/api/drive/pump-1").json
     assert asked["delays"]["counts"]
     assert sum(count for _, count in asked["delays"]["counts"]) == asked["delays"]["replies"]
@@ -136,12 +136,12 @@ def test_a_silent_drive_is_not_read_by_those_who_look(gateway: Served) -> None:
 
 
 def test_lines_show_what_each_drive_costs(gateway: Served) -> None:
-    until(lambda: gateway.get("/api/lines").json["hall"]["hour"])
+    until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]
     assert line["lost"] is None
-    assert line["hour"][0]["asked"] > 0
+    assert line["minutes"][0]["asked"] > 0
     assert set(line["drives"]) == {"pump-1", "pump-2"}
-    assert line["drives"]["pump-1"]["exchanges"] > 0
+    assert line["drives"]["pump-1"]["asked"] > 0
 
 
 def test_reads_past_the_table(gateway: Served) -> None:

@@ -198,11 +198,11 @@ def test_the_audit_log_says_who_and_by_which_way(tmp_path: Path) -> None:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         assert gateway.post(*WRITE, **writer).json["done"] is True
         assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
-        records = gateway.get("/api/audit").json
+        records = gateway.get("/api/audit").json["entries"]
         assert [(one["drive"], one["by"], one["way"]) for one in records[-1:]] == [
             ("pump-1", "writer", "http from 127.0.0.1")
         ]
         assert {(one["by"], one["way"]) for one in records[:-1]} == {("anyone", "page from 127.0.0.1")}
         oldest = records[-1]["time"]
-        assert gateway.get(f"/api/audit?before={oldest}").json == []
-        assert gateway.get("/api/audit?count=1").json == records[:1]
+        assert gateway.get(f"/api/audit?before={oldest}").json == {"entries": [], "more": False}
+        assert gateway.get("/api/audit?count=1").json == {"entries": records[:1], "more": True}

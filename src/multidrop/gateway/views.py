@@ -26,7 +26,7 @@ async def look_at(gateway: Gateway, name: str) -> dict[str, Any]:
         "drive": name,
         "delays": _delays(statistics),
         "misses": misses_of(statistics) if statistics else {},
-        "exchanges": statistics.exchanges if statistics else 0,
+        "asked": statistics.exchanges if statistics else 0,
         "timeout_ms": round(statistics.timeout * 1e3, 1) if statistics else None,
         "values": found,
         "ledger": wear,
@@ -38,9 +38,9 @@ def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
         return None
     delays = statistics.delays
     return {
-        "p50_ms": round(delays.p50 * 1e3, 3),
-        "p99_ms": round(delays.p99 * 1e3, 3),
-        "longest_ms": round(delays.longest * 1e3, 3),
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "longest": round(delays.longest * 1e3, 3),
         "replies": delays.replies,
         "counts": [[round(least * 1e3, 3), count] for least, count in statistics.delay_counts],
     }
@@ -53,9 +53,9 @@ def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
         return [
             {
                 "register": wear.cell.register,
-                "writes": wear.writes,
-                "this_year": wear.this_year,
+                "year": wear.this_year,
                 "budget": book.budget,
+                "total": wear.writes,
             }
             for wear in book.wear(time.time())
             if wear.cell.address == address
@@ -66,10 +66,9 @@ def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
 def look_at_lines(gateway: Gateway) -> dict[str, Any]:
     """Return what the page shows of the lines alone."""
     return {
-        line.name: gateway.lately.line(line.name)
-        | {
+        line.name: {
             "lost": lost_of(gateway.hub, line.name),
-            "hour": gateway.lately.hour(line.name),
+            "minutes": gateway.lately.hour(line.name),
             "drives": {
                 polled.drive.name: _drive_figures(gateway.lately.drive(line.name, polled.drive.name))
                 for polled in line.drives
@@ -120,8 +119,8 @@ def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:
         return None
     delays = statistics.delays
     return {
-        "p50_ms": round(delays.p50 * 1e3, 3),
-        "p99_ms": round(delays.p99 * 1e3, 3),
-        "misses": sum(statistics.misses.values()),
-        "exchanges": statistics.exchanges,
+        "p50": round(delays.p50 * 1e3, 3),
+        "p99": round(delays.p99 * 1e3, 3),
+        "asked": statistics.exchanges,
+        "missed": sum(statistics.misses.values()),
     }
