@@ -143,13 +143,12 @@ def test_a_port_hangs_up_and_is_back_where_it_was(port: str, tmp_path: Path) -> 
     with Simulator([wire]) as sim:
         path = sim.wires[0].path
         names = set()
-        for _ in range(5):
+        while wire.struck["hang_up"] < 5:  # a connection to the port that is just closing is reset instead
             line = opened(path)
             names.add(Path(path).resolve())
             with pytest.raises(LineError):
                 read(line)
             line.close()
-        assert wire.struck["hang_up"] >= 5
         wire.faults = Faults()
         line = opened(path)
         assert read(line) == REPLY
