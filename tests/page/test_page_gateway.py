@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import subprocess
@@ -76,7 +77,11 @@ def test_a_killed_gateway_is_told(page: Any) -> None:
         page.goto(url)
         until(page, LIVE)
         assert page.locator("tr.drive").count() == 8
+        tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
+        simulators = " ".join(task.read_text() for task in tasks).split()
         process.send_signal(signal.SIGKILL)
+        for simulator in simulators:
+            os.kill(int(simulator), signal.SIGTERM)
         assert until(page, STALE) < 20.0
         assert "cannot be reached" in page.locator("#notice").inner_text()
     finally:
