@@ -61,11 +61,11 @@ class Mqtt:
                 speaker.leave()
             await broker.close()
 
-    def numbers(self) -> dict[str, int]:
-        """Return counts since the start: messages that were sent, and that were dropped."""
+    def figures(self) -> dict[str, float]:
+        """Return messages sent and dropped since the start, and how many connections there are."""
         outboxes = [broker.outbox for broker in self._brokers]
         return {
-            "sent": sum(outbox.sent for outbox in outboxes),
-            "dropped": sum(outbox.dropped for outbox in outboxes),
+            "sent_total": sum(outbox.sent for outbox in outboxes),
+            "dropped_total": sum(outbox.dropped for outbox in outboxes),
             "connected": sum(broker.is_connected for broker in self._brokers),
         }
