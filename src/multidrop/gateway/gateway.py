@@ -6,18 +6,19 @@ import asyncio
 import logging
 import struct
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import uvicorn
 
 import multidrop
-from multidrop import Batch, Bus, Ledger, Plant, Poller
+from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.events import Events
-from multidrop.gateway.frames import Frames, frame_of
+from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import listen
@@ -41,7 +42,8 @@ _log = logging.getLogger("multidrop.gateway")
 class Gateway:
     """A plant that is polled, and all ways in to it.
 
-    Raises ValueError, LineError or OSError when something of it cannot be opened; then nothing is left open.
+    Raises ValueError or OSError when something of it cannot be opened; then nothing is left open. A line
+    whose port is not there does not keep the others waiting: it is lost, and tried again.
     """
 
     clock = staticmethod(time.monotonic)
@@ -82,8 +84,10 @@ class Gateway:
         server = _Server(self._server_config())
         try:
             self._build_parts()
-            self.poller = Poller(self.plant, ledger=self.ledger, audit=self.settings.audit)
+            nothing = replace(self.plant, lines=())
+            self.poller = Poller(nothing, ledger=self.ledger, audit=self.settings.audit)
             with self.poller:
+                self.note_unopened(self.poller.adopt(self.plant))
                 tasks = [
                     asyncio.create_task(work, name=name)
                     for name, work in (
@@ -97,7 +101,7 @@ class Gateway:
                     await asyncio.sleep(0.005)
                 if not serving.done():
                     on_ready()
-                    notifier.tell("READY=1", f"STATUS=polling {len(self.plant.lines)} lines")
+                    notifier.tell("READY=1", self.status)
                 end = asyncio.create_task(self._end.wait())
                 await asyncio.wait({end, serving, *tasks[:2]}, return_when=asyncio.FIRST_COMPLETED)
                 end.cancel()
@@ -182,6 +186,8 @@ class Gateway:
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
             self.events.look(_utc_ms(), name, self.hub.seen(name))
+        for line in [line for line in self.hub.unopened if lost_of(self.hub, line) is None]:
+            del self.hub.unopened[line]  # it came: should it go again, that has another reason
 
     def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
         try:
@@ -215,6 +221,18 @@ class Gateway:
     def _read_statistics(self) -> None:
         assert self.poller is not None
         self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
+
+    def note_unopened(self, failures: Mapping[str, LineError]) -> None:
+        """Tell which ports are not there, and why."""
+        for line, failure in failures.items():
+            _log.warning("line %s is lost, and tried again: %s", line, failure)
+        self.hub.unopened = {line: str(failure) for line, failure in failures.items()}
+
+    @property
+    def status(self) -> str:
+        """Return what the service manager shows."""
+        lost = len(self.hub.unopened)
+        return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
 
     # ---- for commands, parts and pages ----
 

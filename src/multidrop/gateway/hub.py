@@ -118,6 +118,7 @@ class Hub:
         self.now_ns = 0  # of the monotonic clock
         self.time = 0  # of the newest row, UTC in ns
         self.taken = 0  # batches
+        self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
         self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
