@@ -10,6 +10,7 @@ import signal
 import socket
 import ssl
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
-from gateways import certificate, plant_text, written
+from gateways import certificate, plant_text, served, written
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE
@@ -84,6 +85,41 @@ def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -
     assert stop["message"] == "stop of all drives, asked for by anyone by http from 127.0.0.1"
     assert (stop["level"], stop["logger"]) == ("warning", "multidrop.gateway")
     assert all({"time", "level", "logger", "message"} <= one.keys() for one in records)
+
+
+def test_sighup_reloads_and_systemd_is_told(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE)
+        with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n') as path:
+            good = path.read_text()
+            environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+            with serving(path, "--log", "json", **environment) as (process, _):
+                assert manager.recv(1000).startswith(b"READY=1\n")
+                for text in (good.replace("[[line]]", "[[lin]]"), good.replace("pump-2", "fan-2")):
+                    path.write_text(text)
+                    before = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+                    process.send_signal(signal.SIGHUP)
+                    reloading, _, when = manager.recv(1000).decode().partition("\nMONOTONIC_USEC=")
+                    assert reloading == "RELOADING=1"
+                    assert before <= int(when) <= time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+                    assert manager.recv(1000) == b"READY=1\nSTATUS=polling 1 lines"
+                process.send_signal(signal.SIGTERM)
+                _, errors = process.communicate(timeout=PATIENCE)
+                assert process.returncode == 0
+    messages = [json.loads(line)["message"] for line in errors.splitlines()]
+    assert messages.count("reload, asked for by a signal") == 2
+    mistake = f"the plant goes on as before: {path}: unknown key 'lin'; did you mean 'line'?"
+    assert mistake in messages
+    assert "the plant file is in effect: revision 2" in messages
+
+
+def test_the_demo_has_no_file_to_be_read_again(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        gateway.gateway.reload._read = None
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        assert (told["done"], told["text"]) == (False, "this plant has no file to be read again")
 
 
 def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish
+from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish, without_fan
 from gateways import served
 from lines import until
 from peers import require_module
 
 from multidrop import InvtCHE, PolledDrive
+from multidrop.gateway.homeassistant import discovery_topic
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
 
@@ -341,3 +342,26 @@ def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
         assert figures().keys() == {"sent_total", "dropped_total", "connected"}
         broker.kill()
         until(lambda: figures()["connected"] == 0.0)
+
+
+# ---- another plant ----
+
+
+def test_what_is_kept_of_a_drive_that_left_is_taken_back(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, running = start(home_assistant=True)
+    fan = f"multidrop/{FAN.name}"
+    topics = [fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)]
+    listener.wait_for(has(topics[1], b"online"))
+    running.adopt(without_fan(known))
+    for topic in topics:
+        listener.wait_for(has(topic, b""))
+    listener.wait_for(has(discovery_topic("multidrop", "pump-1")))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    later = Listener(broker)
+    later.wait_for(has("multidrop/pump-1"))
+    running.step()
+    told = later.wait_for(lambda heard: heard.topic in ("multidrop/pump-1", *topics))
+    assert told.topic == "multidrop/pump-1"
+    later.close()

@@ -125,9 +125,14 @@ def served(
     secrets, known = tokens()
     (folder / "tokens").write_text("".join(f"{token.line}\n" for token in known))
     with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
-        plant = written(folder, serve, *names, port=simulator.wires[0].path)
-        found: ServeSettings = read_settings(plant, environment or {})
-        gateway = Gateway(plant, replace(found, port=0, **{"tokens": known, **settings}))
+        written(folder, serve, *names, port=simulator.wires[0].path)
+
+        def read() -> tuple[Plant, ServeSettings]:
+            plant = load_plant(folder / "plant.toml")
+            found = read_settings(plant, environment or {})
+            return plant, replace(found, port=0, **{"tokens": known, **settings})
+
+        gateway = Gateway(*read(), read=read)
         with running(gateway):
             yield Served(gateway, sims, secrets)
 

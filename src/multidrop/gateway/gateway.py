@@ -15,7 +15,7 @@ from typing import Any
 import uvicorn
 
 import multidrop
-from multidrop import Batch, Bus, Ledger, LineError, Plant, Poller
+from multidrop import Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
@@ -23,6 +23,7 @@ from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import listen
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
+from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import ServeSettings
@@ -48,7 +49,9 @@ class Gateway:
 
     clock = staticmethod(time.monotonic)
 
-    def __init__(self, plant: Plant, settings: ServeSettings, *, ledger: Ledger | None = None) -> None:
+    def __init__(
+        self, plant: Plant, settings: ServeSettings, *, ledger: Ledger | None = None, read: Read | None = None
+    ) -> None:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
@@ -71,6 +74,8 @@ class Gateway:
         self.hub = Hub(plant)
         self.events = Events()
         self.lately = Lately(plant)
+        self.notifier = Notifier()
+        self.reload = Reload(self, read)
         self.frames = Frames(self._frame, self.clock)
         self.commands = Commands(self, settings.may)
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
@@ -79,7 +84,6 @@ class Gateway:
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and serve until `end` is called."""
-        notifier = Notifier()
         tasks: list[asyncio.Task[None]] = []
         server = _Server(self._server_config())
         try:
@@ -88,11 +92,12 @@ class Gateway:
             self.poller = Poller(nothing, ledger=self.ledger, audit=self.settings.audit)
             with self.poller:
                 self.note_unopened(self.poller.adopt(self.plant))
+                self.plant = self.poller.plant
                 tasks = [
                     asyncio.create_task(work, name=name)
                     for name, work in (
                         ("take", self._take_all()),
-                        ("tick", self._tick(notifier)),
+                        ("tick", self._tick()),
                         *((name, self._live(name, feed.run)) for name, feed in self.feeds.items()),
                     )
                 ]
@@ -101,11 +106,11 @@ class Gateway:
                     await asyncio.sleep(0.005)
                 if not serving.done():
                     on_ready()
-                    notifier.tell("READY=1", self.status)
+                    self.notifier.tell("READY=1", self.status)
                 end = asyncio.create_task(self._end.wait())
                 await asyncio.wait({end, serving, *tasks[:2]}, return_when=asyncio.FIRST_COMPLETED)
                 end.cancel()
-                notifier.tell("STOPPING=1")
+                self.notifier.tell("STOPPING=1")
                 self.frames.close()
                 server.should_exit = True
                 await serving
@@ -119,8 +124,9 @@ class Gateway:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            await self.reload.close()
             if self.poller is not None:
-                self._hand_out(self.poller)  # what came while it closed
+                self.hand_out(self.poller)  # what came while it closed
             await self._close_parts()
             self.listener.close()
             self._threads.shutdown(wait=False, cancel_futures=True)
@@ -165,23 +171,23 @@ class Gateway:
     async def _take_all(self) -> None:
         while True:
             if self.poller is not None:
-                self._hand_out(self.poller)
+                self.hand_out(self.poller)
             await asyncio.sleep(TAKE_S)
 
-    def _hand_out(self, poller: Poller) -> None:
+    def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
         is_new = False
         self.hub.pass_time(time.monotonic_ns())
         while batch := poller.take():
             is_new = True
-            self._guarded("hub", self.hub.take, batch)
+            self.guarded("hub", self.hub.take, batch)
             for name, feed in self.feeds.items():
-                self._guarded(name, feed.take, batch)
+                self.guarded(name, feed.take, batch)
         if is_new:
-            self._guarded("frames", self.frames.note_news)
+            self.guarded("frames", self.frames.note_news)
         if self.clock() - self._looked >= EVENTS_S:
             self._looked = self.clock()
-            self._guarded("events", self._look_for_events)
+            self.guarded("events", self._look_for_events)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
@@ -189,7 +195,11 @@ class Gateway:
         for line in [line for line in self.hub.unopened if lost_of(self.hub, line) is None]:
             del self.hub.unopened[line]  # it came: should it go again, that has another reason
 
-    def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
+    def forget(self, drive: str) -> None:
+        """End what lasts of a drive that is no longer there."""
+        self.events.forget(drive, _utc_ms())
+
+    def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
         except Exception:  # whatever it is, polling and stops go on
@@ -208,12 +218,13 @@ class Gateway:
             self.dead[name] = f"{type(failure).__name__}: {failure}"
             self._note_failure(name)
 
-    async def _tick(self, notifier: Notifier) -> None:
+    async def _tick(self) -> None:
+        notifier = self.notifier
         every = min(TICK_S, (notifier.watchdog_s or 4 * TICK_S) / 4)
         while True:
             if self.poller is not None:
-                self._guarded("statistics", self._read_statistics)
-            self._guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
+                self.guarded("statistics", self._read_statistics)
+            self.guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
@@ -226,13 +237,19 @@ class Gateway:
         """Tell which ports are not there, and why."""
         for line, failure in failures.items():
             _log.warning("line %s is lost, and tried again: %s", line, failure)
-        self.hub.unopened = {line: str(failure) for line, failure in failures.items()}
+        there = [line.name for line in self.plant.lines]
+        before = {line: why for line, why in self.hub.unopened.items() if line in there}
+        self.hub.unopened = before | {line: str(failure) for line, failure in failures.items()}
 
     @property
     def status(self) -> str:
         """Return what the service manager shows."""
         lost = len(self.hub.unopened)
         return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
+
+    async def settled(self) -> None:
+        """Return as soon as no drive is on its way from one plant to another; see `Reload`."""
+        await self.reload.settled()
 
     # ---- for commands, parts and pages ----
 

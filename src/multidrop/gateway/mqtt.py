@@ -7,7 +7,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from multidrop import Batch
+from multidrop import Batch, Plant
 from multidrop.gateway.broker import Broker, parse_broker
 from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
@@ -43,6 +43,13 @@ class Mqtt:
 
     def take(self, batch: Batch) -> None:
         """Do nothing: the hub has the newest rows."""
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: all drives are made known anew."""
+        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+            speaker.adopt(plant)
+            if broker.is_connected:
+                speaker.connected()
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
         """Publish every so many seconds, until cancelled."""

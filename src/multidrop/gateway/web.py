@@ -44,6 +44,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/stop": Needed("POST", Right.STOP),
     "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
     "/api/write": Needed("POST", Right.WRITE),
+    "/api/reload": Needed("POST", Right.WRITE),
     "/api/token": Needed("POST", None),
     "/api/forget": Needed("POST", None),
 }
@@ -69,6 +70,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/stop", pages.stop, methods=["POST"]),
         Route("/api/write", pages.write, methods=["POST"]),
         Route("/api/act", pages.act, methods=["POST"]),
+        Route("/api/reload", pages.reload, methods=["POST"]),
         Route("/api/token", pages.token, methods=["POST"]),
         Route("/api/forget", pages.forget, methods=["POST"]),
     ]
@@ -84,7 +86,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         needed=NEEDED,
         names=gateway.own_names,
         tokens=gateway.tokens,
-        may=gateway.settings.may,
+        may=lambda: gateway.settings.may,
         behind_proxy=gateway.settings.behind_proxy,
         clock=lambda: gateway.guard_clock(),
     )
@@ -167,6 +169,7 @@ class _Pages:
             revision=gateway.revision,
             version=gateway.version,
             is_demo=gateway.settings.is_demo,
+            mistakes=gateway.reload.mistakes,
         )
         return JSONResponse(described)
 
@@ -274,6 +277,14 @@ class _Pages:
             raise Denied(400, "options is no JSON object")
         drive, verb = _text(body, "drive"), _text(body, "verb")
         return _answer(await self._gateway.commands.act(drive, verb, options, _caller(request)))
+
+    async def reload(self, request: Request) -> Response:
+        if (await _body(request)).get("confirm") is not True:
+            raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
+        told = await self._gateway.reload.carry_out(_caller(request).by)
+        return JSONResponse(
+            {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
+        )
 
     # ---- tokens ----
 
