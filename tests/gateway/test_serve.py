@@ -4,56 +4,25 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import shutil
 import signal
 import socket
 import ssl
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
-from gateways import certificate, plant_text, served, written
+from gateways import certificate, get, served, serving, simulated_plant, written
 from lines import PATIENCE, until
 
-from multidrop import InvtCHE
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, read_tokens
-from multidrop.sim import Simulator, Wire, simulated
 
 UNIT = Path(__file__).parents[2] / "packaging" / "multidrop@.service"
-
-
-@contextmanager
-def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
-    """A plant file whose line is simulated while the context lasts."""
-    drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
-    with Simulator([Wire(drives, unpaced=True)]) as simulator:
-        path = folder / "plant.toml"
-        path.write_text(plant_text(simulator.wires[0].path, ("pump-1", "pump-2"), serve))
-        yield path
-
-
-@contextmanager
-def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command, once it is ready, and the address that it prints."""
-    words = [*MULTIDROP, "serve", str(path), *options]
-    with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert process.stderr is not None
-            assert line.startswith("ready "), process.stderr.read()
-            yield process, line.removeprefix("ready ").strip()
-        finally:
-            process.kill()
 
 
 def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -> None:
@@ -141,11 +110,6 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
         assert "Traceback" not in errors
-
-
-def get(connection: http.client.HTTPConnection, path: str) -> bytes:
-    connection.request("GET", path)
-    return connection.getresponse().read()
 
 
 def test_tls(tmp_path: Path) -> None:

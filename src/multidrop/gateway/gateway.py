@@ -17,11 +17,12 @@ import uvicorn
 import multidrop
 from multidrop import Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.commands import Commands
+from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
-from multidrop.gateway.listener import listen
+from multidrop.gateway.listener import BACKLOG, listen
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
 from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
@@ -68,6 +69,7 @@ class Gateway:
         self._end = asyncio.Event()
         self._threads = ThreadPoolExecutor(MOST_ASKED, "multidrop ask")
         self.listener = listen(settings.host, settings.port)
+        self.connections = self.listener.connections = Connections(self.clock)
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
@@ -138,7 +140,8 @@ class Gateway:
     def _server_config(self) -> uvicorn.Config:
         context = self.settings.tls
         return uvicorn.Config(
-            make_app(self),
+            Watched(make_app(self), self.connections),
+            backlog=BACKLOG,
             http="h11",
             ws="none",
             lifespan="off",
@@ -224,6 +227,7 @@ class Gateway:
         while True:
             if self.poller is not None:
                 self.guarded("statistics", self._read_statistics)
+            self.guarded("connections", self.connections.sweep)
             self.guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")

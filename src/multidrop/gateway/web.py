@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PAGE = Path(__file__).parent / "page"
 MOST_BYTES = 64 * 1024  # of a body
+BODY_S = 10.0  # that it may take to come
 MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
 COOKIE_S = 30 * 24 * 3600
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
@@ -108,10 +109,16 @@ def _caller(request: Request) -> Caller:
 async def _body(request: Request) -> dict[str, Any]:
     """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
     data = bytearray()
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > MOST_BYTES:
-            raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) > MOST_BYTES:
+                    raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    except ClientDisconnect:
+        raise Denied(400, "the client is gone") from None
+    except TimeoutError:
+        raise Denied(408, f"the body did not come within {BODY_S:g} s") from None
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):
