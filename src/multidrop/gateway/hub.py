@@ -124,13 +124,16 @@ class Hub:
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
 
-    def adopt(self, plant: Plant) -> None:
-        """Go on with another plant; what is known of drives that stay as they are is kept."""
+    def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
+        """Go on with another plant; what is known of drives that stay as they are is kept.
+
+        `planned` is what its metadata plan: that takes seconds for hundreds of lines.
+        """
         before = self._watched
         self.plant = plant
         self._cells = {}
         self._watched = {}
-        planned = plant.metadata()["planned"]
+        planned = plant.metadata()["planned"] if planned is None else planned
         for line in plant.lines:
             cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
             for polled in line.drives:

@@ -30,7 +30,7 @@ class Lately:
         self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
 
-    def adopt(self, plant: Plant) -> None:
+    def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
         """Take what is planned from another plant, and forget readings of lines that count anew."""
         before, self._lines = self._lines, {line.name: line for line in plant.lines}
         goes_on = {
@@ -41,7 +41,7 @@ class Lately:
             readings.clear()
             readings.extend(kept)  # type: ignore[arg-type]
         self.newest = _of_lines(self.newest, goes_on)
-        planned = plant.metadata()["planned"]
+        planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:

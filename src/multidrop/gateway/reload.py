@@ -87,13 +87,14 @@ class Reload:
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
         plant, settings = await _beside(self._read)
+        planned = await _beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
         self._is_settled.clear()
         try:
             unopened = await _beside(partial(poller.adopt, plant))
-            self._take_up(poller, settings)
+            self._take_up(poller, settings, planned)
         except Exception:
             if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
-                self._take_up(poller, gateway.settings)
+                self._take_up(poller, gateway.settings, None)
             raise
         finally:
             self._is_settled.set()
@@ -104,7 +105,7 @@ class Reload:
         _log.info("the plant file is in effect: revision %d", gateway.revision)
         return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
 
-    def _take_up(self, poller: Poller, settings: ServeSettings) -> None:
+    def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
         """Go on with the plant that is polled now, and with what of its settings needs no restart."""
         gateway, plant = self._gateway, poller.plant
         gateway.hand_out(poller)  # rows of those that left
@@ -115,8 +116,8 @@ class Reload:
         gateway.revision += 1
         self._take_up_rights(settings)
         gateway.side_reads.begin_anew()
-        gateway.guarded("hub", gateway.hub.adopt, plant)
-        gateway.guarded("statistics", gateway.lately.adopt, plant)
+        gateway.guarded("hub", gateway.hub.adopt, plant, planned)
+        gateway.guarded("statistics", gateway.lately.adopt, plant, planned)
         for name, feed in gateway.feeds.items():
             if hasattr(feed, "adopt"):
                 gateway.guarded(name, feed.adopt, plant)
