@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import Served, running, served, written
+from gateways import Served, served, written
 from lines import until
 
 from multidrop import PlantError
 from multidrop.gateway import parts
-from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.parts import Part
 from multidrop.gateway.rights import Right
 from multidrop.gateway.settings import read_settings
@@ -277,12 +275,3 @@ def test_a_part_that_this_version_lacks(tmp_path: Path, monkeypatch: pytest.Monk
     plant = written(tmp_path, "[serve.mqtt]\n")
     with pytest.raises(PlantError, match=r"\[serve.mqtt\]: this version of multidrop has no such part"):
         read_settings(plant, {})
-
-
-def test_nothing_is_left_open_where_a_port_is_missing(tmp_path: Path) -> None:
-    plant = written(tmp_path, port=str(tmp_path / "nosuch"))
-    settings = read_settings(plant, {})
-    gateway = Gateway(plant, replace(settings, port=0))
-    with pytest.raises(OSError, match="nosuch"), running(gateway):
-        pass
-    assert gateway.listener.fileno() == -1

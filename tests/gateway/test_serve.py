@@ -4,55 +4,25 @@ from __future__ import annotations
 
 import http.client
 import json
-import os
 import shutil
 import signal
 import socket
 import ssl
 import subprocess
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+import time
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
-from gateways import certificate, plant_text, written
+from gateways import certificate, get, served, serving, simulated_plant, written
 from lines import PATIENCE, until
 
-from multidrop import InvtCHE
 from multidrop.gateway.listener import listen
 from multidrop.gateway.rights import Right, digest, read_tokens
-from multidrop.sim import Simulator, Wire, simulated
 
 UNIT = Path(__file__).parents[2] / "packaging" / "multidrop@.service"
-
-
-@contextmanager
-def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
-    """A plant file whose line is simulated while the context lasts."""
-    drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
-    with Simulator([Wire(drives, unpaced=True)]) as simulator:
-        path = folder / "plant.toml"
-        path.write_text(plant_text(simulator.wires[0].path, ("pump-1", "pump-2"), serve))
-        yield path
-
-
-@contextmanager
-def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command, once it is ready, and the address that it prints."""
-    words = [*MULTIDROP, "serve", str(path), *options]
-    with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
-    ) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert process.stderr is not None
-            assert line.startswith("ready "), process.stderr.read()
-            yield process, line.removeprefix("ready ").strip()
-        finally:
-            process.kill()
 
 
 def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -> None:
@@ -86,6 +56,41 @@ def test_ready_alive_and_stopping_are_told_and_the_log_is_json(tmp_path: Path) -
     assert all({"time", "level", "logger", "message"} <= one.keys() for one in records)
 
 
+def test_sighup_reloads_and_systemd_is_told(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE)
+        with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n') as path:
+            good = path.read_text()
+            environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+            with serving(path, "--log", "json", **environment) as (process, _):
+                assert manager.recv(1000).startswith(b"READY=1\n")
+                for text in (good.replace("[[line]]", "[[lin]]"), good.replace("pump-2", "fan-2")):
+                    path.write_text(text)
+                    before = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+                    process.send_signal(signal.SIGHUP)
+                    reloading, _, when = manager.recv(1000).decode().partition("\nMONOTONIC_USEC=")
+                    assert reloading == "RELOADING=1"
+                    assert before <= int(when) <= time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+                    assert manager.recv(1000) == b"READY=1\nSTATUS=polling 1 lines"
+                process.send_signal(signal.SIGTERM)
+                _, errors = process.communicate(timeout=PATIENCE)
+                assert process.returncode == 0
+    messages = [json.loads(line)["message"] for line in errors.splitlines()]
+    assert messages.count("reload, asked for by a signal") == 2
+    mistake = f"the plant goes on as before: {path}: unknown key 'lin'; did you mean 'line'?"
+    assert mistake in messages
+    assert "the plant file is in effect: revision 2" in messages
+
+
+def test_the_demo_has_no_file_to_be_read_again(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        gateway.gateway.reload._read = None
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        assert (told["done"], told["text"]) == (False, "this plant has no file to be read again")
+
+
 def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
     with ExitStack() as stack:
         path = stack.enter_context(simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n'))
@@ -105,11 +110,6 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
         assert "Traceback" not in errors
-
-
-def get(connection: http.client.HTTPConnection, path: str) -> bytes:
-    connection.request("GET", path)
-    return connection.getresponse().read()
 
 
 def test_tls(tmp_path: Path) -> None:

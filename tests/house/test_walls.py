@@ -41,6 +41,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
+    "gateway/connections.py",
     "gateway/gateway.py",
     "gateway/listener.py",
     "gateway/mqtt.py",

@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish
+from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish, without_fan
+from gateways import served
+from lines import until
 from peers import require_module
 
 from multidrop import InvtCHE, PolledDrive
+from multidrop.gateway.homeassistant import discovery_topic
 from multidrop.gateway.mqtt import MqttSettings, build
 from multidrop.gateway.outbox import MOST_UNDER_WAY
 
@@ -128,7 +131,7 @@ def test_a_broker_that_stands_still_holds_up_nothing(
             heard.topic == "multidrop/pump-1" and json_of(heard)["values"]["output_frequency"] == 499.0
         )
     )
-    assert running._part.numbers()["dropped"] > 0
+    assert running._part.figures()["dropped_total"] > 0
 
 
 def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listener, start: Start) -> None:
@@ -321,3 +324,44 @@ def test_a_drive_that_cannot_be_a_topic_is_told(tmp_path: Path) -> None:
             for name in ("a/b", "gateway")
         ),
     ]
+
+
+# ---- figures ----
+
+
+def test_metrics_say_what_was_sent(broker: Broker, tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with served(tmp_path, f'[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
+
+        def figures() -> dict[str, float]:
+            lines = gateway.get("/metrics").body.decode().splitlines()
+            found = [line.split() for line in lines if line.startswith("multidrop_mqtt_")]
+            return {name.removeprefix("multidrop_mqtt_"): float(value) for name, value in found}
+
+        until(lambda: figures().get("connected") == 1.0 and figures()["sent_total"] > 3)
+        assert figures().keys() == {"sent_total", "dropped_total", "connected"}
+        broker.kill()
+        until(lambda: figures()["connected"] == 0.0)
+
+
+# ---- another plant ----
+
+
+def test_what_is_kept_of_a_drive_that_left_is_taken_back(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
+    known, running = start(home_assistant=True)
+    fan = f"multidrop/{FAN.name}"
+    topics = [fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)]
+    listener.wait_for(has(topics[1], b"online"))
+    running.adopt(without_fan(known))
+    for topic in topics:
+        listener.wait_for(has(topic, b""))
+    listener.wait_for(has(discovery_topic("multidrop", "pump-1")))
+    listener.wait_for(has("multidrop/pump-1/available", b"online"))
+    later = Listener(broker)
+    later.wait_for(has("multidrop/pump-1"))
+    running.step()
+    told = later.wait_for(lambda heard: heard.topic in ("multidrop/pump-1", *topics))
+    assert told.topic == "multidrop/pump-1"
+    later.close()

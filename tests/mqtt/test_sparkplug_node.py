@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, publish, sparkplug_messages
+from brokers import (
+    FAN,
+    Broker,
+    Heard,
+    Listener,
+    Running,
+    inside,
+    mosquitto,
+    publish,
+    sparkplug_messages,
+    without_fan,
+)
 from peers import require_module
 
 from multidrop.gateway.mqtt import MqttSettings, build
@@ -181,3 +192,21 @@ def test_commands_of_a_host(broker: Broker, host: Host, node: tuple[Any, Running
     while len(known.commands.noted) < 2 and time.monotonic() < ends:
         time.sleep(0.01)
     assert known.commands.noted == [("write", "pump-1", "setpoint", 25.0), ("stop", ["pump-1"])]
+
+
+def test_another_plant_is_a_death_of_what_left_and_a_birth_of_the_rest(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
+    known, running = node
+    host.wait_for("DBIRTH", FAN.name)
+    running.adopt(without_fan(known))
+    host.wait_for("DDEATH", FAN.name)
+    host.wait_for("NBIRTH")
+    host.wait_for("DBIRTH", "pump-1")
+    born = len(host.kinds)
+    command(broker, ROOT.format("DCMD") + f"/{FAN.name}", name="setpoint", double_value=1.0, datatype=10)
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    assert host.values(host.wait_for("DDATA", "pump-1")) == {"output_frequency": 50.0}
+    assert host.kinds[born:] == ["DDATA"]
+    assert known.commands.noted == []

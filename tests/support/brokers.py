@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -186,10 +187,11 @@ class SaidHub:
         }
         self.states = {PUMP.name: "runs", FAN.name: "runs"}
         self.faults: dict[str, str | None] = {}
+        self.names = [PUMP.name, FAN.name]
 
     @property
     def drives(self) -> Iterator[str]:
-        return iter([PUMP.name, FAN.name])
+        return iter(self.names)
 
     def polled(self, drive: str) -> tuple[Any, ...]:
         return (PUMP.output_frequency, PUMP.status)
@@ -241,6 +243,14 @@ def inside(folder: Path) -> Any:
     return Inside(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
 
 
+def without_fan(known: Any) -> Plant:
+    """Return the plant of `inside` that has no fan any more, as the hub has none then."""
+    known.hub.names.remove(FAN.name)
+    (line,) = known.plant.lines
+    plant: Plant = replace(known.plant, lines=(replace(line, drives=line.drives[:1]),))
+    return plant
+
+
 class Running:
     """The part in a thread with a loop of its own; `step()` lets it publish once, and returns then."""
 
@@ -252,6 +262,10 @@ class Running:
         self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._live(),))
         self._thread.start()
         assert self._published.acquire(timeout=PATIENCE_S)
+
+    def adopt(self, plant: Plant) -> None:
+        """Tell the part of another plant, in its loop."""
+        self._loop.call_soon_threadsafe(self._part.adopt, plant)
 
     async def _live(self) -> None:
         self._task = asyncio.ensure_future(self._part.run(self._sleep))

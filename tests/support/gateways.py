@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import os
 import subprocess
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from commands import MULTIDROP
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant, load_plant
@@ -125,9 +127,14 @@ def served(
     secrets, known = tokens()
     (folder / "tokens").write_text("".join(f"{token.line}\n" for token in known))
     with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
-        plant = written(folder, serve, *names, port=simulator.wires[0].path)
-        found: ServeSettings = read_settings(plant, environment or {})
-        gateway = Gateway(plant, replace(found, port=0, **{"tokens": known, **settings}))
+        written(folder, serve, *names, port=simulator.wires[0].path)
+
+        def read() -> tuple[Plant, ServeSettings]:
+            plant = load_plant(folder / "plant.toml")
+            found = read_settings(plant, environment or {})
+            return plant, replace(found, port=0, **{"tokens": known, **settings})
+
+        gateway = Gateway(*read(), read=read)
         with running(gateway):
             yield Served(gateway, sims, secrets)
 
@@ -164,3 +171,38 @@ def running(gateway: Gateway) -> Iterator[None]:
         assert not thread.is_alive()
     if failures:
         raise failures[0]
+
+
+# ---- the command ----
+
+
+@contextmanager
+def simulated_plant(folder: Path, serve: str) -> Iterator[Path]:
+    """A plant file whose line is simulated while the context lasts."""
+    drives = [simulated(InvtCHE(address, name=f"pump-{address}", baudrate=38400)) for address in (1, 2)]
+    with Simulator([Wire(drives, unpaced=True)]) as simulator:
+        path = folder / "plant.toml"
+        path.write_text(plant_text(simulator.wires[0].path, ("pump-1", "pump-2"), serve))
+        yield path
+
+
+@contextmanager
+def serving(path: Path, *options: str, **environment: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The command, once it is ready, and the address that it prints."""
+    words = [*MULTIDROP, "serve", str(path), *options]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | environment
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert process.stderr is not None
+            assert line.startswith("ready "), process.stderr.read()
+            yield process, line.removeprefix("ready ").strip()
+        finally:
+            process.kill()
+
+
+def get(connection: http.client.HTTPConnection, path: str) -> bytes:
+    connection.request("GET", path)
+    return connection.getresponse().read()

@@ -14,6 +14,7 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 
 if TYPE_CHECKING:
+    from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
 DEMO_PORTS = (8750, 0)  # the usual one, or any
@@ -56,14 +58,18 @@ def run(arguments: argparse.Namespace) -> int:
     _require_server()
     from multidrop.gateway.settings import read_settings
 
-    plant = plant_of(arguments.plant, arguments)
-    settings = read_settings(plant, os.environ)
+    def read() -> tuple[Plant, ServeSettings]:
+        plant = plant_of(arguments.plant, arguments)
+        return plant, read_settings(plant, os.environ)
+
+    plant, settings = read()
     if arguments.check:
         parts = ", ".join(settings.parts) or "none"
         print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
         return 0
     with _logging(arguments.log, logging.INFO):
-        return _serve(plant, settings, lambda port: print_text(f"ready {_url(settings, port)}", flush=True))
+        ready = partial(_tell_ready, settings)
+        return _serve(plant, settings, ready, read)
 
 
 def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
@@ -115,13 +121,19 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     return ServeSettings(port=DEMO_PORTS[0], may=may, audit=audit, folder=folder, parts=parts, is_demo=True)
 
 
-def _serve(plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None]) -> int:
+def _tell_ready(settings: ServeSettings, port: int) -> None:
+    print_text(f"ready {_url(settings, port)}", flush=True)
+
+
+def _serve(
+    plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None], read: Read | None = None
+) -> int:
     from dataclasses import replace
 
     from multidrop.gateway.gateway import Gateway
 
     try:
-        gateway = Gateway(plant, settings)
+        gateway = Gateway(plant, settings, read=read)
     except OSError:
         if not settings.is_demo:
             raise
@@ -137,6 +149,7 @@ def _serve(plant: Plant, settings: ServeSettings, on_ready: Callable[[int], None
 
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, end, number)
+        loop.add_signal_handler(signal.SIGHUP, gateway.reload.begin)
         await gateway.run(lambda: on_ready(gateway.port))
 
     asyncio.run(live())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from math import isfinite
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -51,6 +51,7 @@ class PolledLines(Protocol):
     @property
     def plant(self) -> Plant: ...
     def bus(self, line: str) -> Bus: ...
+    async def settled(self) -> None: ...
 
 
 class VerbRule(NamedTuple):
@@ -107,14 +108,32 @@ class Commands:
         """Stop these drives, or all with None; by drive's name what is known of each.
 
         The stops of all lines and drives go side by side. Never raises for one drive: the others go on.
-        Nothing but the role is looked at, and nothing is waited for before it is sent.
+        Nothing but the role is looked at, and nothing is waited for before it is sent. What a reload of the
+        plant changed meanwhile is stopped again as it is now.
         """
         plant = self._lines.plant
-        names = [polled.drive.name for line in plant.lines for polled in line.drives]
-        wanted = dict.fromkeys(names if drives is None else drives)
+        there = _drives(plant)
+        wanted = dict.fromkeys(there if drives is None else drives)
         if caller.role < Right.STOP:
             return dict.fromkeys(wanted, _denied(caller, Right.STOP, "stop"))
         self.called += 1
+        _log.warning(
+            "stop of %s, asked for by %s", "all drives" if drives is None else list(wanted), caller.by
+        )
+        told = await self._stop(plant, wanted, caller)
+        await self._lines.settled()
+        while self._lines.plant is not plant:
+            plant, before = self._lines.plant, there
+            there = _drives(plant)
+            stopped = [name for name in told if told[name].is_done and before.get(name) is there.get(name)]
+            left = [name for name in (there if drives is None else wanted) if name not in stopped]
+            told |= await self._stop(plant, [name for name in left if name in there], caller)
+            await self._lines.settled()
+        return told
+
+    async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, Told]:
+        """Stop these drives of a plant."""
+        there, wanted = _drives(plant), dict.fromkeys(wanted)
         told: dict[str, Told] = {}
         waited: list[asyncio.Future[dict[str, Told]]] = []
         for line in plant.lines:
@@ -122,26 +141,24 @@ class Commands:
             for name in here:
                 self._stops[name] = self._stops.get(name, 0) + 1
             if here and len(here) == len(line.drives):
-                waited.append(_begin_stop(partial(self._stop_line, line.name), caller))
+                waited.append(_begin_stop(partial(self._stop_line, line.name, list(here)), caller))
             else:
                 waited += [_begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
-        _log.warning(
-            "stop of %s, asked for by %s", "all drives" if drives is None else list(wanted), caller.by
-        )
         for name in wanted:
-            if name not in names:
+            if name not in there:
                 told[name] = _failed(ValueError(f"there is no drive {name!r}"))
         for found in await asyncio.gather(*waited):
             told |= found
         return {name: told[name] for name in wanted if name in told}
 
-    def _stop_line(self, line: str) -> dict[str, Told]:
+    def _stop_line(self, line: str, names: list[str]) -> dict[str, Told]:
         try:
-            return {name: _of_stop(stopped) for name, stopped in self._lines.bus(line).stop_all().items()}
+            found = self._lines.bus(line).stop_all()
         except Exception as failure:  # whatever it is: everybody must see it
             _log.exception("stop_all of line %s", line)
-            names = [polled.drive.name for polled in self._lines.plant.find_line(line).drives]
             return dict.fromkeys(names, _failed(failure))
+        left = _failed(ValueError(f"it is no longer on line {line}"))
+        return {name: _of_stop(found[name]) if name in found else left for name in names}
 
     # ---- writes and verbs ----
 
@@ -206,6 +223,10 @@ class Commands:
 
     def _end(self, line: str) -> None:
         self._under_way[line] -= 1
+
+
+def _drives(plant: Plant) -> dict[str, Drive]:
+    return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
 
 
 def _begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:

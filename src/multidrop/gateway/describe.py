@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from enum import Flag
 from typing import Any, cast
 
@@ -15,7 +16,14 @@ CURRENTS = ("output_current",)
 
 
 def describe(
-    plant: Plant, may: May, right: Right | None, *, revision: int, version: str, is_demo: bool
+    plant: Plant,
+    may: May,
+    right: Right | None,
+    *,
+    revision: int,
+    version: str,
+    is_demo: bool,
+    mistakes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what GET /api/plant answers to a caller with this right."""
     is_writer = right is Right.WRITE
@@ -24,6 +32,7 @@ def describe(
         "version": version,
         "name": plant.path.name,
         "demo": is_demo,
+        "mistakes": list(mistakes),  # of the file, where the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],

@@ -80,15 +80,19 @@ def _finite(value: float) -> float | None:
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
-    """Return the reason why a line is not there, where all its newest rows say so; None otherwise."""
+    """Return the reason why a line is not there, where all its newest rows say so; None otherwise.
+
+    Of a port that could not be opened it is what the system said.
+    """
     rows = [
         row
         for polled in hub.plant.find_line(line).drives
         for poll in polled.polls
         if (row := hub.newest(polled.drive.name, poll.register.name))
     ]
-    reasons = {row.status for row in rows if row.status in LOST}
-    return max(reasons) if reasons and all(row.status in LOST for row in rows) else None
+    if any(row.status not in LOST for row in rows):
+        return None
+    return hub.unopened.get(line) or max((row.status for row in rows), default=None)
 
 
 class Frames:

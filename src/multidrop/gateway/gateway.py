@@ -6,22 +6,25 @@ import asyncio
 import logging
 import struct
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import uvicorn
 
 import multidrop
-from multidrop import Batch, Bus, Ledger, Plant, Poller
+from multidrop import Bus, Ledger, LineError, Plant, Poller
 from multidrop.gateway.commands import Commands
+from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
-from multidrop.gateway.frames import Frames, frame_of
+from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
-from multidrop.gateway.listener import listen
+from multidrop.gateway.listener import BACKLOG, listen
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
+from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import ServeSettings
@@ -41,12 +44,15 @@ _log = logging.getLogger("multidrop.gateway")
 class Gateway:
     """A plant that is polled, and all ways in to it.
 
-    Raises ValueError, LineError or OSError when something of it cannot be opened; then nothing is left open.
+    Raises ValueError or OSError when something of it cannot be opened; then nothing is left open. A line
+    whose port is not there does not keep the others waiting: it is lost, and tried again.
     """
 
     clock = staticmethod(time.monotonic)
 
-    def __init__(self, plant: Plant, settings: ServeSettings, *, ledger: Ledger | None = None) -> None:
+    def __init__(
+        self, plant: Plant, settings: ServeSettings, *, ledger: Ledger | None = None, read: Read | None = None
+    ) -> None:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
@@ -63,12 +69,15 @@ class Gateway:
         self._end = asyncio.Event()
         self._threads = ThreadPoolExecutor(MOST_ASKED, "multidrop ask")
         self.listener = listen(settings.host, settings.port)
+        self.connections = self.listener.connections = Connections(self.clock)
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
         self.hub = Hub(plant)
         self.events = Events()
         self.lately = Lately(plant)
+        self.notifier = Notifier()
+        self.reload = Reload(self, read)
         self.frames = Frames(self._frame, self.clock)
         self.commands = Commands(self, settings.may)
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
@@ -77,18 +86,20 @@ class Gateway:
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and serve until `end` is called."""
-        notifier = Notifier()
         tasks: list[asyncio.Task[None]] = []
         server = _Server(self._server_config())
         try:
             self._build_parts()
-            self.poller = Poller(self.plant, ledger=self.ledger, audit=self.settings.audit)
+            nothing = replace(self.plant, lines=())
+            self.poller = Poller(nothing, ledger=self.ledger, audit=self.settings.audit)
             with self.poller:
+                self.note_unopened(self.poller.adopt(self.plant))
+                self.plant = self.poller.plant
                 tasks = [
                     asyncio.create_task(work, name=name)
                     for name, work in (
                         ("take", self._take_all()),
-                        ("tick", self._tick(notifier)),
+                        ("tick", self._tick()),
                         *((name, self._live(name, feed.run)) for name, feed in self.feeds.items()),
                     )
                 ]
@@ -97,11 +108,11 @@ class Gateway:
                     await asyncio.sleep(0.005)
                 if not serving.done():
                     on_ready()
-                    notifier.tell("READY=1", f"STATUS=polling {len(self.plant.lines)} lines")
+                    self.notifier.tell("READY=1", self.status)
                 end = asyncio.create_task(self._end.wait())
                 await asyncio.wait({end, serving, *tasks[:2]}, return_when=asyncio.FIRST_COMPLETED)
                 end.cancel()
-                notifier.tell("STOPPING=1")
+                self.notifier.tell("STOPPING=1")
                 self.frames.close()
                 server.should_exit = True
                 await serving
@@ -115,8 +126,9 @@ class Gateway:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            await self.reload.close()
             if self.poller is not None:
-                self._hand_out(self.poller)  # what came while it closed
+                self.hand_out(self.poller)  # what came while it closed
             await self._close_parts()
             self.listener.close()
             self._threads.shutdown(wait=False, cancel_futures=True)
@@ -128,7 +140,8 @@ class Gateway:
     def _server_config(self) -> uvicorn.Config:
         context = self.settings.tls
         return uvicorn.Config(
-            make_app(self),
+            Watched(make_app(self), self.connections),
+            backlog=BACKLOG,
             http="h11",
             ws="none",
             lifespan="off",
@@ -161,29 +174,35 @@ class Gateway:
     async def _take_all(self) -> None:
         while True:
             if self.poller is not None:
-                self._hand_out(self.poller)
+                self.hand_out(self.poller)
             await asyncio.sleep(TAKE_S)
 
-    def _hand_out(self, poller: Poller) -> None:
+    def hand_out(self, poller: Poller) -> None:
         """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
         is_new = False
         self.hub.pass_time(time.monotonic_ns())
         while batch := poller.take():
             is_new = True
-            self._guarded("hub", self.hub.take, batch)
+            self.guarded("hub", self.hub.take, batch)
             for name, feed in self.feeds.items():
-                self._guarded(name, feed.take, batch)
+                self.guarded(name, feed.take, batch)
         if is_new:
-            self._guarded("frames", self.frames.note_news)
+            self.guarded("frames", self.frames.note_news)
         if self.clock() - self._looked >= EVENTS_S:
             self._looked = self.clock()
-            self._guarded("events", self._look_for_events)
+            self.guarded("events", self._look_for_events)
 
     def _look_for_events(self) -> None:
         for name in self.hub.drives:
             self.events.look(_utc_ms(), name, self.hub.seen(name))
+        for line in [line for line in self.hub.unopened if lost_of(self.hub, line) is None]:
+            del self.hub.unopened[line]  # it came: should it go again, that has another reason
 
-    def _guarded(self, name: str, work: Callable[..., object], *arguments: Batch) -> None:
+    def forget(self, drive: str) -> None:
+        """End what lasts of a drive that is no longer there."""
+        self.events.forget(drive, _utc_ms())
+
+    def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
         except Exception:  # whatever it is, polling and stops go on
@@ -202,12 +221,14 @@ class Gateway:
             self.dead[name] = f"{type(failure).__name__}: {failure}"
             self._note_failure(name)
 
-    async def _tick(self, notifier: Notifier) -> None:
+    async def _tick(self) -> None:
+        notifier = self.notifier
         every = min(TICK_S, (notifier.watchdog_s or 4 * TICK_S) / 4)
         while True:
             if self.poller is not None:
-                self._guarded("statistics", self._read_statistics)
-            self._guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
+                self.guarded("statistics", self._read_statistics)
+            self.guarded("connections", self.connections.sweep)
+            self.guarded("frames", self.frames.note_news)  # its time is how a page knows that we live
             if notifier.watchdog_s:
                 notifier.tell("WATCHDOG=1")
             await asyncio.sleep(every)
@@ -215,6 +236,24 @@ class Gateway:
     def _read_statistics(self) -> None:
         assert self.poller is not None
         self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
+
+    def note_unopened(self, failures: Mapping[str, LineError]) -> None:
+        """Tell which ports are not there, and why."""
+        for line, failure in failures.items():
+            _log.warning("line %s is lost, and tried again: %s", line, failure)
+        there = [line.name for line in self.plant.lines]
+        before = {line: why for line, why in self.hub.unopened.items() if line in there}
+        self.hub.unopened = before | {line: str(failure) for line, failure in failures.items()}
+
+    @property
+    def status(self) -> str:
+        """Return what the service manager shows."""
+        lost = len(self.hub.unopened)
+        return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
+
+    async def settled(self) -> None:
+        """Return as soon as no drive is on its way from one plant to another; see `Reload`."""
+        await self.reload.settled()
 
     # ---- for commands, parts and pages ----
 

@@ -53,7 +53,7 @@ class Guard:
         needed: Mapping[str, Needed],
         names: OwnNames,
         tokens: Tokens,
-        may: May,
+        may: Callable[[], May],
         behind_proxy: bool,
         clock: Callable[[], float],
     ) -> None:
@@ -136,7 +136,7 @@ class Guard:
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
-        free = self._may.without_token(is_loopback=local)
+        free = self._may().without_token(is_loopback=local)
         secret, way = _secret(headers)
         token: Token | None = None
         is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())

@@ -118,18 +118,22 @@ class Hub:
         self.now_ns = 0  # of the monotonic clock
         self.time = 0  # of the newest row, UTC in ns
         self.taken = 0  # batches
+        self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
         self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
 
-    def adopt(self, plant: Plant) -> None:
-        """Go on with another plant; what is known of drives that stay as they are is kept."""
+    def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
+        """Go on with another plant; what is known of drives that stay as they are is kept.
+
+        `planned` is what its metadata plan: that takes seconds for hundreds of lines.
+        """
         before = self._watched
         self.plant = plant
         self._cells = {}
         self._watched = {}
-        planned = plant.metadata()["planned"]
+        planned = plant.metadata()["planned"] if planned is None else planned
         for line in plant.lines:
             cycle_ns = round(planned[line.name]["cycle_ms"] * 1e6)
             for polled in line.drives:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from multidrop import Plant
 from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
@@ -25,6 +26,7 @@ EXAMPLES = {
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
 ONLINE, OFFLINE = b"online", b"offline"
+NOTHING = b""  # makes a broker forget what it kept of a topic
 
 
 class JsonTopics:
@@ -37,6 +39,7 @@ class JsonTopics:
         self._settings = settings
         self._inside = inside
         self._hub = inside.hub
+        self._plant = inside.plant
         caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
         self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
@@ -89,6 +92,17 @@ class JsonTopics:
         except ValueError as mistake:
             self._orders.refuse(drive, "/".join(what), f"it is no {EXAMPLES[what[0]]}: {mistake}")
 
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: what the broker keeps of drives that left is taken back."""
+        left = _drives(self._plant) - _drives(plant)
+        self._plant = plant
+        for drive in sorted(left):
+            topics = [self._topic(drive), self._topic(drive, "available")]
+            if self._settings.home_assistant:
+                topics.append(discovery_topic(self._settings.prefix, drive))
+            for topic in topics:
+                self.outbox.put(self._kept(topic, NOTHING))
+
     # ---- what is said ----
 
     def publish(self) -> None:
@@ -121,7 +135,7 @@ class JsonTopics:
         self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 
     def _discover(self, name: str) -> None:
-        _, drive = self._inside.plant.find_drive(name)
+        _, drive = self._plant.find_drive(name)
         may = self._inside.commands.may.write
         writable = [register for register in drive.registers if f"{name}.{register}" in may]
         topics = {
@@ -142,6 +156,10 @@ class JsonTopics:
             takes_commands=self._settings.commands,
         )
         self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
+
+
+def _drives(plant: Plant) -> set[str]:
+    return {polled.drive.name for line in plant.lines for polled in line.drives}
 
 
 def _read_write(payload: bytes) -> tuple[float, int]:

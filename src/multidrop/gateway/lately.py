@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
-from multidrop import LineStatistics, Plant, Statistics
+from multidrop import LineStatistics, Plant, PlantLine, Statistics
 
 SECONDS = 5.0  # over which the use of a line is taken
 MINUTES = 60
@@ -26,11 +27,21 @@ class Lately:
         self._recent: deque[tuple[float, Reading]] = deque()
         self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=MINUTES + 1)
+        self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
 
-    def adopt(self, plant: Plant) -> None:
-        """Take what is planned from another plant."""
-        planned = plant.metadata()["planned"]
+    def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
+        """Take what is planned from another plant, and forget readings of lines that count anew."""
+        before, self._lines = self._lines, {line.name: line for line in plant.lines}
+        goes_on = {
+            name for name, line in self._lines.items() if name in before and _counts_on(before[name], line)
+        }
+        for readings in (self._recent, self._minutes):
+            kept = [(time, _of_lines(reading, goes_on)) for time, reading in readings]
+            readings.clear()
+            readings.extend(kept)  # type: ignore[arg-type]
+        self.newest = _of_lines(self.newest, goes_on)
+        planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
@@ -88,6 +99,17 @@ class Lately:
                 minute = after[line].since(before[line])
                 found.append({"time": begin_ms, "asked": _asked(minute), "misses": misses_of(minute)})
         return found
+
+
+def _counts_on(before: PlantLine, line: PlantLine) -> bool:
+    """Return True where port and drives are the same ones: their counts go on."""
+    drives = [[polled.drive for polled in one.drives] for one in (before, line)]
+    is_same = len(drives[0]) == len(drives[1]) and all(a is b for a, b in zip(*drives, strict=True))
+    return is_same and replace(before, drives=()) == replace(line, drives=())
+
+
+def _of_lines(reading: Reading, names: set[str]) -> Reading:
+    return {name: found for name, found in reading.items() if name in names}
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:

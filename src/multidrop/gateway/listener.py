@@ -5,6 +5,10 @@ from __future__ import annotations
 import errno
 import socket
 
+from multidrop.gateway.connections import Listener
+
+BACKLOG = 64  # connections that wait, and that are taken at once: their descriptors are not bounded yet
+
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
     errno.EACCES: "this user may not",
@@ -12,7 +16,7 @@ _WHY = {
 }
 
 
-def listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int) -> Listener:
     """Return a listening socket. Raises OSError with a sentence where the port cannot be had."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
@@ -21,11 +25,11 @@ def listen(host: str, port: int) -> socket.socket:
     except socket.gaierror as failure:
         raise OSError(f"listen: {host} is no address of this machine: {failure.strerror}") from failure
     # With its protocol named asyncio sets TCP_NODELAY: else each frame waits 40 ms.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = Listener(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
-        listener.listen(256)
+        listener.listen(BACKLOG)
         listener.setblocking(False)
     except OSError as failure:
         listener.close()

@@ -10,6 +10,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from multidrop import LineStatistics
+from multidrop.gateway.frames import lost_of
 from multidrop.gateway.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
 
 CONTENT_TYPE = "application/openmetrics-text; version=1.0.0; charset=utf-8"
@@ -38,6 +39,12 @@ def metrics_of(hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figu
             "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
         ),
         _family("multidrop_drive_state", "stateset", "State of each drive.", _states(hub)),
+        _family(
+            "multidrop_line_up",
+            "gauge",
+            "1 while a line's port is there, 0 while it is lost.",
+            _ups(hub),
+        ),
         *_line_families(statistics),
         *_drive_families(statistics),
         _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped),
@@ -73,6 +80,11 @@ def _states(hub: Hub) -> Iterator[Sample]:
             for state in STATES:
                 labels = {"line": line.name, "drive": polled.drive.name, "multidrop_drive_state": state}
                 yield "", labels, float(state == present)
+
+
+def _ups(hub: Hub) -> Iterator[Sample]:
+    for line in hub.plant.lines:
+        yield "", {"line": line.name}, float(lost_of(hub, line.name) is None)
 
 
 def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterable[str]]:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from multidrop import Batch
+from multidrop import Batch, Plant
 from multidrop.gateway.broker import Broker, parse_broker
 from multidrop.gateway.json_topics import JsonTopics
 from multidrop.gateway.mqtt_settings import MqttSettings as MqttSettings
@@ -44,6 +44,13 @@ class Mqtt:
     def take(self, batch: Batch) -> None:
         """Do nothing: the hub has the newest rows."""
 
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: all drives are made known anew."""
+        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+            speaker.adopt(plant)
+            if broker.is_connected:
+                speaker.connected()
+
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
         """Publish every so many seconds, until cancelled."""
         for broker in self._brokers:
@@ -61,11 +68,11 @@ class Mqtt:
                 speaker.leave()
             await broker.close()
 
-    def numbers(self) -> dict[str, int]:
-        """Return counts since the start: messages that were sent, and that were dropped."""
+    def figures(self) -> dict[str, float]:
+        """Return messages sent and dropped since the start, and how many connections there are."""
         outboxes = [broker.outbox for broker in self._brokers]
         return {
-            "sent": sum(outbox.sent for outbox in outboxes),
-            "dropped": sum(outbox.dropped for outbox in outboxes),
+            "sent_total": sum(outbox.sent for outbox in outboxes),
+            "dropped_total": sum(outbox.dropped for outbox in outboxes),
             "connected": sum(broker.is_connected for broker in self._brokers),
         }

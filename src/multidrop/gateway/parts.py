@@ -46,7 +46,11 @@ class Inside(NamedTuple):
 
 
 class Feed(Protocol):
-    """A part that was built."""
+    """A part that was built.
+
+    It may have `adopt(plant)`, which is told of another plant once the hub has it, `health()`, which says
+    what is not well, and `figures()` for the metrics.
+    """
 
     def take(self, batch: Batch) -> None:
         """Take rows, in the loop, within 1 ms."""

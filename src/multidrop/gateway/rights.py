@@ -134,6 +134,11 @@ class May(NamedTuple):
     write: frozenset[str] = frozenset()
     verbs: frozenset[str] = frozenset()
 
+    def bounded_by(self, other: May) -> May:
+        """Return the same lists, and those rights without a token that both give."""
+        look = "anyone" if self.look == other.look == "anyone" else "token"
+        return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
+
     def without_token(self, *, is_loopback: bool) -> Right | None:
         """Return the right of those without a token; None: not even a look."""
         if is_loopback and self.on_loopback > Right.LOOK:
@@ -155,11 +160,15 @@ class OwnNames:
     """The names under which the gateway is called: all others are somebody else's page."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
-        own = {"localhost", "127.0.0.1", "[::1]", *(name.lower() for name in names)}
+        self._always = {"localhost", "127.0.0.1", "[::1]"}
         if listen not in ("0.0.0.0", "::", ""):
-            own.add(f"[{listen}]" if ":" in listen else listen)
-        self._hosts = frozenset(own)
+            self._always.add(f"[{listen}]" if ":" in listen else listen)
         self._port = port
+        self.replace(names)
+
+    def replace(self, names: Iterable[str]) -> None:
+        """Take the names of a file that was read again."""
+        self._hosts = frozenset({*self._always, *(name.lower() for name in names)})
 
     def has_host(self, host: str) -> bool:
         """Return True for a Host header that is ours; a proxy's port may be another one."""

@@ -1,9 +1,10 @@
-"""Notify the service manager, as sd_notify(3) says: ready, alive, and about to end."""
+"""Notify the service manager, as sd_notify(3) says: ready, alive, reloading, and about to end."""
 
 from __future__ import annotations
 
 import os
 import socket
+import time
 from contextlib import suppress
 
 
@@ -19,6 +20,10 @@ class Notifier:
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
+
+    def tell_reloading(self) -> None:
+        """Say that a reload begins now; READY=1 ends it. The time tells it from an older one."""
+        self.tell("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def tell(self, *lines: str) -> None:
         """Send lines such as READY=1. What the manager does not take is lost."""

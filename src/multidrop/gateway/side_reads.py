@@ -55,11 +55,18 @@ class SideReads:
         """Return how many drives are read at present."""
         return len(self._tasks)
 
-    async def close(self) -> None:
-        """Read no more."""
+    def begin_anew(self) -> None:
+        """End all reads: drives may be others now."""
         for task in self._tasks.values():
             task.cancel()
-        await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+        self._tasks.clear()
+        self._found.clear()
+
+    async def close(self) -> None:
+        """Read no more."""
+        tasks = [*self._tasks.values()]
+        self.begin_anew()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _read(self, line: str, drive: Drive, registers: list[str]) -> None:
         turn = self._turns.setdefault(line, asyncio.Lock())
@@ -74,8 +81,9 @@ class SideReads:
                     if found.get(register, ["", 0, ""])[2].startswith(UNANSWERED):
                         registers.remove(register)  # each would cost its time-out
         finally:
-            del self._tasks[drive.name]
-            self._found.pop(drive.name, None)  # nobody is shown what nobody keeps up to date
+            if self._tasks.get(drive.name) is asyncio.current_task():
+                del self._tasks[drive.name]
+                self._found.pop(drive.name, None)  # nobody is shown what nobody keeps up to date
 
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()

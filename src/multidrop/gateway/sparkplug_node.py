@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from multidrop import Register
+from multidrop import Plant, Register
 from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.hub import SILENT
@@ -42,6 +42,7 @@ class SparkplugNode:
         self._settings = settings
         self._inside = inside
         self._hub = inside.hub
+        self._plant = inside.plant
         self._utc_ms = utc_ms
         self._node = settings.node or inside.plant.path.stem
         caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
@@ -84,6 +85,14 @@ class SparkplugNode:
             return
         for given in metrics:
             self._order(levels[-1], given, sent_ms, is_retained=is_retained)
+
+    def adopt(self, plant: Plant) -> None:
+        """Go on with another plant: devices that left are dead."""
+        self._plant = plant
+        there = {polled.drive.name for line in plant.lines for polled in line.drives}
+        for drive in [drive for drive in self._said if drive not in there]:
+            del self._said[drive]
+            self.outbox.put(Publication(self._topic("DDEATH", drive), self._device_death, qos=0))
 
     def publish(self) -> None:
         """Say what changed of each drive, and which came and went."""
@@ -165,7 +174,8 @@ class SparkplugNode:
         return [name for name in self._registers(drive) if f"{drive}.{name}" in listed]
 
     def _registers(self, drive: str) -> dict[str, Register[Any]]:
-        return dict(self._inside.plant.find_drive(drive)[1].registers)
+        drives = [polled.drive for line in self._plant.lines for polled in line.drives]
+        return next((dict(one.registers) for one in drives if one.name == drive), {})
 
     def _datatype(self, drive: str, name: str) -> DataType:
         if name in (STATE, FAULT) and name not in self._registers(drive):

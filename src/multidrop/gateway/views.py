@@ -82,7 +82,7 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
     """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
     lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
     parts = {name: gateway.dead.get(name) or _health_of_part(feed) for name, feed in gateway.feeds.items()}
-    is_well = all(said == "ok" for said in (*lost.values(), *parts.values()))
+    is_well = all(said == "ok" for said in (*lost.values(), *parts.values())) and not gateway.reload.mistakes
     return {
         "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
         "version": gateway.version,
@@ -90,6 +90,8 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
         "newest_row": gateway.hub.time // 1_000_000,
         "lines": lost,
         "parts": parts,
+        "mistakes": gateway.reload.mistakes,
+        "restart": gateway.reload.restart,
         "failures": gateway.failures,
     }
 

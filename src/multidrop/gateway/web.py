@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 PAGE = Path(__file__).parent / "page"
 MOST_BYTES = 64 * 1024  # of a body
+BODY_S = 10.0  # that it may take to come
 MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
 COOKIE_S = 30 * 24 * 3600
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
@@ -44,6 +45,7 @@ NEEDED: Mapping[str, Needed] = {
     "/api/stop": Needed("POST", Right.STOP),
     "/api/act": Needed("POST", Right.STOP),  # the verb's own right is looked at by Commands
     "/api/write": Needed("POST", Right.WRITE),
+    "/api/reload": Needed("POST", Right.WRITE),
     "/api/token": Needed("POST", None),
     "/api/forget": Needed("POST", None),
 }
@@ -69,6 +71,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         Route("/api/stop", pages.stop, methods=["POST"]),
         Route("/api/write", pages.write, methods=["POST"]),
         Route("/api/act", pages.act, methods=["POST"]),
+        Route("/api/reload", pages.reload, methods=["POST"]),
         Route("/api/token", pages.token, methods=["POST"]),
         Route("/api/forget", pages.forget, methods=["POST"]),
     ]
@@ -84,7 +87,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
         needed=NEEDED,
         names=gateway.own_names,
         tokens=gateway.tokens,
-        may=gateway.settings.may,
+        may=lambda: gateway.settings.may,
         behind_proxy=gateway.settings.behind_proxy,
         clock=lambda: gateway.guard_clock(),
     )
@@ -106,10 +109,16 @@ def _caller(request: Request) -> Caller:
 async def _body(request: Request) -> dict[str, Any]:
     """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
     data = bytearray()
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > MOST_BYTES:
-            raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) > MOST_BYTES:
+                    raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    except ClientDisconnect:
+        raise Denied(400, "the client is gone") from None
+    except TimeoutError:
+        raise Denied(408, f"the body did not come within {BODY_S:g} s") from None
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):
@@ -167,6 +176,7 @@ class _Pages:
             revision=gateway.revision,
             version=gateway.version,
             is_demo=gateway.settings.is_demo,
+            mistakes=gateway.reload.mistakes,
         )
         return JSONResponse(described)
 
@@ -274,6 +284,14 @@ class _Pages:
             raise Denied(400, "options is no JSON object")
         drive, verb = _text(body, "drive"), _text(body, "verb")
         return _answer(await self._gateway.commands.act(drive, verb, options, _caller(request)))
+
+    async def reload(self, request: Request) -> Response:
+        if (await _body(request)).get("confirm") is not True:
+            raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
+        told = await self._gateway.reload.carry_out(_caller(request).by)
+        return JSONResponse(
+            {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
+        )
 
     # ---- tokens ----
 

@@ -1,0 +1,166 @@
+"""Reload: the plant file read again while the plant is polled; a mistake leaves all as it is."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from multidrop import Plant, PlantError, Poller
+
+if TYPE_CHECKING:
+    from multidrop.gateway.gateway import Gateway
+    from multidrop.gateway.settings import ServeSettings
+
+Read = Callable[[], "tuple[Plant, ServeSettings]"]
+AT_ONCE = ("names", "tokens", "may")  # keys of [serve]; all others wait for a restart
+RESTART = "takes effect after a restart"
+NO_FILE = "this plant has no file to be read again"
+
+R = TypeVar("R")
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Reloaded(NamedTuple):
+    """The end of a reload: the mistakes that kept it back, or what still needs a restart."""
+
+    is_done: bool
+    text: str
+    mistakes: tuple[str, ...] = ()
+    restart: tuple[str, ...] = ()
+
+
+class Reload:
+    """Reads the plant file anew with `read`, which raises ValueError or OSError for what is wrong with it."""
+
+    def __init__(self, gateway: Gateway, read: Read | None) -> None:
+        self.mistakes: tuple[str, ...] = ()  # of the newest reload
+        self.restart: tuple[str, ...] = ()  # what is in the file, and not yet in effect
+        self._gateway = gateway
+        self._read = read
+        self._begun_with = dict(gateway.plant.serve)
+        self._turn = asyncio.Lock()
+        self._soon: asyncio.Task[None] | None = None
+        self._is_wanted = False
+        self._is_settled = asyncio.Event()
+        self._is_settled.set()
+
+    def begin(self) -> None:
+        """Reload as soon as the one that is under way has ended. To be called in the loop."""
+        self._is_wanted = True
+        if self._soon is None or self._soon.done():
+            self._soon = asyncio.create_task(self._carry_out_wanted())
+
+    async def _carry_out_wanted(self) -> None:
+        while self._is_wanted:
+            self._is_wanted = False
+            await self.carry_out("a signal")
+
+    async def close(self) -> None:
+        """Wait for nothing any more."""
+        if self._soon is not None:
+            self._soon.cancel()
+            await asyncio.gather(self._soon, return_exceptions=True)
+
+    async def settled(self) -> None:
+        """Return as soon as the lines are those of `plant`: no drive is on its way from one to the other."""
+        await self._is_settled.wait()
+
+    async def carry_out(self, by: str) -> Reloaded:
+        """Read the file, and poll what it says now, or go on as before and say why."""
+        async with self._turn:
+            _log.info("reload, asked for by %s", by)
+            self._gateway.notifier.tell_reloading()
+            try:
+                told = await self._carry_out()
+            except Exception as failure:  # whatever it is, the old plant goes on
+                told = self._refused(failure)
+            self._gateway.notifier.tell("READY=1", self._gateway.status)
+            return told
+
+    async def _carry_out(self) -> Reloaded:
+        gateway, poller = self._gateway, self._gateway.poller
+        if self._read is None or poller is None:
+            return Reloaded(False, NO_FILE)
+        plant, settings = await _beside(self._read)
+        planned = await _beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
+        self._is_settled.clear()
+        try:
+            unopened = await _beside(partial(poller.adopt, plant))
+            self._take_up(poller, settings, planned)
+        except Exception:
+            if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
+                self._take_up(poller, gateway.settings, None)
+            raise
+        finally:
+            self._is_settled.set()
+        gateway.note_unopened(unopened)
+        self.mistakes, self.restart = (), tuple(_after_restart(self._begun_with, plant.serve))
+        for sentence in self.restart:
+            _log.warning("%s", sentence)
+        _log.info("the plant file is in effect: revision %d", gateway.revision)
+        return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
+
+    def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
+        """Go on with the plant that is polled now, and with what of its settings needs no restart."""
+        gateway, plant = self._gateway, poller.plant
+        gateway.hand_out(poller)  # rows of those that left
+        there = {polled.drive.name for line in plant.lines for polled in line.drives}
+        for name in set(gateway.hub.drives) - there:
+            gateway.forget(name)
+        gateway.plant = plant
+        gateway.revision += 1
+        self._take_up_rights(settings)
+        gateway.side_reads.begin_anew()
+        gateway.guarded("hub", gateway.hub.adopt, plant, planned)
+        gateway.guarded("statistics", gateway.lately.adopt, plant, planned)
+        for name, feed in gateway.feeds.items():
+            if hasattr(feed, "adopt"):
+                gateway.guarded(name, feed.adopt, plant)
+        gateway.guarded("frames", gateway.frames.note_news)
+
+    def _take_up_rights(self, settings: ServeSettings) -> None:
+        gateway, may = self._gateway, settings.may
+        if settings.behind_proxy != gateway.settings.behind_proxy:
+            may = may.bounded_by(gateway.settings.may)  # who counts as being on this machine changes later
+        gateway.settings = replace(gateway.settings, names=settings.names, tokens=settings.tokens, may=may)
+        gateway.commands.may = may
+        gateway.own_names.replace(settings.names)
+        gateway.tokens.replace(settings.tokens)
+
+    def _refused(self, failure: Exception) -> Reloaded:
+        if not isinstance(failure, (ValueError, OSError)):
+            _log.exception("a reload failed")
+        mistakes = failure.mistakes if isinstance(failure, PlantError) else (_sentence(failure),)
+        for mistake in mistakes:
+            _log.error("the plant goes on as before: %s", mistake)
+        self.mistakes = tuple(mistakes)
+        return Reloaded(False, "the plant goes on as before: the file has mistakes", self.mistakes)
+
+
+async def _beside(work: Callable[[], R]) -> R:
+    """Return what work returns, in a thread of its own: all others may be busy."""
+    own = ThreadPoolExecutor(1, "multidrop reload")
+    try:
+        return await asyncio.get_running_loop().run_in_executor(own, work)
+    finally:
+        own.shutdown(wait=False)
+
+
+def _sentence(failure: Exception) -> str:
+    return str(failure) or type(failure).__name__
+
+
+def _after_restart(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each key of [serve] that has changed, and that a running gateway keeps."""
+    changed = [
+        key
+        for key in dict.fromkeys((*before, *now))
+        if key not in AT_ONCE and before.get(key) != now.get(key)
+    ]
+    tables = {key for key in changed if isinstance(now.get(key, before.get(key)), dict)}
+    return [f"[serve.{key}] {RESTART}" if key in tables else f"{key} of [serve] {RESTART}" for key in changed]

@@ -1,0 +1,66 @@
+"""A port that is not there when the gateway starts: its line is lost, and the others are polled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from gateways import Served, plant_text, running, tokens, written
+from lines import until
+
+from multidrop import InvtCHE, load_plant
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.settings import read_settings
+from multidrop.sim import Simulator, Wire, simulated
+
+SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
+
+
+def test_the_other_lines_are_polled_and_it_comes_when_its_port_does(tmp_path: Path) -> None:
+    port = tmp_path / "late"
+    sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
+    with Simulator([Wire([sim], unpaced=True) for sim in sims]) as simulator:
+        text = plant_text(simulator.wires[0].path, ["pump-1"])
+        text += plant_text(str(port), ["fan-1"], SERVE).replace('"hall"', '"roof"')
+        (tmp_path / "plant.toml").write_text(text)
+        plant = load_plant(tmp_path / "plant.toml")
+        gateway = Gateway(plant, read_settings(plant, {}))
+        with running(gateway):
+            served = Served(gateway, dict(zip(("pump-1", "fan-1"), sims, strict=True)), tokens()[0])
+            served.await_state("pump-1", "stands")
+            served.await_state("fan-1", "silent")
+            lost = served.frame()["lines"]["roof"]["lost"]
+            assert lost == f"{port}: there is no such port"
+            assert served.get("/api/lines").json["roof"]["lost"] == lost
+            health = served.get("/health")
+            assert (health.status, health.json["status"]) == (200, "degraded")
+            assert health.json["lines"] == {"hall": "ok", "roof": lost}
+            metrics = served.get("/metrics").body.decode()
+            assert 'multidrop_line_up{line="hall"} 1.0\n' in metrics
+            assert 'multidrop_line_up{line="roof"} 0.0\n' in metrics
+            assert served.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+
+            port.symlink_to(simulator.wires[1].path)
+            served.await_state("fan-1", "stands")
+            assert served.get("/health").json["lines"] == {"hall": "ok", "roof": "ok"}
+            until(lambda: 'multidrop_line_up{line="roof"} 1.0\n' in served.get("/metrics").body.decode())
+            until(lambda: not gateway.hub.unopened)
+            assert served.get("/health").json["status"] == "ok"
+
+
+def test_no_port_at_all_is_told_and_waited_for(tmp_path: Path) -> None:
+    plant = written(tmp_path, SERVE, port=str(tmp_path / "nosuch"))
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with running(gateway):
+        served = Served(gateway, {}, tokens()[0])
+        served.await_state("pump-1", "silent")
+        assert gateway.status == "STATUS=polling 0 lines; 1 lost"
+        assert served.get("/health").json["status"] == "degraded"
+
+
+def test_nothing_is_left_open_where_a_port_can_never_be(tmp_path: Path) -> None:
+    plant = written(tmp_path, SERVE, port="nosuch://port")
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with pytest.raises(ValueError, match="nosuch"), running(gateway):
+        pass
+    assert gateway.listener.fileno() == -1

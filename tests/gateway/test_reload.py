@@ -1,0 +1,302 @@
+"""Reload of the plant file: with mistakes all goes on as before, and without them the new plant is polled."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from broken_part import BrokenFeed
+from gateways import Answer, Served, plant_text, running, served, tokens
+from lines import HOST_LATE, PATIENCE, until
+
+from multidrop import Batch, InvtCHE, LineError, Plant, load_plant
+from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.rights import Right
+from multidrop.gateway.settings import ServeSettings, read_settings
+from multidrop.sim import Simulator, Wire, simulated
+
+MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
+
+
+def reload(gateway: Served) -> Any:
+    answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
+    assert answer.status == 200
+    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)  # a frame is made every 0.1 s
+    return answer.json
+
+
+def edit(gateway: Served, old: str, new: str) -> None:
+    """Replace a text of the plant file, which is there once."""
+    path = gateway.gateway.plant.path
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+
+
+class Rows:
+    """A part that keeps the rows of a line's drives."""
+
+    def __init__(self) -> None:
+        self.found: list[tuple[str, str, str]] = []  # drive, register, status
+        self.adopted: list[Plant] = []
+
+    def take(self, batch: Batch) -> None:
+        self.found += [(row.drive, row.register, str(row.status)) for row in batch]
+
+    def adopt(self, plant: Plant) -> None:
+        self.adopted.append(plant)
+
+    async def run(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+@contextmanager
+def two_lines(folder: Path, serve: str = MAY) -> Iterator[tuple[Served, Rows]]:
+    """A gateway of hall with pump-1 and of roof with fan-1, and its rows."""
+    secrets, known = tokens()
+    sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
+    path = folder / "plant.toml"
+
+    def read() -> tuple[Plant, ServeSettings]:
+        plant = load_plant(path)
+        return plant, replace(read_settings(plant, {}), port=0, tokens=known)
+
+    with Simulator([Wire([sim], unpaced=True) for sim in sims.values()]) as simulator:
+        hall, roof = (wire.path for wire in simulator.wires)
+        path.write_text(
+            plant_text(hall, ["pump-1"])
+            + plant_text(roof, ["fan-1"], serve).replace('name = "hall"', 'name = "roof"')
+        )
+        gateway, rows = Gateway(*read(), read=read), Rows()
+        gateway.feeds["rows"] = rows
+        with running(gateway):
+            yield Served(gateway, sims, secrets), rows
+
+
+def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        gateway.await_state("pump-2", "stands")
+        path = gateway.gateway.plant.path
+        good = path.read_text()
+        drives = [polled.drive for polled in gateway.gateway.plant.lines[0].drives]
+        path.write_text(
+            good.replace('model = "invt-che"', 'model = "invt-chf"').replace("= 38400", '= "fast"')
+        )
+        told = reload(gateway)
+        assert told["done"] is False
+        assert told["text"] == "the plant goes on as before: the file has mistakes"
+        assert [mistake.partition(": ")[0] for mistake in told["mistakes"]] == [str(path)] * 3
+        path.write_text(good + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
+        mistakes = reload(gateway)["mistakes"]
+        assert mistakes == [
+            f'{path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
+            f"{path}: [serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
+        ]
+        health = gateway.get("/health")
+        assert (health.status, health.json["status"]) == (200, "degraded")
+        assert health.json["mistakes"] == mistakes
+        plant = gateway.get("/api/plant").json
+        assert (plant["mistakes"], plant["revision"]) == (mistakes, 1)
+        assert drives == [polled.drive for polled in gateway.gateway.plant.lines[0].drives]
+        seen = gateway.frame()["drives"]["pump-2"]["seen"]
+        until(lambda: gateway.frame()["drives"]["pump-2"]["seen"] > seen)
+
+        path.unlink()
+        (mistake,) = reload(gateway)["mistakes"]
+        assert "plant.toml" in mistake
+        path.write_text(good)
+        assert reload(gateway) == {
+            "done": True,
+            "text": "plant.toml is in effect",
+            "mistakes": [],
+            "restart": [],
+        }
+        plant = gateway.get("/api/plant").json
+        assert (plant["mistakes"], plant["revision"]) == ([], 2)
+        assert gateway.get("/health").json["status"] == "ok"
+        assert drives == [polled.drive for polled in gateway.gateway.plant.lines[0].drives]
+
+
+def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) -> None:
+    with two_lines(tmp_path) as (gateway, rows):
+        gateway.await_state("fan-1", "stands")
+        (pump,) = gateway.gateway.plant.lines[0].drives
+        gateway.sims["fan-1"].deaf_until = float("inf")
+        gateway.await_state("fan-1", "silent")
+        edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
+        assert reload(gateway)["done"] is True
+        gateway.sims["fan-1"].deaf_until = 0.0
+        gateway.await_state("fan-2", "stands")
+        frame = gateway.frame()
+        assert (frame["revision"], frame["drives"].keys()) == (2, {"pump-1", "fan-2"})
+        (alarm,) = [one for one in frame["alarms"] if one["drive"] == "fan-1"]
+        assert alarm["ended"] is not None
+        names = [line["drives"][0]["name"] for line in gateway.get("/api/plant").json["lines"]]
+        assert names == ["pump-1", "fan-2"]
+        assert rows.adopted == [gateway.gateway.plant]
+        assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
+        after = len(rows.found)
+        until(lambda: [row[0] for row in rows.found[after:]].count("pump-1") > 40)
+        statuses = {status for drive, _, status in rows.found if drive == "pump-1"}
+        assert "ok" in statuses
+        assert statuses <= {"ok", *HOST_LATE}
+        assert "fan-1" not in {drive for drive, _, _ in rows.found[after:]}
+        told = gateway.post("/api/stop").json
+        assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "fan-2": True}
+        until(lambda: gateway.gateway.lately.line("roof")["rate"])
+        assert gateway.gateway.failures == {}
+
+
+def test_a_port_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with two_lines(tmp_path) as (gateway, _):
+        roof = gateway.gateway.plant.lines[1].port
+        edit(gateway, roof, str(tmp_path / "nosuch"))
+        assert reload(gateway)["done"] is True
+        assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
+        assert reload(gateway)["done"] is True  # the reason stays
+        assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
+        edit(gateway, str(tmp_path / "nosuch"), roof)
+        assert reload(gateway)["done"] is True
+        gateway.await_state("fan-1", "stands")
+        until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
+
+
+def test_rights_names_and_tokens_take_effect_at_once_and_the_rest_after_a_restart(tmp_path: Path) -> None:
+    with served(tmp_path, f'[serve]\nnames = ["old.example"]\nlisten = "localhost:1"\n{MAY}') as gateway:
+        gateway.await_state("pump-1", "stands")
+        assert gateway.get("/health", host="old.example").status == 200
+        assert gateway.get("/health", host="new.example").status == 421
+        edit(gateway, "old.example", "new.example")
+        edit(gateway, "localhost:1", "localhost:2")
+        edit(gateway, 'stop = "anyone"\nwrite = ["pump-1.setpoint"]', 'write = ["pump-2.setpoint"]')
+        with gateway.gateway.plant.path.open("a") as file:
+            file.write("[serve.mqtt]\nbroker = 'mqtt://nosuch'\n")
+        restart = [
+            "listen of [serve] takes effect after a restart",
+            "[serve.mqtt] takes effect after a restart",
+        ]
+        assert reload(gateway)["restart"] == restart
+        assert gateway.get("/health").json["restart"] == restart
+        assert gateway.get("/health", host="old.example").status == 421
+        assert gateway.get("/health", host="new.example").status == 200
+        assert gateway.post("/api/stop").status == 401
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        assert gateway.get("/api/plant", **writer).json["may"]["write"] == ["pump-2.setpoint"]
+
+        def write(drive: str) -> Answer:
+            body = {"drive": drive, "register": "setpoint", "value": 10.0}
+            return gateway.post("/api/write", body, **writer)
+
+        assert write("pump-1").status == 403
+        assert write("pump-2").json["done"] is True
+        assert gateway.gateway.feeds == {}
+
+
+def test_who_counts_as_being_here_is_not_widened_before_the_restart(tmp_path: Path) -> None:
+    with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
+        edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
+        assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
+        assert gateway.post("/api/stop").status == 401
+
+
+def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        assert gateway.post("/api/reload", {"confirm": True}).status == 401
+        stopper = {"authorization": gateway.bearer(Right.STOP)}
+        assert gateway.post("/api/reload", {"confirm": True}, **stopper).status == 403
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        unconfirmed = gateway.post("/api/reload", {}, **writer)
+        assert unconfirmed.status == 400
+        assert unconfirmed.json == {
+            "error": 'a reload changes what is polled: confirm it with {"confirm": true}'
+        }
+        assert gateway.gateway.revision == 1
+
+
+def test_a_stop_of_a_drive_that_a_reload_exchanges_is_sent_to_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with two_lines(tmp_path, MAY.replace("pump-1", "fan-1")) as (gateway, _):
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
+        gateway.post("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 50.0}, **writer)
+        gateway.post("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
+        assert fan.goal
+        poller = gateway.gateway.poller
+        assert poller is not None
+        adopt, changed, answered = poller.adopt, threading.Event(), threading.Event()
+
+        def hold(plant: Plant) -> dict[str, LineError]:
+            found = adopt(plant)
+            changed.set()
+            assert answered.wait(PATIENCE)
+            return found
+
+        monkeypatch.setattr(poller, "adopt", hold)
+        old = gateway.gateway.plant.lines[1].drives[0].drive
+        edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
+        told: list[Any] = []
+        threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
+        threads[0].start()
+        assert changed.wait(PATIENCE)
+        assert old.bus is None  # nothing can be sent through it any more
+        threads += [
+            threading.Thread(target=lambda drives=drives: told.append(gateway.post("/api/stop", drives).json))
+            for drives in ({"drives": None}, {"drives": ["fan-1"]})
+        ]
+        called = gateway.gateway.commands.called
+        for thread in threads[1:]:
+            thread.start()
+        until(lambda: gateway.gateway.commands.called == called + 2)
+        answered.set()
+        for thread in threads:
+            thread.join(PATIENCE)
+        stops = [one for one in told if "fan-1" in one]
+        assert [one["fan-1"]["done"] for one in stops] == [True, True]
+        assert not fan.goal
+        assert gateway.gateway.revision == 2
+
+
+def test_a_stop_that_is_under_way_goes_on(tmp_path: Path) -> None:
+    """The reload waits for it, and exchanges the drive only then."""
+    with two_lines(tmp_path) as (gateway, _):
+        gateway.await_state("fan-1", "stands")
+        gateway.sims["fan-1"].deaf_until = float("inf")
+        told: list[Any] = []
+        stopping = threading.Thread(target=lambda: told.append(gateway.post("/api/stop").json))
+        called = gateway.gateway.commands.called
+        stopping.start()
+        until(lambda: gateway.gateway.commands.called > called)
+        edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
+        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading.start()
+        gateway.await_state("pump-1", "stands")
+        gateway.sims["fan-1"].deaf_until = 0.0
+        stopping.join(PATIENCE)
+        reloading.join(PATIENCE)
+        (stopped,) = [one for one in told if "fan-1" in one]
+        assert {name: one["done"] for name, one in stopped.items()} == {"pump-1": True, "fan-1": True}
+        assert gateway.gateway.revision == 2
+
+
+def test_a_part_that_does_not_take_it_and_a_failure_nobody_thought_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Deaf(BrokenFeed):
+        def adopt(self, plant: Plant) -> None:
+            raise RuntimeError("no plant")
+
+    with two_lines(tmp_path) as (gateway, _):
+        gateway.gateway.feeds["deaf"] = Deaf()
+        assert reload(gateway)["done"] is True
+        assert gateway.gateway.failures["deaf"] > 0
+        monkeypatch.setattr(gateway.gateway.poller, "adopt", lambda plant: 1 // 0)
+        told = reload(gateway)
+        assert (told["done"], told["mistakes"]) == (False, ["integer division or modulo by zero"])
+        assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
