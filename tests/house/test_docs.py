@@ -59,6 +59,7 @@ NOT_RUN = {
     "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
     "multidrop serve --demo": "runs until it is told to end: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is told to end: tests/gateway/test_serve.py",
+    "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line that somebody else masters: tests/cli/test_cli_sniff.py",

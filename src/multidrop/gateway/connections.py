@@ -83,7 +83,7 @@ class Connections:
         return len(self._open)
 
 
-class Listener(socket.socket):
+class CountingSocket(socket.socket):
     """A listening socket that tells `connections` of each one."""
 
     connections: Connections | None = None

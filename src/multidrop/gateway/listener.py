@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 
-from multidrop.gateway.connections import Listener
+from multidrop.gateway.connections import CountingSocket
 
 BACKLOG = 64  # connections that wait, and that are taken at once: their descriptors are not bounded yet
 
@@ -16,7 +16,7 @@ _WHY = {
 }
 
 
-def listen(host: str, port: int) -> Listener:
+def listen(host: str, port: int) -> CountingSocket:
     """Return a listening socket. Raises OSError with a sentence where the port cannot be had."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
@@ -25,7 +25,7 @@ def listen(host: str, port: int) -> Listener:
     except socket.gaierror as failure:
         raise OSError(f"listen: {host} is no address of this machine: {failure.strerror}") from failure
     # With its protocol named asyncio sets TCP_NODELAY: else each frame waits 40 ms.
-    listener = Listener(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = CountingSocket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
