@@ -43,6 +43,9 @@ class Lines(NamedTuple):
     def bus(self, line: str) -> Bus:
         return self.poller.bus(line)
 
+    async def settled(self) -> None:
+        pass  # nothing is reloaded
+
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         line, known = self.plant.find_drive(drive)
         data = await asyncio.to_thread(self.bus(line.name).ask, known, function, start, count, expiry=expiry)
