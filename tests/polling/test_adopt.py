@@ -118,7 +118,7 @@ def test_what_is_the_same_stays_the_same() -> None:
         assert made.poller.adopt(plant(hall(*pumps()), yard(*fans()))) == {}
         made.run(2)
         assert made.poller.plant == before
-        assert made.opened == ["port of hall", "port of yard"]
+        assert sorted(made.opened) == ["port of hall", "port of yard"]
         pump, _ = made.poller.bus("hall").drives
         assert pump is before.lines[0].drives[0].drive
 
@@ -199,7 +199,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
         assert_rate(rows, "pump-1", 5, 0.1)
         assert list(made.poller.statistics()) == ["yard", "hall"]
         assert [drive.name for drive in made.poller.bus("hall").drives] == ["fan-1", "fan-2"]
-        assert made.opened == ["port of hall", "port of yard"]
+        assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
 # ---- lines that come and go ----
@@ -218,7 +218,7 @@ def test_lines_come_and_go() -> None:
         rows = made.run(10)
         assert_rate(rows, "pump-1", 10, 0.1)
         assert_rate(rows, "fan-1", 10, 0.1)
-        assert made.opened == ["port of hall", "port of yard", "port of hall"]
+        assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
 def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
