@@ -79,6 +79,20 @@ def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeG
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
+def test_the_key_is_taken_as_soon_as_the_dialog_is_closed(opened: Opener) -> None:
+    """The browser moves the focus out of a closed dialog only some milliseconds later."""
+    page = opened()
+    page.keyboard.press("Shift+S")
+    assert title(page).inner_text() == "Stop all 31 drives?"
+    assert page.evaluate("""() => {
+        const key = { key: 'S', shiftKey: true, bubbles: true };
+        document.activeElement.click();
+        const isClosed = !document.querySelector('#ask').open;
+        document.activeElement.dispatchEvent(new KeyboardEvent('keydown', key));
+        return isClosed && document.querySelector('#ask').open;
+    }""")
+
+
 def test_a_stop_needs_nothing_of_the_other_parts(opened: Opener, gateway: FakeGateway) -> None:
     """A view that cannot be loaded takes all views with it, and no stop."""
     page = opened(live=False)

@@ -91,12 +91,7 @@ setTimeout(() => {
 
 find("#stopall").addEventListener("click", stopAll);
 addEventListener("keydown", event => {
-  if (
-    event.key === "S" &&
-    !event.ctrlKey &&
-    !event.metaKey &&
-    !event.altKey &&
-    !event.target.closest?.("input, select, textarea, dialog")
-  )
-    stopAll();
+  // The focus is still in the dialog for some milliseconds after that was closed.
+  const isElsewhere = find("#ask").open || event.target.closest?.("input, select, textarea");
+  if (event.key === "S" && !event.ctrlKey && !event.metaKey && !event.altKey && !isElsewhere) stopAll();
 });
