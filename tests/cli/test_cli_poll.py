@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from batches import METADATA, counting
 from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
 from examples import usually
-from lines import Faulty, line, polled
+from lines import Faulty, line, polled, until
 from recordings import recorded
 from terminals import on_terminal
 from toy import Toy
@@ -23,6 +25,15 @@ from multidrop.core import Status
 from multidrop.errors import NoReply
 from multidrop.recording import open_reader, open_writer
 from multidrop.sim import Simulator, simulated
+
+SIMULATING = """
+import sys, time
+from pathlib import Path
+from multidrop.cli.support.demo_plant import simulator
+with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
+    print("ready", flush=True)
+    time.sleep(600)
+"""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -313,6 +324,17 @@ def test_a_demo_takes_the_place_of_a_demo_only(run: Run, tmp_path: Path) -> None
     sentence = f"multidrop: {out} is there already: name another file, or remove it first\n"
     assert run("demo", "--seconds", 1, "--out", out) == (2, "", sentence)
     assert out.read_bytes() == mine
+
+
+def test_a_demo_that_is_killed_leaves_no_simulator(tmp_path: Path) -> None:
+    ports = tmp_path / "ports"
+    words = [sys.executable, "-c", SIMULATING, str(plant_file(tmp_path)), str(ports)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert (ports / "hall-1").is_symlink()
+        process.kill()
+    until(lambda: not (ports / "hall-1").is_symlink())
 
 
 # ---- on a terminal ----

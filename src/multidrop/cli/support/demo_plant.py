@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from multidrop.bus import Bus
+from multidrop.cli import main
 from multidrop.drives import MODELS
 from multidrop.errors import BadReply, Expired, NoReply, NotDone, Unconfirmed
 from multidrop.plant.model import PlantLine
@@ -53,10 +57,11 @@ def start_motors(line: PlantLine) -> None:
 
 @contextmanager
 def simulator(plant: Path, ports: Path) -> Iterator[None]:
-    """Simulate in another process: the two sides do not share an interpreter."""
-    words = [sys.executable, "-m", "multidrop", "simulate", str(plant), "--ports", str(ports)]
+    """Simulate in another process, which ends with this one: the two sides do not share an interpreter."""
+    words = [sys.executable, "-m", __name__, str(plant), "--ports", str(ports)]
+    pipe = subprocess.PIPE
     # A session of its own keeps Ctrl-C from it: it must outlive the polling.
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
         assert process.stdout is not None
         try:
             if not process.stdout.readline().startswith("ready"):
@@ -64,3 +69,18 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
             yield
         finally:
             process.terminate()
+
+
+def simulate(words: Sequence[str]) -> int:
+    """Simulate until standard input ends, which it does when the process that began this one is gone."""
+
+    def end_with_parent() -> None:
+        os.read(0, 1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    return main(["simulate", *words])
+
+
+if __name__ == "__main__":
+    sys.exit(simulate(sys.argv[1:]))
