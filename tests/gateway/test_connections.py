@@ -12,6 +12,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
+from clocks import Clock
 from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE
 
@@ -79,14 +80,6 @@ def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         client.sendall(SLOW[2])
         assert client.recv(1000).startswith(b"HTTP/1.1 408 ")
         assert gateway.get("/api/plant").status == 200
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

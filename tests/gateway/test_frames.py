@@ -8,19 +8,10 @@ import json
 from typing import Any
 
 import pytest
+from clocks import Clock
 
 from multidrop.gateway import frames as module
 from multidrop.gateway.frames import Frames
-
-
-class Clock:
-    """Monotonic seconds that the test sets."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

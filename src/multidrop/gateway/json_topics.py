@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 from multidrop import Plant
-from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.homeassistant import discovery, discovery_topic
 from multidrop.gateway.hub import SILENT
@@ -19,7 +18,6 @@ from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
 from multidrop.gateway.parts import Inside
-from multidrop.gateway.rights import Caller, Right
 
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
@@ -40,8 +38,7 @@ class JsonTopics:
         self._inside = inside
         self._hub = inside.hub
         self._plant = inside.plant
-        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
-        self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
+        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
         self._available: dict[str, bytes] = {}
 
     def _topic(self, *levels: str) -> str:

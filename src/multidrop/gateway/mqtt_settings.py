@@ -10,6 +10,7 @@ from typing import Any
 from multidrop import Plant, Register, parse_duration
 from multidrop.gateway.broker import Login, parse_broker
 from multidrop.gateway.hub import Hub
+from multidrop.gateway.rights import Caller, Right
 
 LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
@@ -56,6 +57,11 @@ class MqttSettings:
     def every_s(self) -> float:
         """Seconds between two messages of a drive."""
         return parse_duration(self.every)
+
+    @property
+    def caller(self) -> Caller:
+        """Everybody who may publish to the broker, as the audit log says it."""
+        return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each file that cannot be read, and each drive that cannot be a topic."""

@@ -7,14 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 from multidrop import Plant, Register
-from multidrop.gateway.broker import parse_broker
 from multidrop.gateway.commands import Told
 from multidrop.gateway.hub import SILENT
 from multidrop.gateway.mqtt_settings import MqttSettings, fresh_values
 from multidrop.gateway.orders import Orders
 from multidrop.gateway.outbox import Publication
 from multidrop.gateway.parts import Inside
-from multidrop.gateway.rights import Caller, Right
 from multidrop.gateway.sparkplug import (
     BIRTH_DEATH,
     NAMESPACE,
@@ -45,8 +43,7 @@ class SparkplugNode:
         self._plant = inside.plant
         self._utc_ms = utc_ms
         self._node = settings.node or inside.plant.path.stem
-        caller = Caller(settings.user or "anyone", "mqtt", parse_broker(settings.broker).host, Right.WRITE)
-        self._orders = Orders(inside.commands, caller, utc_ms, self._tell)
+        self._orders = Orders(inside.commands, settings.caller, utc_ms, self._tell)
         self._birth = -1  # bdSeq
         self._seq = 0
         self._said: dict[str, dict[str, Value]] = {}  # by drive that is born
