@@ -99,6 +99,7 @@ def make_day(folder: Path, hours: int) -> None:
                 copy_out(database, query, folder / kind / file_name(number, number, *span), {})
         made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the end of the day once more, growing
         recorded(database, folder, segments)
+    compact(folder, 0)  # one file of tens for each hour that is over
 
 
 def asked(ask: Callable[[], object]) -> tuple[float, float, float, float]:
