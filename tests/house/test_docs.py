@@ -53,6 +53,7 @@ NOT_RUN = {
     ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares what does not change",
     "mbpoll": "is another program: tests/modbus_server/test_masters.py runs it",
     "tshark": "is another program: tests/capture/test_capture.py runs it",
+    "multidrop demo --web": "runs until it is told to end: tests/gateway/test_serve.py",
     "multidrop demo": "takes ten seconds: tests/cli and .ci/run run it",
     "multidrop plot demo.arrows": "needs the demo's recording",
     "multidrop report demo.arrows": "needs the demo's recording",
