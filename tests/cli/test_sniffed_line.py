@@ -108,6 +108,8 @@ def mastered(hear: Callable[[bytes], bytes] = bytes) -> tuple[list[Said], list[d
 
 
 def told_as_said(told: dict[str, Any]) -> Said:
+    if "values" not in told and told["result"] != "refused":
+        pytest.fail(f"heard, and not understood: {told}")
     values = -told["exception"] if told["result"] == "refused" else list(told["values"].values())
     return told["address"], told["function"], values
 
