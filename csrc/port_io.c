@@ -139,6 +139,15 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
     }
 }
 
+/* A client that reads again and again comes back while the line is still silent. The thread wakes when that is
+ * over, and the client need not wake it. */
+static int64_t expect_client(const struct md_turn *turn, int64_t wake_ns, int64_t now_ns)
+{
+    int64_t silent_ns = md_line_silent_ns(&turn->line);
+    int may_come = turn->whose == MD_NOBODYS && turn->last == MD_URGENT;
+    return may_come && silent_ns - now_ns > MD_MOST_LATENESS ? sooner(wake_ns, silent_ns) : wake_ns;
+}
+
 int64_t md_port_advance(struct md_port *port, int64_t now_ns)
 {
     struct md_turn *turn = &port->turn;
@@ -152,6 +161,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
         turn->has_done_urgent = 0;
         pthread_cond_broadcast(&engine->changed);
     }
+    wake_ns = expect_client(turn, wake_ns, now_ns);
     port->is_empty = 0;
     port->is_blind = want == MD_WAIT || (port->is_blind && want != MD_READ);
     if (port->is_blind && wake_ns - now_ns > WORTH_BLINDNESS)
