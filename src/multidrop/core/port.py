@@ -10,7 +10,7 @@ from typing import Any
 from weakref import finalize
 
 from multidrop._core import ffi, lib
-from multidrop.core.exchange import Completion, Exchange, Peer, completion
+from multidrop.core.exchange import Completion, Exchange, Peer
 from multidrop.core.fork import register_at_fork
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.tap import Tap
@@ -204,4 +204,4 @@ class Port:
         self._kept.add(exchange.peer)  # a late reply may come
         found = ffi.new("struct md_completion *")
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
-        return completion(found)
+        return Completion(found)
