@@ -17,12 +17,12 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import check_own, check_own_text
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Echo, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_drive, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
@@ -269,10 +269,8 @@ class Bus:
 
     def read_many(self, drive: Drive, registers: Iterable[Register[Any]]) -> dict[str, Any]:
         """Return values by register name, in as few exchanges as the family allows; raises as `read`."""
-        registers = tuple(registers)
-        for register in registers:
-            check_own(drive, register)
-        return self._exchanges.values(drive, registers, READ_ATTEMPTS)
+        check_drive(drive)
+        return self._exchanges.values(drive, tuple(registers), READ_ATTEMPTS)
 
     def read_text(self, drive: Drive, text: Text) -> str:
         """Return a text of the drive, such as its serial number.

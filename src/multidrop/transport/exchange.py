@@ -18,6 +18,7 @@ from multidrop.core import (
     build_request,
 )
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_own
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
@@ -29,7 +30,14 @@ from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import mixed_up, silence_hint
-from multidrop.transport.prepared import NO_ROWS, PreparedRead, PreparedReads, make_exchange, make_read
+from multidrop.transport.prepared import (
+    NO_ROWS,
+    PreparedRead,
+    PreparedReads,
+    ReadPlan,
+    make_exchange,
+    make_read,
+)
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -119,14 +127,18 @@ class Exchanges:
         NoValue where a register has none.
         """
         prepared = self._prepare(drive)
+        reads, names = self._plan(drive, prepared, tuple(registers))
         found: dict[str, Any] = {}
-        wanted = list(reversed(prepared.of(tuple(registers))))
+        wanted = list(reads)
         while wanted:
             read = wanted.pop()
-            parts = prepared.parts.get(read.block)
+            parts = prepared.parts.get(read.block) if prepared.parts else None
             if parts is None:
+                exchange = read.exchange
+                if insists:
+                    exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
                 try:
-                    found.update(self._values(drive, read, attempts, insists, timeout))
+                    found |= read.decode(self._ask(drive, exchange, attempts))
                     if read.may_be_too_long:
                         prepared.answered.add(read.block)
                     continue
@@ -136,15 +148,7 @@ class Exchanges:
                         raise
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
-        return _with_values(drive, {register.name: found[register.name] for register in registers})
-
-    def _values(
-        self, drive: Drive, read: PreparedRead, attempts: int, insists: bool, timeout: float
-    ) -> dict[str, Any]:
-        exchange = read.exchange
-        if insists:
-            exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
-        return read.decode(self._ask(drive, exchange, attempts).data)
+        return _with_values(drive, {name: found[name] for name in names})
 
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
@@ -181,7 +185,16 @@ class Exchanges:
         """Return a text, read in as many requests as its family's limit makes it."""
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
-        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
+        return text.decode(b"".join(self._ask(drive, read, attempts) for read in reads))
+
+    @staticmethod
+    def _plan(drive: Drive, prepared: PreparedReads, registers: tuple[Register[Any], ...]) -> ReadPlan:
+        try:
+            return prepared.of(registers)
+        except TypeError:  # what cannot be looked up is no register
+            for register in registers:
+                check_own(drive, register)
+            raise
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
@@ -204,11 +217,11 @@ class Exchanges:
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
-            return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
+            return register.decode(b"".join(self._ask(drive, read, 1) for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return _with_values(drive, read.decode(self._ask(drive, insisting, 1).data))[register.name]
+        return _with_values(drive, read.decode(self._ask(drive, insisting, 1)))[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
         """Return the data of the reply to any read, sent once, and begun within so many seconds."""
@@ -228,14 +241,17 @@ class Exchanges:
         if completion.result > 0:  # an exception also says that the drive is there
             self._answered_on[drive] = self.line.queue
 
-    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
-        """Return the reply to a read, which is sent again where it is lost."""
+    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> bytes:
+        """Return the data of the reply to a read, which is sent again where it is lost."""
         while True:
             attempts -= 1
             completion = self._carry_out(exchange)
             self._note_answer(drive, completion)
+            data = completion.data
+            if data is not None:
+                return data
             try:
-                return self.reply(drive, completion)
+                return self.reply(drive, completion).data  # raises
             except (NoReply, BadReply):
                 if not attempts:
                     raise
@@ -299,10 +315,9 @@ class Exchanges:
 
 def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
     """Return what was found; NoValue where the drive gave no value for one."""
-    for name, value in found.items():
-        if value is None:
-            known = {name: value for name, value in found.items() if value is not None}
-            raise NoValue(drive.name, name, known)
+    if None in found.values():
+        known = {name: value for name, value in found.items() if value is not None}
+        raise NoValue(drive.name, next(name for name in found if name not in known), known)
     return found
 
 

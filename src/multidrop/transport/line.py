@@ -42,6 +42,8 @@ _TRANSACTIONS = {
     TransactionIds.IGNORE: Transactions.IGNORED,
 }
 
+_LOST = (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
+
 # struct serial_icounter_struct of linux/serial.h
 _TIOCGICOUNT = 0x545D
 _ICOUNTER = struct.Struct("20i")
@@ -268,13 +270,14 @@ class Line:
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            is_lost = found.result == Failure.LATE_ANSWER_DUE and core.lost
+            result = found.result
+            is_lost = result in _LOST or (result == Failure.LATE_ANSWER_DUE and core.lost)
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
             self._log_frames(exchange, found)
-        if is_lost or found.result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED):
-            failure = self._failure(found.result, found.error, found.raw)
+        if is_lost:
+            failure = self._failure(result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
