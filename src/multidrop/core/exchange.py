@@ -173,18 +173,15 @@ class Exchange:
 class Completion:
     """The result of an exchange (struct md_completion), read where it is asked for.
 
-    Times are CLOCK_MONOTONIC, in ns.
+    Times are CLOCK_MONOTONIC, in ns. `result` is the reply's length; 0 after a broadcast, else a Failure or a
+    FrameFault.
     """
 
-    __slots__ = ("_c",)
+    __slots__ = ("_c", "result")
 
     def __init__(self, found: Any) -> None:
         self._c = found
-
-    @property
-    def result(self) -> int:
-        """The reply's length; 0 after a broadcast, else a Failure or a FrameFault."""
-        return int(self._c.result)
+        self.result: int = found.result
 
     @property
     def error(self) -> int:
@@ -230,7 +227,7 @@ class Completion:
     def data(self) -> bytes | None:
         """Data of the good reply; None where there is none, or an exception."""
         reply = self._c.reply
-        if self._c.result <= 0 or reply.exception:
+        if self.result <= 0 or reply.exception:
             return None
         return bytes(ffi.buffer(reply.data, reply.data_len))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
+from operator import add, itemgetter, mul, truediv
 from struct import Struct
 from typing import Any
 
@@ -50,6 +50,7 @@ class BlockDecoder:
         self._multipliers, self._addends, self._divisors = (
             tuple(register.coding.factors[which] for register in plain) for which in range(3)
         )
+        self._is_affine = any(self._addends) or any(factor != 1 for factor in self._multipliers)
         self._whole = [  # a float would not hold it
             (register.name, at)
             for at, register in enumerate(plain)
@@ -62,13 +63,11 @@ class BlockDecoder:
         if len(data) < self._numbers.size:
             return {register.name: register.value_in(data, at) for register, at in self._places}
         counts = self._numbers.unpack_from(data)
-        scaled = zip(self.plain, counts, self._multipliers, self._addends, self._divisors, strict=True)
-        found: dict[str, Any] = {
-            name: (count * multiplier + addend) / divisor + 0.0  # never -0.0
-            for name, count, multiplier, addend, divisor in scaled
-        }
+        if self._is_affine:
+            counts = tuple(map(add, map(mul, counts, self._multipliers), self._addends))
+        found: dict[str, Any] = dict(zip(self.plain, map(truediv, counts, self._divisors), strict=True))
         for name, at in self._whole:
-            found[name] = counts[at] * self._multipliers[at] + self._addends[at]
+            found[name] = counts[at]
         for name, decode in self._named:
             found[name] = decode(found[name])
         for register, at in self._others:

@@ -199,7 +199,7 @@ class Exchanges:
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
         made_for = (
-            self.peer(drive),
+            self._peers.get(drive),
             self.line.queue,
             drive.address,
             drive.framing,
@@ -247,8 +247,7 @@ class Exchanges:
             attempts -= 1
             completion = self._carry_out(exchange)
             self._note_answer(drive, completion)
-            data = completion.data
-            if data is not None:
+            if (data := completion.data) is not None:
                 return data
             try:
                 return self.reply(drive, completion).data  # raises

@@ -42,8 +42,6 @@ _TRANSACTIONS = {
     TransactionIds.IGNORE: Transactions.IGNORED,
 }
 
-_LOST = (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
-
 # struct serial_icounter_struct of linux/serial.h
 _TIOCGICOUNT = 0x545D
 _ICOUNTER = struct.Struct("20i")
@@ -52,6 +50,11 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 _log = logging.getLogger("multidrop.line")
+
+
+def _is_lost(core: Port, result: int) -> bool:
+    is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
+    return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
 
 
 class Line:
@@ -270,14 +273,13 @@ class Line:
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            result = found.result
-            is_lost = result in _LOST or (result == Failure.LATE_ANSWER_DUE and core.lost)
+            is_lost = found.result < 0 and _is_lost(core, found.result)
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
             self._log_frames(exchange, found)
         if is_lost:
-            failure = self._failure(result, found.error, found.raw)
+            failure = self._failure(found.result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
