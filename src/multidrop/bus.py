@@ -22,7 +22,7 @@ from multidrop.control.writer import Writer
 from multidrop.core import Echo, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
-from multidrop.drive.own import check_drive, check_own_text
+from multidrop.drive.own import check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
@@ -269,8 +269,13 @@ class Bus:
 
     def read_many(self, drive: Drive, registers: Iterable[Register[Any]]) -> dict[str, Any]:
         """Return values by register name, in as few exchanges as the family allows; raises as `read`."""
-        check_drive(drive)
-        return self._exchanges.values(drive, tuple(registers), READ_ATTEMPTS)
+        wanted = tuple(registers)
+        try:
+            return self._exchanges.values(drive, wanted, READ_ATTEMPTS)
+        except TypeError:  # what cannot be looked up is no register, or no drive
+            for register in wanted:
+                check_own(drive, register)
+            raise
 
     def read_text(self, drive: Drive, text: Text) -> str:
         """Return a text of the drive, such as its serial number.

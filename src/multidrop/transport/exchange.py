@@ -18,7 +18,7 @@ from multidrop.core import (
     build_request,
 )
 from multidrop.drive.family import Drive
-from multidrop.drive.own import check_own
+from multidrop.drive.own import check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
@@ -34,7 +34,6 @@ from multidrop.transport.prepared import (
     NO_ROWS,
     PreparedRead,
     PreparedReads,
-    ReadPlan,
     make_exchange,
     make_read,
 )
@@ -101,6 +100,7 @@ class Exchanges:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
         peer = self._peers.get(drive)
         if peer is None:
+            check_drive(drive)
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
         return peer
 
@@ -127,7 +127,7 @@ class Exchanges:
         NoValue where a register has none.
         """
         prepared = self._prepare(drive)
-        reads, names = self._plan(drive, prepared, tuple(registers))
+        reads, names = prepared.of(tuple(registers))
         found: dict[str, Any] = {}
         wanted = list(reads)
         while wanted:
@@ -148,7 +148,9 @@ class Exchanges:
                         raise
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
-        return _with_values(drive, {name: found[name] for name in names})
+        if None in found.values():
+            raise _no_value(drive, {name: found[name] for name in names})
+        return found if tuple(found) == names else {name: found[name] for name in names}
 
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
@@ -187,19 +189,11 @@ class Exchanges:
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
         return text.decode(b"".join(self._ask(drive, read, attempts) for read in reads))
 
-    @staticmethod
-    def _plan(drive: Drive, prepared: PreparedReads, registers: tuple[Register[Any], ...]) -> ReadPlan:
-        try:
-            return prepared.of(registers)
-        except TypeError:  # what cannot be looked up is no register
-            for register in registers:
-                check_own(drive, register)
-            raise
-
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
+        peer = self._peers.get(drive) or self.peer(drive)
         made_for = (
-            self._peers.get(drive),
+            peer,
             self.line.queue,
             drive.address,
             drive.framing,
@@ -209,7 +203,7 @@ class Exchanges:
         )
         prepared = self._prepared.get(drive)
         if prepared is None or prepared.made_for != made_for:
-            prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
+            prepared = self._prepared[drive] = PreparedReads(drive, peer, made_for)
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
@@ -221,7 +215,10 @@ class Exchanges:
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return _with_values(drive, read.decode(self._ask(drive, insisting, 1)))[register.name]
+        found = read.decode(self._ask(drive, insisting, 1))
+        if None in found.values():
+            raise _no_value(drive, found)
+        return found[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
         """Return the data of the reply to any read, sent once, and begun within so many seconds."""
@@ -312,12 +309,10 @@ class Exchanges:
         raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
 
 
-def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
-    """Return what was found; NoValue where the drive gave no value for one."""
-    if None in found.values():
-        known = {name: value for name, value in found.items() if value is not None}
-        raise NoValue(drive.name, next(name for name in found if name not in known), known)
-    return found
+def _no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
+    """Return the error that says for which register the drive gave no value, with the others'."""
+    known = {name: value for name, value in found.items() if value is not None}
+    return NoValue(drive.name, next(name for name in found if name not in known), known)
 
 
 def _port_of(drive: Drive) -> str:

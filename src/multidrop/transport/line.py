@@ -83,7 +83,9 @@ class Line:
         self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
-        self._core: Port | None = None  # dropped before the descriptor that it looks at
+        # Of the core, to queue exchanges on; None while it is closed. Dropped before the descriptor that it
+        # looks at.
+        self.queue: Port | None = None
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
         self._is_loss_logged = False
@@ -102,7 +104,7 @@ class Line:
         self._make_locks()
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
-        self._core = None
+        self.queue = None
         if self._bridge:
             self._bridge.forget()
             self._bridge = None
@@ -128,7 +130,7 @@ class Line:
             core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
-            self._core = core
+            self.queue = core
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except NoSuchPort:
@@ -162,7 +164,7 @@ class Line:
         The port itself, which may take its time, is closed by `close` or `reopen`.
         """
         with self._lock:
-            core, self._core = self._core, None
+            core, self.queue = self.queue, None
             if core is None:
                 return
             if core.lost:
@@ -205,7 +207,7 @@ class Line:
     @property
     def is_lost(self) -> bool:
         """True when the port failed, and was neither opened again nor closed since."""
-        core = self._core
+        core = self.queue
         return not self._is_over and (core is None or core.lost)
 
     def regain(self) -> None:
@@ -226,8 +228,8 @@ class Line:
         """Give this tap, and no other any more, all bytes that go over the line."""
         with self._lock:
             self._tap = tap
-            if self._core:
-                self._core.tap(tap)
+            if self.queue:
+                self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
         """Prepare for exchanges with these settings: a bridged port can have only one kind of them.
@@ -256,8 +258,8 @@ class Line:
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
         with self._lock:
-            if self._core:
-                self._core.inherit(peer, before)
+            if self.queue:
+                self.queue.inherit(peer, before)
             else:
                 peer.inherit(before)
 
@@ -265,11 +267,11 @@ class Line:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
-        if self._core and self._bridge and self._settings != exchange.settings:
+        if self.queue and self._bridge and self._settings != exchange.settings:
             self.require(exchange.settings)
         self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
         try:
-            core = self._core
+            core = self.queue
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
@@ -300,7 +302,7 @@ class Line:
             return LineError(
                 self.port, f"the port does not take the {refused_names(error)} that the drive needs"
             )
-        if self._core is None or self.why_closing:
+        if self.queue is None or self.why_closing:
             return self._closed()
         why = os.strerror(error) if error else "hung up"
         if error == errno.EPROTO:
@@ -336,9 +338,4 @@ class Line:
     @property
     def has_echo(self) -> bool:
         """True where the adapter is known to repeat what is sent."""
-        return self._core is not None and self._core.has_echo
-
-    @property
-    def queue(self) -> Port | None:
-        """Port of the core, to queue exchanges on; None while it is closed."""
-        return self._core
+        return self.queue is not None and self.queue.has_echo
