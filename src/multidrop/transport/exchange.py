@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from multidrop.core import (
-    STATUSES,
     Completion,
     Exchange,
     Failure,
@@ -22,14 +21,13 @@ from multidrop.drive.own import check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached, NoValue
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import mixed_up, silence_hint
 from multidrop.transport.prepared import (
     NO_ROWS,
     PreparedRead,
@@ -37,6 +35,7 @@ from multidrop.transport.prepared import (
     make_exchange,
     make_read,
 )
+from multidrop.transport.replies import good_reply, no_reply, no_value
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -149,7 +148,7 @@ class Exchanges:
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
         if None in found.values():
-            raise _no_value(drive, {name: found[name] for name in names})
+            raise no_value(drive, {name: found[name] for name in names})
         return found if tuple(found) == names else {name: found[name] for name in names}
 
     def _parts(
@@ -217,7 +216,7 @@ class Exchanges:
         insisting = make_read(other, block, self.peer(drive), insists=True)
         found = read.decode(self._ask(drive, insisting, 1))
         if None in found.values():
-            raise _no_value(drive, found)
+            raise no_value(drive, found)
         return found[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
@@ -232,7 +231,7 @@ class Exchanges:
         self._note_answer(drive, completion)
         if completion.raw == build_request(drive.framing, request) and not self.line.has_echo:
             raise BadReply(drive.name, "the reply is a copy of the request, as an echo is", completion.raw)
-        return self.reply(drive, completion).data
+        return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
         if completion.result > 0:  # an exception also says that the drive is there
@@ -247,7 +246,7 @@ class Exchanges:
             if (data := completion.data) is not None:
                 return data
             try:
-                return self.reply(drive, completion).data  # raises
+                return good_reply(drive, completion).data  # raises
             except (NoReply, BadReply):
                 if not attempts:
                     raise
@@ -279,7 +278,7 @@ class Exchanges:
         )
         completion = self._carry_out(made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
-            raise _no_reply(drive, completion)
+            raise no_reply(drive, completion)
         return completion
 
     def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
@@ -294,33 +293,3 @@ class Exchanges:
         until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
         clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
-
-    @staticmethod
-    def reply(drive: Drive, completion: Completion) -> Message:
-        """Return the good reply; raises NoReply, BadReply or DriveRefused."""
-        result, reply = completion.result, completion.reply
-        if result > 0 and not reply.exception:
-            return reply
-        if result > 0:
-            raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
-        if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
-            raise _no_reply(drive, completion)
-        advice = mixed_up(_port_of(drive), completion.raw)
-        raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
-
-
-def _no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return the error that says for which register the drive gave no value, with the others'."""
-    known = {name: value for name, value in found.items() if value is not None}
-    return NoValue(drive.name, next(name for name in found if name not in known), known)
-
-
-def _port_of(drive: Drive) -> str:
-    return drive.bus.line.port if drive.bus else ""
-
-
-def _no_reply(drive: Drive, completion: Completion) -> NoReply:
-    if drive.framing is Framing.TCP and completion.raw:
-        code = completion.raw[-1]
-        return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
-    return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))

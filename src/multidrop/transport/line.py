@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import logging
 import os
-import struct
 import threading
 from contextlib import suppress
 
 import serial
 
 from multidrop.core import (
-    STATUSES,
     Completion,
     Echo,
     Exchange,
@@ -23,7 +20,6 @@ from multidrop.core import (
     Tap,
     TransactionIds,
     Transactions,
-    build_request,
     must_take,
     refused_names,
 )
@@ -33,19 +29,16 @@ from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, log_aside
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
+from multidrop.transport.frame_log import log_frames
 from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
+from multidrop.transport.overruns import overruns
 
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
     TransactionIds.MATCH: Transactions.MATCHED,
     TransactionIds.IGNORE: Transactions.IGNORED,
 }
-
-# struct serial_icounter_struct of linux/serial.h
-_TIOCGICOUNT = 0x545D
-_ICOUNTER = struct.Struct("20i")
-_OVERRUN, _BUF_OVERRUN = 7, 10
 
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
@@ -279,23 +272,12 @@ class Line:
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
-            self._log_frames(exchange, found)
+            log_frames(_log, self.port, exchange, found)
         if is_lost:
             failure = self._failure(found.result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
-
-    def _log_frames(self, exchange: Exchange, found: Completion) -> None:
-        """Log both frames: direction, CLOCK_MONOTONIC in s, bytes, meaning."""
-        if found.sent_ns:
-            frame = build_request(exchange.framing, exchange.request).hex(" ").upper()
-            at = found.sent_ns / 1e9
-            log_aside(_log, logging.DEBUG, "%s > %.6f %s %s", self.port, at, frame, exchange.request)
-        meaning = found.reply if found.result > 0 else STATUSES[-found.result]
-        at = (found.first_ns or found.begun_ns) / 1e9
-        came = found.raw.hex(" ").upper() or "nothing"
-        log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self.port, at, came, meaning)
 
     def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
@@ -325,15 +307,10 @@ class Line:
 
         None while it is closed, and where the driver does not count them.
         """
-        counts = bytearray(_ICOUNTER.size)
         try:
-            if self._bridge or not self._serial:
-                return None
-            fcntl.ioctl(self._serial.fileno(), _TIOCGICOUNT, counts)
+            return None if self._bridge or not self._serial else overruns(self._serial.fileno())
         except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
             return None
-        found = _ICOUNTER.unpack(counts)
-        return int(found[_OVERRUN] + found[_BUF_OVERRUN])
 
     @property
     def has_echo(self) -> bool:
