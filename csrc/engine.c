@@ -70,8 +70,7 @@ static void open_ports(struct md_engine *engine)
         engine->wakes[engine->count] = MD_NEVER;
         engine->ports[engine->count++] = port;
     }
-    if (engine->arriving)
-        pthread_cond_broadcast(&engine->changed);
+    engine->has_news |= engine->arriving != NULL;
     engine->arriving = NULL;
 }
 
@@ -89,8 +88,7 @@ static void close_ports(struct md_engine *engine)
         engine->ports[i] = last;
         engine->wakes[i] = engine->wakes[engine->count];
         last->index = i;
-        port->is_closed = 1;
-        pthread_cond_broadcast(&engine->changed);
+        port->is_closed = engine->has_news = 1;
     }
 }
 
@@ -124,7 +122,11 @@ static void *run(void *argument)
     pthread_mutex_lock(&engine->mutex);
     for (;;) {
         int64_t until_ns = earliest(engine);
+        int has_news = engine->has_news;
+        engine->has_news = 0;
         pthread_mutex_unlock(&engine->mutex);
+        if (has_news) /* not before: they would wake for nothing but to wait for the mutex */
+            pthread_cond_broadcast(&engine->changed);
         while (atomic_load(&engine->callers)) /* yield: otherwise this thread would always win the mutex */
             sched_yield();
         int n = wait_until(engine, ready, until_ns);

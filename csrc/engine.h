@@ -27,6 +27,7 @@ struct md_engine {
     pthread_mutex_t mutex;  /* held by the thread but while it waits; guards all below, and the ports */
     atomic_int callers;     /* clients that want the mutex */
     pthread_cond_t changed; /* an urgent request is done, a port opened or closed */
+    int has_news;           /* of these: clients are to be woken */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
     struct md_port *arriving; /* clients wait for these to be opened */

@@ -83,6 +83,7 @@ void md_line_init(struct md_line *line, int64_t now_ns);
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns);
 int md_line_want(struct md_line *line, int64_t now_ns); /* enum md_want */
+int64_t md_line_silent_ns(const struct md_line *line);  /* no request leaves before then */
 /* The port took bytes, some time between these two. */
 void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t now_ns);
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);

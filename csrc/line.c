@@ -198,7 +198,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->tx_at = 0;
     line->echo_due = line->echo != MD_NO_ECHO && !line->transactions;
     line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
-    line->give_up_ns = later(now_ns, line->quiet_ns + line->silence_ns) + exchange->drive->most_timeout_ns;
+    line->give_up_ns = later(now_ns, md_line_silent_ns(line)) + exchange->drive->most_timeout_ns;
     go(line, MD_BEGUN);
     md_late_resume(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
@@ -206,11 +206,16 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
         finish(line, (struct md_ending){refused, 0, 0});
 }
 
+int64_t md_line_silent_ns(const struct md_line *line)
+{
+    return line->quiet_ns + line->silence_ns;
+}
+
 int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
     case SILENCE: /* a line that babbles is not waited for without end */
-        line->wake_ns = sooner(line->quiet_ns + line->silence_ns, line->give_up_ns);
+        line->wake_ns = sooner(md_line_silent_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
             return MD_WAIT;
         go(line, MD_FELL_SILENT);

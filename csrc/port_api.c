@@ -134,6 +134,13 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->turn.progress;
 }
 
+/* The thread looks at the port by itself before anything can be sent there: it need not be woken. */
+static int is_attended(const struct md_port *port)
+{
+    return port->turn.whose != MD_NOBODYS ||
+           port->engine->wakes[port->index] <= md_line_silent_ns(&port->turn.line);
+}
+
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion)
 {
@@ -145,7 +152,8 @@ void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange,
         *completion = (struct md_completion){.result = MD_LINE_LOST};
     } else {
         md_turn_add_urgent(&port->turn, &urgent);
-        md_engine_wake(engine);
+        if (!is_attended(port))
+            md_engine_wake(engine);
         md_engine_await(engine, &urgent.is_done);
     }
     md_engine_leave(engine);

@@ -139,6 +139,14 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
     }
 }
 
+/* A client that reads again and again comes back while the line is still silent. The thread wakes when that is
+ * over, and the client need not wake it. */
+static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
+{
+    return turn->whose == MD_NOBODYS && turn->last == MD_URGENT &&
+           md_line_silent_ns(&turn->line) - now_ns > MD_MOST_LATENESS;
+}
+
 int64_t md_port_advance(struct md_port *port, int64_t now_ns)
 {
     struct md_turn *turn = &port->turn;
@@ -150,10 +158,13 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
     while (act(port, want, &wake_ns, &now_ns));
     if (turn->has_done_urgent) {
         turn->has_done_urgent = 0;
-        pthread_cond_broadcast(&engine->changed);
+        engine->has_news = 1;
     }
+    int is_expected = is_client_expected(turn, now_ns);
+    if (is_expected)
+        wake_ns = sooner(wake_ns, md_line_silent_ns(&turn->line));
     port->is_empty = 0;
-    port->is_blind = want == MD_WAIT || (port->is_blind && want != MD_READ);
+    port->is_blind = want == MD_WAIT || is_expected || (port->is_blind && want == MD_WRITE);
     if (port->is_blind && wake_ns - now_ns > WORTH_BLINDNESS)
         watch(port, 0);
     else if (!port->is_blind)

@@ -32,12 +32,12 @@ class Inherited(Line):
 
     def _open(self) -> None:
         os.set_blocking(int(self.port), False)
-        self._core = Port(int(self.port), must_take=-1)
+        self.queue = Port(int(self.port), must_take=-1)
 
     def close(self) -> None:
-        if self._core:
-            self._core.close()
-            self._core = None
+        if self.queue:
+            self.queue.close()
+            self.queue = None
 
 
 def _opened(port: str, echo: Echo, ids: TransactionIds) -> Line:

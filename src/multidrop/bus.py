@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from multidrop.control.attached import Attached
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
 from multidrop.control.eeprom_ledger import Ledger
@@ -17,12 +17,12 @@ from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
-from multidrop.control.rules import check_own, check_own_text
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Echo, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script
 from multidrop.drive.state import State
@@ -100,7 +100,6 @@ class Bus:
     def _begin(
         self, line: Line, ledger: Ledger | Path | str | None, audit: Path | str | None, expiry: float
     ) -> None:
-        self.drives: list[Drive] = []
         self.line = line
         try:
             log = AuditLog(audit) if audit else None
@@ -118,15 +117,14 @@ class Bus:
         self._meter = LineMeter(self._exchanges)
         self._last_act: LastAct | None = None
         self._is_closed = False
-        self._attaching = threading.RLock()  # one drive comes or goes at a time
+        self._attached = Attached(self, self._exchanges, self._latches, self._performer, self._stopper)
         register_at_fork(self)
 
     def forked(self) -> None:
         """Be closed in the child, where nobody stops drives."""
         self._is_closed = True
-        self._attaching = threading.RLock()
         self._latches.forked()
-        self._free(self.drives)
+        self._attached.forked()
 
     def __repr__(self) -> str:
         state = "" if self.is_open else ", closed"
@@ -171,14 +169,18 @@ class Bus:
             self.line.close()
             self._meter.freeze(overruns)
             self._records.close()
-            with self._attaching:
-                self._free(self.drives)
+            self._attached.free()
 
     def tended(self, is_tended: bool) -> None:
         """Note that a poller opens a lost port again: a stop waits for that, or else does it itself."""
         self._stopper.is_tended = is_tended
 
     # ---- the drives ----
+
+    @property
+    def drives(self) -> list[Drive]:
+        """The drives that are on the bus now."""
+        return self._attached.drives
 
     def attach(self, drive: D | type[D], address: int | None = None, **details: Any) -> D:
         """Put a drive on the bus: a family with address, name and so on, or a drive made before.
@@ -189,24 +191,7 @@ class Bus:
         """
         made = self._made(drive, address, details)
         made.take_framing_of(self.line.port)
-        with self._attaching:
-            for other in self.drives:
-                if other.address == made.address:
-                    raise ValueError(f"address {made.address} is taken by {other.name}")
-            owner = vars(made).setdefault("bus", self)  # in one step: two buses cannot both have it
-            if owner is not self and owner.is_open:
-                raise ValueError(
-                    f"{made.name} is on the bus at {owner.line.port}: detach it there first, or make another"
-                )
-            made.bus = self
-            made.perform = lambda script: self.perform(made, script)
-            made.check_identity = lambda: self.check_identity(made)
-            made.begin_call = lambda verb: self._performer.call(made, verb)
-            made.carry_out_move = self._performer.move
-            made.carry_out_stop = lambda verb, script, seconds: self._stopper.stop(made, script, seconds)
-            self._exchanges.add(made)
-            self._latches.add(made)
-            self.drives = [*self.drives, made]  # anew, for others may be going through them
+        self._attached.add(made)
         return made
 
     def _made(self, drive: D | type[D], address: int | None, details: dict[str, Any]) -> D:
@@ -229,12 +214,9 @@ class Bus:
         where it was sent, and waits until the stops that are under way are done.
         """
         self._latches.remove(drive)
-        with self._attaching:
-            self.peer(drive)
-            self.drives = [other for other in self.drives if other is not drive]
-            self._exchanges.remove(drive)
+        with self._attached.lock:
+            self._attached.remove(drive)
             self._writer.identity_check.forget(drive)
-            self._free([drive])
 
     def remember(self, before: Bus) -> None:
         """Take over what another bus, which is closed, learnt of the drives on the same serial line.
@@ -242,12 +224,6 @@ class Bus:
         Their answers to what they were asked there may still come.
         """
         self._exchanges.remember(before._exchanges)
-
-    def _free(self, drives: Iterable[Drive]) -> None:
-        """Let these drives be attached to another bus."""
-        for drive in drives:
-            if drive.bus is self:
-                del drive.bus
 
     def peer(self, drive: Drive) -> Peer:
         """Return what is learnt of this drive's answers; ValueError for a drive that is not on this bus."""
@@ -269,10 +245,13 @@ class Bus:
 
     def read_many(self, drive: Drive, registers: Iterable[Register[Any]]) -> dict[str, Any]:
         """Return values by register name, in as few exchanges as the family allows; raises as `read`."""
-        registers = tuple(registers)
-        for register in registers:
-            check_own(drive, register)
-        return self._exchanges.values(drive, registers, READ_ATTEMPTS)
+        wanted = tuple(registers)
+        try:
+            return self._exchanges.values(drive, wanted, READ_ATTEMPTS)
+        except TypeError:  # what cannot be looked up is no register, or no drive
+            for register in wanted:
+                check_own(drive, register)
+            raise
 
     def read_text(self, drive: Drive, text: Text) -> str:
         """Return a text of the drive, such as its serial number.

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from completions import completed
 from serial_server import SerialServer, pyserials_own, vanishing_pty
 
 from multidrop.cli.doctor.adapter import (
@@ -49,7 +50,7 @@ REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 def heard(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
     """Return the result of the request that nobody should answer."""
     reply = Message(0xF7, 3, exception=exception)
-    return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)
+    return completed(result, reply, raw, at_ns=1, skipped=skipped)
 
 
 @pytest.fixture

@@ -30,6 +30,14 @@ def test_ports_come_and_go_on_threads_of_their_own(tmp_path: Path, sanitizers: l
     build_and_run(tmp_path / "test_engine", *core, sanitizers=sanitizers)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+def test_a_client_that_is_back_soon_wakes_nobody(tmp_path: Path) -> None:
+    replaced = ("waiter_poll", "wakeup")
+    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    build_and_run(tmp_path / "test_wakings", *core)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(tmp_path: Path, program: str) -> None:

@@ -202,7 +202,7 @@ def test_a_lock_that_was_held_does_not_hold_a_child_up(port: str) -> None:
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        with held(bus.line._lock, bus._attaching, bus._latches._over):
+        with held(bus.line._lock, bus._attached.lock, bus._latches._over):
             assert in_child(use) is None
         assert current(bus) == 3.25
 

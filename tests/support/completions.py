@@ -6,12 +6,26 @@ from typing import Any
 
 from multidrop._core import ffi, lib
 
-from multidrop.core import EXCEPTION_STATUS, Columns, Completion, Port, RowLayout, Status
+from multidrop.core import EXCEPTION_STATUS, Columns, Completion, Message, Port, RowLayout, Status
+from multidrop.core.frame import to_c
 
 
 def new_completion(**fields: object) -> Any:
     """Return a struct md_completion."""
     return ffi.new("struct md_completion *", fields)
+
+
+def copied(found: Any) -> Completion:
+    """Return what a struct md_completion holds now: the core may write to it again."""
+    return Completion(ffi.new("struct md_completion *", found[0]))
+
+
+def completed(result: int, reply: Message, raw: bytes, *, at_ns: int, skipped: int = 0) -> Completion:
+    """Return the result of an exchange that took no time."""
+    times = dict.fromkeys(("begun_ns", "sent_ns", "first_ns", "last_ns"), at_ns)
+    found = new_completion(result=result, skipped=skipped, reply=to_c(reply)[0], raw_len=len(raw), **times)
+    found.raw[0 : len(raw)] = list(raw)
+    return Completion(found)
 
 
 def add_rows(columns: Columns, block: RowLayout, found: Any, utc_minus_monotonic_ns: int) -> bool:

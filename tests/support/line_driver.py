@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from completions import new_completion
+from completions import copied, new_completion
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Exchange, Failure, Transactions, completion
+from multidrop.core import Completion, Exchange, Failure, Transactions
 
 MS = 1_000_000
 
@@ -61,7 +61,7 @@ class LineDriver:
 
     @property
     def completion(self) -> Completion:
-        return completion(self.found)
+        return copied(self.found)
 
     @property
     def still_open(self) -> int:

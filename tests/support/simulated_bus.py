@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from completions import completed
 
 from multidrop import bus
 from multidrop.core import (
@@ -103,7 +104,7 @@ class SimulatedBus:
 
     def _completion(self, result: int, reply: Message | None = None, raw: bytes = b"") -> Completion:
         at = round(self.seconds * 1e9)
-        return Completion(result, 0, at, at, at, at, 0, 0, reply or Message(0, 0), raw)
+        return completed(result, reply or Message(0, 0), raw, at_ns=at)
 
     def attach(self, drive: Drive) -> Any:
         return self.bus.attach(drive)

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 import pytest
+from completions import copied
 from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
@@ -27,7 +28,6 @@ from multidrop.core import (
     RowQueue,
     TransactionIds,
     Transactions,
-    completion,
 )
 from multidrop.drive import Drive
 from multidrop.drive.network import speaks_tcp
@@ -165,7 +165,7 @@ class WorldPort:
     @property
     def granted(self) -> Completion | None:
         """The completion of the latest urgent exchange; None while it lasts."""
-        return completion(self._urgent.completion) if self._urgent and self._urgent.is_done else None
+        return copied(self._urgent.completion) if self._urgent and self._urgent.is_done else None
 
     def end(self) -> bool:
         with self._guard:

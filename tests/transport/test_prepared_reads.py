@@ -101,7 +101,7 @@ def test_what_a_drive_is_told_meanwhile_is_heeded(bus: Bus, name: str, value: ob
     after = bus._exchanges._prepare(drive)
     assert after is not before
     assert bus._exchanges._prepare(drive) is after
-    made = after.of(WANTED)[0].exchange
+    made = after.of(WANTED).reads[0].exchange
     assert made.settings[0] == drive.settings.baudrate
     assert made.request.address == drive.address
     assert made.c.silence_ns == round(silence(drive) * 1e9)

@@ -173,7 +173,7 @@ def test_what_the_port_lost_is_read_from_its_driver(monkeypatch: pytest.MonkeyPa
 
     with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has none
-        monkeypatch.setattr(multidrop.transport.line.fcntl, "ioctl", counts)
+        monkeypatch.setattr(multidrop.transport.overruns.fcntl, "ioctl", counts)
         assert bus.line.overruns() == 120
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import Any, TypeVar
 
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_own
 from multidrop.drive.register import Access, Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
 from multidrop.drive.table import Carrier, Kept
-from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.errors import Advice, Refused, Unsupported
 
@@ -41,32 +41,6 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
         return register.encode(value)
     except ValueError as mistake:
         raise _refusal(register, str(mistake), f"{drive.name}: {mistake}") from mistake
-
-
-def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for another family's register: the same address means something else there.
-
-    Raises TypeError for what is no register, such as a name.
-    """
-    if not isinstance(drive, Drive):
-        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
-    if not isinstance(register, Register):
-        hint = "use its attribute, or drive.register(NAME)"
-        raise TypeError(f"{register!r} is no register of {drive.name}: {hint}")
-    if drive.registers.get(register.name) is not register:
-        family = drive.title or type(drive).__name__
-        raise ValueError(f"this {register.name} is no register of {drive.name}, which is a {family}")
-
-
-def check_own_text(drive: Drive, text: Text) -> None:
-    """Raise ValueError for another family's text, TypeError for what is none."""
-    if not isinstance(drive, Drive):
-        raise TypeError(f"{drive!r} is no drive: it is what attach returns")
-    if not isinstance(text, Text):
-        raise TypeError(f"{text!r} is no text of {drive.name}: use its attribute, or drive.texts[NAME]")
-    if drive.texts.get(text.name) is not text:
-        family = drive.title or type(drive).__name__
-        raise ValueError(f"this {text.name} is no text of {drive.name}, which is a {family}")
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:

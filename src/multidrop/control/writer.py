@@ -33,6 +33,7 @@ from multidrop.errors import (
 )
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges
+from multidrop.transport.replies import good_reply
 
 ACKNOWLEDGED = 5  # the exception code of what is accepted and takes longer
 
@@ -102,7 +103,7 @@ class Writer:
         with self._logged(drive, request, what, log):
             completion = self._carry_out(drive, request, what, call)
         try:
-            reply = self._exchanges.reply(drive, completion)
+            reply = good_reply(drive, completion)
         except (NoReply, BadReply) as failure:
             log(drive, request, what, Effect.UNCONFIRMED, str(failure))
             raise Unconfirmed(drive.name, what, _reason(failure)) from failure
@@ -172,7 +173,7 @@ class Writer:
         lost: BusError | None = None
         held, unread = None, None
         try:
-            self._exchanges.reply(drive, completion)
+            good_reply(drive, completion)
         except DriveRefused as failure:
             if call is None or not _is_under_way(failure):
                 return Outcome(drive.name, register, asked, Effect.REFUSED, failure=failure)

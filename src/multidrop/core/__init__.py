@@ -17,7 +17,7 @@ from multidrop.core.columns import (
     spell,
 )
 from multidrop.core.counters import DELAY_BUCKETS, Counters, delay_edge
-from multidrop.core.exchange import Completion, Exchange, Peer, completion
+from multidrop.core.exchange import Completion, Exchange, Peer
 from multidrop.core.frame import (
     MODBUS,
     Framing,
@@ -108,7 +108,6 @@ __all__ = [
     "build_reply",
     "build_request",
     "characters_on_wire",
-    "completion",
     "crc16",
     "delay_edge",
     "get_settings",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from multidrop._core import ffi, lib
@@ -171,33 +170,74 @@ class Exchange:
         )
 
 
-@dataclass(frozen=True)
 class Completion:
-    """The result of an exchange (struct md_completion). Times are CLOCK_MONOTONIC, in ns."""
+    """The result of an exchange (struct md_completion), read where it is asked for.
 
-    result: int
-    error: int
-    begun_ns: int
-    sent_ns: int
-    first_ns: int
-    last_ns: int
-    stale: int
-    skipped: int
-    reply: Message
-    raw: bytes
+    Times are CLOCK_MONOTONIC, in ns. `result` is the reply's length; 0 after a broadcast, else a Failure or a
+    FrameFault.
+    """
 
+    __slots__ = ("_c", "result")
 
-def completion(found: Any) -> Completion:
-    """Copy a struct md_completion."""
-    return Completion(
-        found.result,
-        found.error,
-        found.begun_ns,
-        found.sent_ns,
-        found.first_ns,
-        found.last_ns,
-        found.stale,
-        found.skipped,
-        from_c(found.reply),
-        bytes(ffi.buffer(found.raw, found.raw_len)),
-    )
+    def __init__(self, found: Any) -> None:
+        self._c = found
+        self.result: int = found.result
+
+    @property
+    def error(self) -> int:
+        """An errno of a line that was lost, or the REFUSALS of settings."""
+        return int(self._c.error)
+
+    @property
+    def begun_ns(self) -> int:
+        """The time at which its turn came."""
+        return int(self._c.begun_ns)
+
+    @property
+    def sent_ns(self) -> int:
+        """The time at which the request began to leave; 0: it never did."""
+        return int(self._c.sent_ns)
+
+    @property
+    def first_ns(self) -> int:
+        """The time at which the first byte was seen after the request; 0: none came."""
+        return int(self._c.first_ns)
+
+    @property
+    def last_ns(self) -> int:
+        """The same of the last byte."""
+        return int(self._c.last_ns)
+
+    @property
+    def stale(self) -> int:
+        """Bytes that were thrown away before the request left."""
+        return int(self._c.stale)
+
+    @property
+    def skipped(self) -> int:
+        """Bytes after the request that were no part of the reply."""
+        return int(self._c.skipped)
+
+    @property
+    def reply(self) -> Message:
+        """The good reply, or an exception."""
+        return from_c(self._c.reply)
+
+    @property
+    def data(self) -> bytes | None:
+        """Data of the good reply; None where there is none, or an exception."""
+        reply = self._c.reply
+        if self.result <= 0 or reply.exception:
+            return None
+        return bytes(ffi.buffer(reply.data, reply.data_len))
+
+    @property
+    def raw(self) -> bytes:
+        """The reply's bytes; of a failure the end of what came."""
+        return bytes(ffi.buffer(self._c.raw, self._c.raw_len))
+
+    def unanswered(self) -> Completion:
+        """Return the same as one to which nothing came: the reply was the request's echo."""
+        found = ffi.new("struct md_completion *", self._c[0])
+        found.result, found.raw_len = lib.MD_NO_REPLY, 0
+        return Completion(found)

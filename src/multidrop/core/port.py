@@ -10,11 +10,12 @@ from typing import Any
 from weakref import finalize
 
 from multidrop._core import ffi, lib
-from multidrop.core.exchange import Completion, Exchange, Peer, completion
+from multidrop.core.exchange import Completion, Exchange, Peer
 from multidrop.core.fork import register_at_fork
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.tap import Tap
 
+_COMPLETION = ffi.typeof("struct md_completion *")
 now_ns = lib.md_now_ns
 utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
@@ -202,6 +203,6 @@ class Port:
         After `expires_ns` (0: never), or after a stop, it is not sent.
         """
         self._kept.add(exchange.peer)  # a late reply may come
-        found = ffi.new("struct md_completion *")
+        found = ffi.new(_COMPLETION)
         lib.md_port_carry_out(self.c, exchange.c, not_before_ns, expires_ns, found)
-        return completion(found)
+        return Completion(found)

@@ -7,9 +7,9 @@ from copy import copy
 from functools import partial
 from typing import NamedTuple
 
-from multidrop.control.rules import check_own
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
+from multidrop.drive.own import check_own
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.toml_check import check_period

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from multidrop.bus import Bus
-from multidrop.control.rules import check_own
 from multidrop.core import Exchange, Names, RowLayout
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_own
 from multidrop.drive.row_field import row_field
 from multidrop.planning.blocks import Block, Plan, plan
 from multidrop.planning.bus_time import kind, sending, silence

@@ -10,7 +10,8 @@ from multidrop.drive.family import Drive
 from multidrop.scan.identify import identify
 from multidrop.scan.results import Found
 from multidrop.scan.sweep import Sweep
-from multidrop.transport.exchange import LEAST_TIMEOUT, Exchanges
+from multidrop.transport.exchange import LEAST_TIMEOUT
+from multidrop.transport.replies import good_reply
 
 MOST_TIMEOUT = 1.0  # s: for a drive of which only the address is known
 TRIES = 3
@@ -70,7 +71,7 @@ class Probe:
             completion = self._ask(request)
             if completion.result > 0:
                 break
-        return Exchanges.reply(drive, completion)
+        return good_reply(drive, completion)
 
     def _doubt(self) -> str:
         if self.damaged:

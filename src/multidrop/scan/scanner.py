@@ -118,7 +118,7 @@ class _Scan:
             self._once(sweep, other, Message(request.address, 0x03, 0, 1), self._sweep_peer(sweep))
             completion = self._once(sweep, sweep.framing, request, peer)
             if completion.raw == build_request(sweep.framing, request):
-                return replace(completion, result=Failure.NO_REPLY, raw=b"")
+                return completion.unanswered()
         return completion
 
     def _once(self, sweep: Sweep, framing: Framing, request: Message, peer: Peer) -> Completion:

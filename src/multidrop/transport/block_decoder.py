@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
+from operator import add, itemgetter, mul, truediv
 from struct import Struct
 from typing import Any
 
@@ -33,8 +33,8 @@ class BlockDecoder:
 
     def __init__(self, block: Block) -> None:
         self._places = [(register, block.offset(register)) for register in block.registers]
-        self._plain: list[tuple[Register[Any], int, int, int, bool]] = []
         self._others: list[tuple[Register[Any], int]] = []
+        plain: list[Register[Any]] = []
         codes, end = ">", 0
         for register, at in sorted(self._places, key=itemgetter(1)):
             number_format = register.coding.number_format
@@ -43,21 +43,33 @@ class BlockDecoder:
                 continue
             codes += f"{2 * (at - end)}x{_CODES[number_format]}"
             end = at + WORDS[number_format]
-            factors = register.coding.factors
-            is_whole = factors[2] == 1 and number_format in WHOLE  # a float would not hold it
-            self._plain.append((register, *factors, is_whole))
+            plain.append(register)
         self._numbers = Struct(codes)
+        # side by side, and without the registers: a reading thread comes to them with cold caches
+        self.plain = tuple(register.name for register in plain)
+        self._multipliers, self._addends, self._divisors = (
+            tuple(register.coding.factors[which] for register in plain) for which in range(3)
+        )
+        self._is_affine = any(self._addends) or any(factor != 1 for factor in self._multipliers)
+        self._whole = [  # a float would not hold it
+            (register.name, at)
+            for at, register in enumerate(plain)
+            if self._divisors[at] == 1 and register.coding.number_format in WHOLE
+        ]
+        self._named = [(register.name, register.decode) for register in plain if register.values is not None]
 
     def decode(self, data: bytes) -> dict[str, Any]:
         """Return the values by the registers' names; None where the drive gave none."""
-        is_whole_reply = len(data) >= self._numbers.size
-        slowly = self._others if is_whole_reply else self._places
-        found = {register.name: register.value_in(data, at) for register, at in slowly}
-        if not is_whole_reply:
-            return found
+        if len(data) < self._numbers.size:
+            return {register.name: register.value_in(data, at) for register, at in self._places}
         counts = self._numbers.unpack_from(data)
-        for count, (register, multiplier, addend, divisor, is_whole) in zip(counts, self._plain, strict=True):
-            scaled = count * multiplier + addend
-            number = scaled if is_whole else scaled / divisor + 0.0  # never -0.0
-            found[register.name] = number if register.values is None else register.decode(number)
+        if self._is_affine:
+            counts = tuple(map(add, map(mul, counts, self._multipliers), self._addends))
+        found: dict[str, Any] = dict(zip(self.plain, map(truediv, counts, self._divisors), strict=True))
+        for name, at in self._whole:
+            found[name] = counts[at]
+        for name, decode in self._named:
+            found[name] = decode(found[name])
+        for register, at in self._others:
+            found[register.name] = register.value_in(data, at)
         return found

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from multidrop.core import (
-    STATUSES,
     Completion,
     Exchange,
     Failure,
@@ -18,18 +17,25 @@ from multidrop.core import (
     build_request,
 )
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached, NoValue
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
 from multidrop.planning.splitting import halves, least
 from multidrop.transport import clock
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import mixed_up, silence_hint
-from multidrop.transport.prepared import NO_ROWS, PreparedRead, PreparedReads, make_exchange, make_read
+from multidrop.transport.prepared import (
+    NO_ROWS,
+    PreparedRead,
+    PreparedReads,
+    make_exchange,
+    make_read,
+)
+from multidrop.transport.replies import good_reply, no_reply, no_value
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -93,6 +99,7 @@ class Exchanges:
         """Return what is learnt of this drive's answers; NotAttached for a drive that is not on this bus."""
         peer = self._peers.get(drive)
         if peer is None:
+            check_drive(drive)
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
         return peer
 
@@ -119,14 +126,18 @@ class Exchanges:
         NoValue where a register has none.
         """
         prepared = self._prepare(drive)
+        reads, names = prepared.of(tuple(registers))
         found: dict[str, Any] = {}
-        wanted = list(reversed(prepared.of(tuple(registers))))
+        wanted = list(reads)
         while wanted:
             read = wanted.pop()
-            parts = prepared.parts.get(read.block)
+            parts = prepared.parts.get(read.block) if prepared.parts else None
             if parts is None:
+                exchange = read.exchange
+                if insists:
+                    exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
                 try:
-                    found.update(self._values(drive, read, attempts, insists, timeout))
+                    found |= read.decode(self._ask(drive, exchange, attempts))
                     if read.may_be_too_long:
                         prepared.answered.add(read.block)
                     continue
@@ -136,15 +147,9 @@ class Exchanges:
                         raise
                 prepared.parts[read.block] = parts
             wanted += [prepared.prepare(part) for part in reversed(parts)]
-        return _with_values(drive, {register.name: found[register.name] for register in registers})
-
-    def _values(
-        self, drive: Drive, read: PreparedRead, attempts: int, insists: bool, timeout: float
-    ) -> dict[str, Any]:
-        exchange = read.exchange
-        if insists:
-            exchange = make_read(drive, read.block, exchange.peer, insists=True, timeout=timeout)
-        return read.decode(self._ask(drive, exchange, attempts).data)
+        if None in found.values():
+            raise no_value(drive, {name: found[name] for name in names})
+        return found if tuple(found) == names else {name: found[name] for name in names}
 
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
@@ -181,12 +186,13 @@ class Exchanges:
         """Return a text, read in as many requests as its family's limit makes it."""
         peer = self.peer(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
-        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
+        return text.decode(b"".join(self._ask(drive, read, attempts) for read in reads))
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return what is prepared for this drive; anew where anything that it depends on has changed."""
+        peer = self._peers.get(drive) or self.peer(drive)
         made_for = (
-            self.peer(drive),
+            peer,
             self.line.queue,
             drive.address,
             drive.framing,
@@ -196,7 +202,7 @@ class Exchanges:
         )
         prepared = self._prepared.get(drive)
         if prepared is None or prepared.made_for != made_for:
-            prepared = self._prepared[drive] = PreparedReads(drive, self.peer(drive), made_for)
+            prepared = self._prepared[drive] = PreparedReads(drive, peer, made_for)
         return prepared
 
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
@@ -204,11 +210,14 @@ class Exchanges:
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
-            return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
+            return register.decode(b"".join(self._ask(drive, read, 1) for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peer(drive))
         insisting = make_read(other, block, self.peer(drive), insists=True)
-        return _with_values(drive, read.decode(self._ask(drive, insisting, 1).data))[register.name]
+        found = read.decode(self._ask(drive, insisting, 1))
+        if None in found.values():
+            raise no_value(drive, found)
+        return found[register.name]
 
     def ask(self, drive: Drive, function: int, start: int, count: int, expiry: float) -> bytes:
         """Return the data of the reply to any read, sent once, and begun within so many seconds."""
@@ -222,20 +231,22 @@ class Exchanges:
         self._note_answer(drive, completion)
         if completion.raw == build_request(drive.framing, request) and not self.line.has_echo:
             raise BadReply(drive.name, "the reply is a copy of the request, as an echo is", completion.raw)
-        return self.reply(drive, completion).data
+        return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
         if completion.result > 0:  # an exception also says that the drive is there
             self._answered_on[drive] = self.line.queue
 
-    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Message:
-        """Return the reply to a read, which is sent again where it is lost."""
+    def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> bytes:
+        """Return the data of the reply to a read, which is sent again where it is lost."""
         while True:
             attempts -= 1
             completion = self._carry_out(exchange)
             self._note_answer(drive, completion)
+            if (data := completion.data) is not None:
+                return data
             try:
-                return self.reply(drive, completion)
+                return good_reply(drive, completion).data  # raises
             except (NoReply, BadReply):
                 if not attempts:
                     raise
@@ -267,7 +278,7 @@ class Exchanges:
         )
         completion = self._carry_out(made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
-            raise _no_reply(drive, completion)
+            raise no_reply(drive, completion)
         return completion
 
     def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
@@ -282,36 +293,3 @@ class Exchanges:
         until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
         clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
         return self.line.carry_out(made, expires_ns=expires_ns)
-
-    @staticmethod
-    def reply(drive: Drive, completion: Completion) -> Message:
-        """Return the good reply; raises NoReply, BadReply or DriveRefused."""
-        result, reply = completion.result, completion.reply
-        if result > 0 and not reply.exception:
-            return reply
-        if result > 0:
-            raise DriveRefused(drive.name, reply.exception, drive.exception(reply.exception))
-        if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
-            raise _no_reply(drive, completion)
-        advice = mixed_up(_port_of(drive), completion.raw)
-        raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
-
-
-def _with_values(drive: Drive, found: dict[str, Any]) -> dict[str, Any]:
-    """Return what was found; NoValue where the drive gave no value for one."""
-    for name, value in found.items():
-        if value is None:
-            known = {name: value for name, value in found.items() if value is not None}
-            raise NoValue(drive.name, name, known)
-    return found
-
-
-def _port_of(drive: Drive) -> str:
-    return drive.bus.line.port if drive.bus else ""
-
-
-def _no_reply(drive: Drive, completion: Completion) -> NoReply:
-    if drive.framing is Framing.TCP and completion.raw:
-        code = completion.raw[-1]
-        return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
-    return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import logging
 import os
-import struct
 import threading
 from contextlib import suppress
 
 import serial
 
 from multidrop.core import (
-    STATUSES,
     Completion,
     Echo,
     Exchange,
@@ -23,7 +20,6 @@ from multidrop.core import (
     Tap,
     TransactionIds,
     Transactions,
-    build_request,
     must_take,
     refused_names,
 )
@@ -33,8 +29,10 @@ from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, log_aside
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
+from multidrop.transport.frame_log import log_frames
 from multidrop.transport.mixed_up import mixed_up
 from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
+from multidrop.transport.overruns import overruns
 
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
@@ -42,14 +40,14 @@ _TRANSACTIONS = {
     TransactionIds.IGNORE: Transactions.IGNORED,
 }
 
-# struct serial_icounter_struct of linux/serial.h
-_TIOCGICOUNT = 0x545D
-_ICOUNTER = struct.Struct("20i")
-_OVERRUN, _BUF_OVERRUN = 7, 10
-
 LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 _log = logging.getLogger("multidrop.line")
+
+
+def _is_lost(core: Port, result: int) -> bool:
+    is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
+    return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
 
 
 class Line:
@@ -78,7 +76,9 @@ class Line:
         self._echo = echo
         self._bridge: Bridge | None = None
         self._settings: tuple[int, str] | None = None  # that a bridged port must have
-        self._core: Port | None = None  # dropped before the descriptor that it looks at
+        # Of the core, to queue exchanges on; None while it is closed. Dropped before the descriptor that it
+        # looks at.
+        self.queue: Port | None = None
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
         self._is_loss_logged = False
@@ -97,7 +97,7 @@ class Line:
         self._make_locks()
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
-        self._core = None
+        self.queue = None
         if self._bridge:
             self._bridge.forget()
             self._bridge = None
@@ -123,7 +123,7 @@ class Line:
             core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
-            self._core = core
+            self.queue = core
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except NoSuchPort:
@@ -157,7 +157,7 @@ class Line:
         The port itself, which may take its time, is closed by `close` or `reopen`.
         """
         with self._lock:
-            core, self._core = self._core, None
+            core, self.queue = self.queue, None
             if core is None:
                 return
             if core.lost:
@@ -200,7 +200,7 @@ class Line:
     @property
     def is_lost(self) -> bool:
         """True when the port failed, and was neither opened again nor closed since."""
-        core = self._core
+        core = self.queue
         return not self._is_over and (core is None or core.lost)
 
     def regain(self) -> None:
@@ -221,8 +221,8 @@ class Line:
         """Give this tap, and no other any more, all bytes that go over the line."""
         with self._lock:
             self._tap = tap
-            if self._core:
-                self._core.tap(tap)
+            if self.queue:
+                self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
         """Prepare for exchanges with these settings: a bridged port can have only one kind of them.
@@ -251,8 +251,8 @@ class Line:
     def inherit(self, peer: Peer, before: Peer) -> None:
         """Let a drive take the place of another at its address, whose answers may still come."""
         with self._lock:
-            if self._core:
-                self._core.inherit(peer, before)
+            if self.queue:
+                self.queue.inherit(peer, before)
             else:
                 peer.inherit(before)
 
@@ -260,42 +260,31 @@ class Line:
 
     def carry_out(self, exchange: Exchange, *, not_before_ns: int = 0, expires_ns: int = 0) -> Completion:
         """Carry an exchange out ahead of what is queued, and wait for it; LineError when the port fails."""
-        if self._core and self._bridge and self._settings != exchange.settings:
+        if self.queue and self._bridge and self._settings != exchange.settings:
             self.require(exchange.settings)
         self._callers.append(None)  # before the port is looked at: `drop` then waits for this thread
         try:
-            core = self._core
+            core = self.queue
             if core is None:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
-            is_lost = found.result == Failure.LATE_ANSWER_DUE and core.lost
+            is_lost = found.result < 0 and _is_lost(core, found.result)
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
-            self._log_frames(exchange, found)
-        if is_lost or found.result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED):
+            log_frames(_log, self.port, exchange, found)
+        if is_lost:
             failure = self._failure(found.result, found.error, found.raw)
             failure.is_sent = found.sent_ns > 0
             raise failure
         return found
-
-    def _log_frames(self, exchange: Exchange, found: Completion) -> None:
-        """Log both frames: direction, CLOCK_MONOTONIC in s, bytes, meaning."""
-        if found.sent_ns:
-            frame = build_request(exchange.framing, exchange.request).hex(" ").upper()
-            at = found.sent_ns / 1e9
-            log_aside(_log, logging.DEBUG, "%s > %.6f %s %s", self.port, at, frame, exchange.request)
-        meaning = found.reply if found.result > 0 else STATUSES[-found.result]
-        at = (found.first_ns or found.begun_ns) / 1e9
-        came = found.raw.hex(" ").upper() or "nothing"
-        log_aside(_log, logging.DEBUG, "%s < %.6f %s %s", self.port, at, came, meaning)
 
     def _failure(self, result: int, error: int, received: bytes) -> LineError:
         if result == Failure.SETTINGS_REFUSED:
             return LineError(
                 self.port, f"the port does not take the {refused_names(error)} that the drive needs"
             )
-        if self._core is None or self.why_closing:
+        if self.queue is None or self.why_closing:
             return self._closed()
         why = os.strerror(error) if error else "hung up"
         if error == errno.EPROTO:
@@ -318,22 +307,12 @@ class Line:
 
         None while it is closed, and where the driver does not count them.
         """
-        counts = bytearray(_ICOUNTER.size)
         try:
-            if self._bridge or not self._serial:
-                return None
-            fcntl.ioctl(self._serial.fileno(), _TIOCGICOUNT, counts)
+            return None if self._bridge or not self._serial else overruns(self._serial.fileno())
         except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
             return None
-        found = _ICOUNTER.unpack(counts)
-        return int(found[_OVERRUN] + found[_BUF_OVERRUN])
 
     @property
     def has_echo(self) -> bool:
         """True where the adapter is known to repeat what is sent."""
-        return self._core is not None and self._core.has_echo
-
-    @property
-    def queue(self) -> Port | None:
-        """Port of the core, to queue exchanges on; None while it is closed."""
-        return self._core
+        return self.queue is not None and self.queue.has_echo

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop import core
 from multidrop.core import Exchange, Message, Peer
 from multidrop.drive.family import Drive
+from multidrop.drive.own import check_own
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Block, blocks
 from multidrop.planning.bus_time import silence
@@ -57,6 +58,13 @@ class PreparedRead:
         self.decode = BlockDecoder(block).decode
 
 
+class ReadPlan(NamedTuple):
+    """Reads of a set of registers, the last one first, and the registers' names as they were asked for."""
+
+    reads: tuple[PreparedRead, ...]
+    names: tuple[str, ...]
+
+
 class PreparedReads:
     """Reads of one drive, made once and kept while all that they depend on stays as it was."""
 
@@ -68,8 +76,11 @@ class PreparedReads:
             return PreparedRead(drive, block, peer)
 
         @lru_cache(MOST_PREPARED)
-        def of(registers: tuple[Register[Any], ...]) -> tuple[PreparedRead, ...]:
-            return tuple(prepare(block) for block in blocks(drive, registers))
+        def of(registers: tuple[Register[Any], ...]) -> ReadPlan:
+            for register in registers:
+                check_own(drive, register)
+            reads = tuple(prepare(block) for block in reversed(blocks(drive, registers)))
+            return ReadPlan(reads, tuple(register.name for register in registers))
 
         self.of = of
         self.prepare = prepare

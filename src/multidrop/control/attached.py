@@ -1,0 +1,76 @@
+"""Drives that are attached to a bus, which carries out their verbs; each is on one bus at a time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from typing import Any
+
+from multidrop.control.latches import Latches
+from multidrop.control.performer import Performer
+from multidrop.control.stop_all import Stopper
+from multidrop.drive.family import Drive
+from multidrop.transport.exchange import Exchanges
+
+
+class Attached:
+    """The drives of a bus, which come and go on any thread."""
+
+    def __init__(
+        self, bus: Any, exchanges: Exchanges, latches: Latches, performer: Performer, stopper: Stopper
+    ) -> None:
+        self.drives: list[Drive] = []
+        self.lock = threading.RLock()  # one drive comes or goes at a time
+        self._bus = bus
+        self._exchanges = exchanges
+        self._latches = latches
+        self._performer = performer
+        self._stopper = stopper
+
+    def forked(self) -> None:
+        """Let them be attached to a bus of the child."""
+        self.lock = threading.RLock()
+        self._free(self.drives)
+
+    def add(self, drive: Drive) -> None:
+        """Attach a drive; ValueError where its address is taken, or it is on another bus."""
+        with self.lock:
+            for other in self.drives:
+                if other.address == drive.address:
+                    raise ValueError(f"address {drive.address} is taken by {other.name}")
+            owner = vars(drive).setdefault("bus", self._bus)  # in one step: two buses cannot both have it
+            if owner is not self._bus and owner.is_open:
+                raise ValueError(
+                    f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or make another"
+                )
+            self._give_verbs(drive)
+            self._exchanges.add(drive)
+            self._latches.add(drive)
+            self.drives = [*self.drives, drive]  # anew, for others may be going through them
+
+    def _give_verbs(self, drive: Drive) -> None:
+        bus, performer, stopper = self._bus, self._performer, self._stopper
+        drive.bus = bus
+        drive.perform = lambda script: bus.perform(drive, script)
+        drive.check_identity = lambda: bus.check_identity(drive)
+        drive.begin_call = lambda verb: performer.call(drive, verb)
+        drive.carry_out_move = performer.move
+        drive.carry_out_stop = lambda verb, script, seconds: stopper.stop(drive, script, seconds)
+
+    def remove(self, drive: Drive) -> None:
+        """Take a drive off, which nothing moves any more; NotAttached where it is not on the bus."""
+        with self.lock:
+            self._exchanges.peer(drive)
+            self.drives = [other for other in self.drives if other is not drive]
+            self._exchanges.remove(drive)
+            self._free([drive])
+
+    def free(self) -> None:
+        """Let them be attached to other buses, once this one is closed."""
+        with self.lock:
+            self._free(self.drives)
+
+    def _free(self, drives: Iterable[Drive]) -> None:
+        for drive in drives:
+            if drive.bus is self._bus:
+                del drive.bus

@@ -1,0 +1,113 @@
+/* A client wakes the engine's thread only where that would not look at the port by itself in time. */
+#include "internal.h"
+
+#include <assert.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <pthread.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+enum { WANTED = 3, MOST_TRIES = 200 };
+static const int64_t SILENCE_NS = 50000000, EARLY_NS = 80000, TIMEOUT_NS = INT64_C(5000000000);
+
+static atomic_int rings;
+
+/* ---- in place of wakeup.c ---- */
+
+int md_wakeup_make(struct md_wakeup *wakeup)
+{
+    int ends[2];
+    int made = pipe(ends);
+    *wakeup = (struct md_wakeup){.fd = ends[0], .ringer = ends[1]};
+    return made;
+}
+
+void md_wakeup_destroy(struct md_wakeup *wakeup)
+{
+    close(wakeup->fd);
+    close(wakeup->ringer);
+}
+
+void md_wakeup_ring(struct md_wakeup *wakeup)
+{
+    atomic_fetch_add(&rings, 1);
+    (void)!write(wakeup->ringer, "", 1);
+}
+
+void md_wakeup_silence(struct md_wakeup *wakeup)
+{
+    char byte;
+    (void)!read(wakeup->fd, &byte, 1);
+}
+
+/* ---- a drive that answers at once ---- */
+
+static void *answer(void *argument)
+{
+    int fd = *(int *)argument;
+    uint8_t request[8];
+    struct md_message reply = {.address = 1, .function = 3, .start = 1, .count = 1, .data_len = 2};
+    uint8_t frame[MD_KEPT_FRAME];
+    int length = md_build_reply(MD_RTU, &reply, frame, sizeof frame);
+    while (recv(fd, request, sizeof request, MSG_WAITALL) == (ssize_t)sizeof request)
+        (void)!write(fd, frame, (size_t)length);
+    return NULL;
+}
+
+/* Carry one out; return how often the thread was rung for it. */
+static int asked(struct md_port *port, const struct md_exchange *exchange, struct md_completion *found)
+{
+    int before = atomic_load(&rings);
+    md_port_carry_out(port, exchange, 0, 0, found);
+    assert(found->result > 0);
+    return atomic_load(&rings) - before;
+}
+
+int main(void)
+{
+    alarm(60); /* nobody would wake a thread that was not rung for */
+    struct md_history history = {0};
+    struct md_drive drive = {.least_timeout_ns = TIMEOUT_NS, .most_timeout_ns = TIMEOUT_NS,
+                             .history = &history};
+    struct md_exchange exchange = {.drive = &drive, .character_ns = 10000, .silence_ns = SILENCE_NS,
+                                   .framing = MD_RTU};
+    exchange.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
+    struct md_engine *engine = md_engine_start();
+    int ends[2];
+    int made = socketpair(AF_UNIX, SOCK_STREAM, 0, ends);
+    assert(engine && made == 0);
+    fcntl(ends[0], F_SETFL, O_NONBLOCK);
+    pthread_t drives;
+    pthread_create(&drives, NULL, answer, &ends[1]);
+    struct md_port *port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, 4);
+    assert(port);
+
+    /* A client that is back before the line is silent finds the thread about to wake. One that was held up for
+     * as long rings, and its request is not taken up before. */
+    struct md_completion before, found;
+    asked(port, &exchange, &before);
+    int unrung = 0;
+    for (int tries = 0; unrung < WANTED; tries++) {
+        assert(tries < MOST_TRIES);
+        int rung = asked(port, &exchange, &found);
+        int64_t silent_ns = before.last_ns + SILENCE_NS;
+        assert(rung == 0 || found.begun_ns >= silent_ns - EARLY_NS);
+        assert(found.sent_ns >= silent_ns);
+        unrung += rung == 0;
+        before = found;
+    }
+
+    /* Nobody looks at a line that has been silent for long: the thread is woken, and sends at once. */
+    poll(NULL, 0, 3 * (int)(SILENCE_NS / 1000000));
+    int rung = asked(port, &exchange, &found);
+    assert(rung == 1);
+
+    md_port_stop(port);
+    md_port_free(port);
+    close(ends[0]);
+    shutdown(ends[1], SHUT_RDWR);
+    pthread_join(drives, NULL);
+    close(ends[1]);
+    return 0;
+}
