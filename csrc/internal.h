@@ -170,6 +170,23 @@ void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *blo
                       const struct md_completion *completion);
 /* cdef: end */
 
+/* ---- body.c: what is wrapped in a frame, from its address on ---- */
+
+enum { MD_MOST_BODY = 253 }; /* 125 registers read; the standard has room for 254 */
+
+/* Return the length of the body that begins there: a request's, or a reply's to `request`. MD_INCOMPLETE where
+ * its first bytes do not tell yet. */
+int md_body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request);
+int md_body_reply_length(int framing, const struct md_message *request); /* of the good reply; 0: none comes */
+/* Write what follows on address and function, and return the whole length; MD_BAD_REQUEST where no body can
+ * say it. */
+int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);
+int md_body_put_reply(int framing, const struct md_message *message, uint8_t *body);
+void md_body_get_request(int framing, const uint8_t *body, struct md_message *message);
+/* Read a whole reply; MD_BAD_ECHO where it confirms what was not asked for, else 0. */
+int md_body_get_reply(int framing, const uint8_t *body, const struct md_message *request,
+                      struct md_message *reply);
+
 /* ---- frame.c, reason.c ---- */
 
 enum { MD_MOST_ADDRESS = 247, MD_TCP_HEAD = 6 /* before the unit id, which is the address */ };
