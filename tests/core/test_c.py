@@ -9,7 +9,7 @@ from c_programs import ROOT, SANITIZERS, build_and_run
 
 @pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
-    line = ("line", "reply", "tcp", "echo", "late", "delay", "counters")
+    line = ("line", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
     core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
