@@ -15,6 +15,11 @@ def test_core(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_rows(tmp_path: Path) -> None:
+    build_and_run(tmp_path / "test_rows", "columns", "tap", "body", "frame", "checksum", "reason")
+
+
+@pytest.mark.slow
 def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
     build_and_run(tmp_path / "test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
 
