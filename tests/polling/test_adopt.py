@@ -488,14 +488,14 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
             lines = made.poller._lines
             hall = lines.find("hall")
             return (
-                len(hall._planned),
+                len(hall._drives._planned),
                 len(hall._maker._made),
                 len(hall._maker._rows),
                 len(lines._numbered),
                 len(lines._free),
                 max(lines._numbered),
                 len(hall.bus._exchanges._known),
-                len(hall._gone),
+                len(hall._drives._gone),
             )
 
         def adopt_some(number: int) -> None:
