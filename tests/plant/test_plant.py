@@ -16,7 +16,8 @@ from multidrop.plant.model import Plant
 from multidrop.toml_check import parse_duration
 
 FAMILY = """\
-from multidrop.drive.family import Drive, Framing, Option
+from multidrop.drive.family import Drive, Framing
+from multidrop.drive.options import Option
 from multidrop.drive.declare import command, reading, setting
 
 class Toy(Drive):

@@ -11,8 +11,8 @@ from typing import Any
 
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
+from multidrop.drive.options import Option
 from multidrop.drive.register import Access
-from multidrop.drive.verbs import Option
 from multidrop.family_file.addresses import Counting
 from multidrop.family_file.csv_table import MOST_BYTES, beside, declare_rows
 from multidrop.family_file.facts import FAMILY_KEYS, facts_of
