@@ -149,12 +149,12 @@ def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.Mon
 
     ledger = Ledger(tmp_path / "wear")
     sim = SimulatedDrive(Fan(1))
-    hall = SimulatedBus(monkeypatch, sim, ledger=ledger)
-    fan = hall.attach(Fan(1, ram=["known"]))
+    line = SimulatedBus(monkeypatch, sim, ledger=ledger)
+    fan = line.attach(Fan(1, ram=["known"]))
     for register in (fan.relay, fan.speed, fan.known):
-        hall.bus.write(fan, register, 1)
+        line.bus.write(fan, register, 1)
     assert ledger.wear(0) == []
-    hall.bus.write(fan, fan.latch, 1)
+    line.bus.write(fan, fan.latch, 1)
     assert [it.cell.register for it in ledger.wear(0)] == ["latch"]
     assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # what its owner knows, its class does not
 

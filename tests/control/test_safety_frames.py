@@ -127,26 +127,26 @@ def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any
     )
     if name == "set_frequency":
         hz = draw(numbers)
-        return name, lambda hall, drive: drive.set_frequency(hz)
+        return name, lambda line, drive: drive.set_frequency(hz)
     if name in ("write", "broadcast"):
         registers = list(family.registers.values())
         moving = [it for it in registers if it.harmless is not None]
         register = draw(st.one_of(st.sampled_from(moving), st.sampled_from(registers)))
         value = draw(values(register))
         if name == "write":
-            return name, lambda hall, drive: hall.bus.write(drive, register, value)
-        return name, lambda hall, drive: hall.bus.broadcast(register, value)
+            return name, lambda line, drive: line.bus.write(drive, register, value)
+        return name, lambda line, drive: line.bus.broadcast(register, value)
     if name == "stop_all":
-        return name, lambda hall, drive: hall.bus.stop_all()
+        return name, lambda line, drive: line.bus.stop_all()
     if name == "ramp":
         hz = draw(st.floats(0, 60))
-        return name, lambda hall, drive: ramp(drive, hz, rate=5.0, every=1.0)
+        return name, lambda line, drive: ramp(drive, hz, rate=5.0, every=1.0)
     if name == "start_staggered":
-        return name, lambda hall, drive: start_staggered([drive], 1.0)
+        return name, lambda line, drive: start_staggered([drive], 1.0)
     if name in ("start", "jog"):
         direction = draw(directions)
-        return name, lambda hall, drive: getattr(drive, name)(direction)
-    return name, lambda hall, drive: getattr(drive, name)()
+        return name, lambda line, drive: getattr(drive, name)(direction)
+    return name, lambda line, drive: getattr(drive, name)()
 
 
 def values(register: Register[Any]) -> st.SearchStrategy[Any]:
@@ -171,28 +171,28 @@ def test_no_sequence_of_calls_sends_what_is_forbidden(
 ) -> None:
     sim: Any = simulated(MAKE[model](1))
     with TemporaryDirectory() as directory:
-        hall = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
-        play(hall, sim, model, data)
+        line = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
+        play(line, sim, model, data)
 
 
-def play(hall: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
+def play(line: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
     """A setpoint, and then any calls with any replies lost."""
-    drive = hall.attach(sim.drive)
+    drive = line.attach(sim.drive)
     drive.set_frequency(20)
-    hall.frames.clear()
+    line.frames.clear()
     loses = data.draw(st.sampled_from(["nothing", "writes", "some"]))
     some = data.draw(st.sets(st.integers(0, 60), max_size=12))
-    hall.loses = {
+    line.loses = {
         "nothing": lambda request: False,
         "writes": is_write,
-        "some": lambda request: len(hall.frames) in some,
+        "some": lambda request: len(line.frames) in some,
     }[loses]
     for name, call in data.draw(st.lists(calls(model), min_size=1, max_size=6)):
-        begun = len(hall.frames)
+        begun = len(line.frames)
         ran = sim.motor.energised
         with suppress(BusError, ValueError, TypeError):
-            call(hall, drive)
-        sent = [request for request, _ in hall.frames[begun:] if is_write(request)]
+            call(line, drive)
+        sent = [request for request, _ in line.frames[begun:] if is_write(request)]
         for request in sent:
             if request.address == 0:
                 assert (request.function, request.start, word(request)) in BROADCASTS
@@ -201,7 +201,7 @@ def play(hall: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
         turning = [request for request in sent if STARTS[model](request)]
         assert len(turning) <= (name in TURNING_VERBS), f"{name} sent {turning}"
         assert len([request for request in sent if resets(model, request)]) <= (name == "reset_fault")
-        sim.pass_time(hall.seconds)
+        sim.pass_time(line.seconds)
         if name not in TURNING_VERBS and not ran:
             assert not sim.motor.energised, f"{name} started the motor"
 

@@ -34,7 +34,7 @@ ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at onc
 
 
 @contextmanager
-def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]:
+def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]:
     """Our drive 1, the pair, and what the drives 1 and 2 hear."""
     ours = MAKE[model](1)
     heard = []
@@ -118,7 +118,7 @@ class Stranger:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*RTU_FAMILIES))
 def test_starts_and_stops_while_another_client_talks(model: str) -> None:
-    with hall(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
+    with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
         stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
         for done in range(MOST_ROUNDS):
@@ -189,7 +189,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
 def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard):
+    with shared_line("invt-che", seed=3) as (drive, pair, heard):
         set_frequency(drive, 20)
         if verb == "reset_fault":
             heard[0].sim.trip(4)
@@ -205,7 +205,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
 @patient
 @pytest.mark.parametrize("says", usually(*SAYS))
 def test_what_another_client_says_confirms_no_stop(says: str) -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard):
+    with shared_line("invt-che", seed=3) as (drive, pair, heard):
         running(drive, heard[0])
         pair.says = SAYS[says]
         pair.holds = lambda said: said == rtu(STOP)
@@ -219,7 +219,7 @@ def test_what_another_client_says_confirms_no_stop(says: str) -> None:
 @patient
 def test_the_same_stop_of_another_client_is_one_too() -> None:
     """It looks like the drive's confirmation of ours, and the motor stops all the same."""
-    with hall("invt-che", seed=3) as (drive, pair, heard):
+    with shared_line("invt-che", seed=3) as (drive, pair, heard):
         running(drive, heard[0])
         pair.says = rtu(STOP)
         pair.holds = lambda said: said == rtu(STOP)
@@ -232,7 +232,7 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
 def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
     """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
     look = rtu("01 03 10 01 00 01")
-    with hall("invt-che", seed=3) as (drive, pair, heard):
+    with shared_line("invt-che", seed=3) as (drive, pair, heard):
         running(drive, heard[0])
         pair.says = look
         pair.holds = lambda said: said == look
@@ -246,7 +246,7 @@ def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -
 
 @patient
 def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard), Bus(pair.theirs) as other:
+    with shared_line("invt-che", seed=3) as (drive, pair, heard), Bus(pair.theirs) as other:
         set_frequency(drive, 20)
         set_frequency(other.attach(InvtCHE(1, maximum_frequency=50)), 50)
         with pytest.raises(Refused, match=r"holds 100\.00 % and not 40\.00 %"):

@@ -218,14 +218,14 @@ def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
-    hall, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
+    line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
-        hall.bus.write(drive, drive.ramp, seconds)
-    assert ledger.wear(hall.seconds) == []
+        line.bus.write(drive, drive.ramp, seconds)
+    assert ledger.wear(line.seconds) == []
     assert not sim.counters.eeprom_writes
-    hall.bus.write(drive, drive.stored_ramp, 1.0)
+    line.bus.write(drive, drive.stored_ramp, 1.0)
     with pytest.raises(Refused, match="less often"):
-        hall.bus.write(drive, drive.stored_ramp, 2.0)
+        line.bus.write(drive, drive.stored_ramp, 2.0)
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
 

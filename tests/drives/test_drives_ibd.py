@@ -154,14 +154,14 @@ def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[
 
 
 def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InnovertIBD(1))
+    line, drive, sim = one(monkeypatch, InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
     with pytest.raises(Refused, match=r"stop\(\) first"):
         drive.start()
     drive.stop()
     drive.start()
-    sim.pass_time(hall.seconds + 60)
+    sim.pass_time(line.seconds + 60)
     assert sim.motor.frequency == 50
 
 

@@ -451,13 +451,13 @@ def test_a_trip_shows_in_what_it_froze() -> None:
 
 def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """From a new object too, as the command line has it each time."""
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
     drive.start()
-    hall.sleep(3)
+    line.sleep(3)
     drive.emergency_stop()
-    hall.bus.detach(drive)
-    drive = hall.attach(YD1000(1))
+    line.bus.detach(drive)
+    drive = line.attach(YD1000(1))
     with pytest.raises(Refused, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
         drive.start()
     drive.reset_fault()
@@ -478,24 +478,24 @@ def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
 
 
 def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    assert hall.bus.write(drive, drive.communication_timeout, 5) == 5
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert line.bus.write(drive, drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
     for wrong in (-1, 101, 0.5):
         with pytest.raises(Refused, match="communication_timeout"):
-            hall.bus.write(drive, drive.communication_timeout, wrong)
+            line.bus.write(drive, drive.communication_timeout, wrong)
     drive.set_frequency(30)
     drive.start()
     with pytest.raises(Refused, match="only while the motor stands"):
-        hall.bus.write(drive, drive.communication_timeout, 2)
+        line.bus.write(drive, drive.communication_timeout, 2)
 
 
 @pytest.mark.parametrize("speed", range(1, 8))
 def test_a_preset_speed_on_a_simulated_drive(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
+    line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5
     drive.start()
-    hall.sleep(60)
-    sim.pass_time(hall.seconds)
+    line.sleep(60)
+    sim.pass_time(line.seconds)
     assert sim.motor.frequency == 12.5
     drive.stop()
