@@ -149,7 +149,7 @@ def _cut_one(
     made.mend()
     time.sleep(3.0 if is_long else 1.5)  # what TCP held back comes now
     counters.rounds += 1
-    late = [it for it in client.heard(line, 1, "moves") if it.at > told_ns]
+    late = [it for it in client.received(line, 1, "moves") if it.at > told_ns]
     counters.moved += len(late)
     port = client.far.ports[0].partition(":")[0]
     counters.stories += [

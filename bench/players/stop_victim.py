@@ -16,7 +16,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from responder import Heard, Responder, ResponderLine
+from responder import ReceivedFrame, Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 
 CLIENT = "bench.players.stop_client"
@@ -102,7 +102,7 @@ class Victim:
     def release(self) -> None:
         self.far.release(self.lines[0])
 
-    def heard(self, line: ResponderLine, address: int, what: str) -> list[Heard]:
+    def received(self, line: ResponderLine, address: int, what: str) -> list[ReceivedFrame]:
         """In this episode."""
         return [
             it
@@ -115,11 +115,11 @@ class Victim:
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():
-                stops = self.heard(line, address, "stops")
+                stops = self.received(line, address, "stops")
                 counters.asked += 1
                 if stops and self.asked_ns:
                     counters.first_ms.append((stops[0].at - self.asked_ns) / 1e6)
-                late = [it for it in self.heard(line, address, "moves") if stops and it.at > stops[0].at]
+                late = [it for it in self.received(line, address, "moves") if stops and it.at > stops[0].at]
                 counters.moved += len(late)
                 counters.unsent += not stops
                 counters.turning += drive.runs and not excuse

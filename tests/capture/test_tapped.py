@@ -283,8 +283,8 @@ def seconds_in(path: Path) -> list[int]:
         return [
             span.time_ns // 10**9
             for _ in capture
-            for heard in capture.streams
-            for span in splitter.spans(heard)
+            for stream in capture.streams
+            for span in splitter.spans(stream)
         ]
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from commands import TOY, Run
 from lines import Faulty, patient, until
-from motors import Heard
+from motors import ReceivedRequests
 from toy import Status, Toy
 
 from multidrop.control import eeprom_ledger as ledger
@@ -343,14 +343,17 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
 # ---- interruptions ----
 
 
+Che = tuple[ReceivedRequests, list[object]]
+
+
 @pytest.fixture
-def che() -> Iterator[tuple[Heard, list[object]]]:
+def che() -> Iterator[Che]:
     """Return the requests of a CHE, and the words that name it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
-        yield Heard(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
+        yield ReceivedRequests(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
 
 
 def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
@@ -367,36 +370,34 @@ def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
 
 
 @patient
-def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
-    run: Run, che: tuple[Heard, list[object]]
-) -> None:
-    heard, words = che
-    heard.loses = pressing(lambda request: request in heard.starts)
+def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(run: Run, che: Che) -> None:
+    received, words = che
+    received.loses = pressing(lambda request: request in received.starts)
     status, _, err = run("start", *words, "--frequency", 20, "--yes")
     assert status == 130
-    assert len(heard.starts) == 1
+    assert len(received.starts) == 1
     assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
     assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
 
 
 @patient
-def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard, list[object]]) -> None:
-    heard, words = che
+def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> None:
+    received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
-    begun = len(heard.writes)
-    heard.loses = pressing(lambda request: request.start == 0x1000)
+    begun = len(received.writes)
+    received.loses = pressing(lambda request: request.start == 0x1000)
     status, _, err = run("stop", *words)
     assert status == 130
-    until(lambda: len(heard.writes) >= begun + 2)  # the drive may hear it when the client has left
-    assert [it.data for it in heard.writes[begun:]] == [b"\0\5"] * 2
+    until(lambda: len(received.writes) >= begun + 2)  # the drive may hear it when the client has left
+    assert [it.data for it in received.writes[begun:]] == [b"\0\5"] * 2
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
 
 
-def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: tuple[Heard, list[object]]) -> None:
-    heard, words = che
-    heard.loses = lambda request: True
+def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
+    received, words = che
+    received.loses = lambda request: True
     status, _, err = run("stop", *words, "--seconds", 1)
     assert status == 1
     assert "it was never confirmed" in err
-    assert {it.data for it in heard.writes} == {b"\0\5"}
+    assert {it.data for it in received.writes} == {b"\0\5"}

@@ -165,9 +165,9 @@ def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) 
     told = [json.loads(line) for line in out.splitlines()]
     assert {it["line"] for it in told[:-1]} == {url}
     assert told[-1]["summary"]["exchanges"] > 10
-    heard = [it.get("frames", [])[1:] for it in told[2:-2]]  # it may begin, and end, amid a frame
+    sniffed = [it.get("frames", [])[1:] for it in told[2:-2]]  # it may begin, and end, amid a frame
     pair = [[it.frame.hex(" ").upper()] for it in (READ, WRITE)]
-    assert heard in ((len(heard) * pair)[: len(heard)], (len(heard) * pair)[1 : len(heard) + 1])
+    assert sniffed in ((len(sniffed) * pair)[: len(sniffed)], (len(sniffed) * pair)[1 : len(sniffed) + 1])
     if server:
         assert (server.port.baudrate, server.port.parity) == (19200, "E")
         server.close()
@@ -289,10 +289,10 @@ def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
 
 
 def test_noise_is_told_though_it_does_not_end() -> None:
-    heard, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
+    stream, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
     for time in range(4):
-        heard.put(b"\xff" * 1500, time)
-        told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(heard))])
+        stream.put(b"\xff" * 1500, time)
+        told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(stream))])
     assert told == [[], [], [(0, 4500)], []]
     assert [(it.time_ns, len(it.raw)) for it in pairing.flush()] == [(3, 1500)]
 

@@ -46,7 +46,7 @@ SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
 REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
-def heard(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
+def ended(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
     """Return the result of the request that nobody should answer."""
     reply = Message(0xF7, 3, exception=exception)
     return Completion(result, 0, 1, 1, 2, 2, 0, skipped, reply, raw)
@@ -166,23 +166,23 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
             False,
         ),
         (
-            echo_finding(heard(b""), SENT, USUAL),
+            echo_finding(ended(b""), SENT, USUAL),
             "none at 9600 8N1: nothing came back of what was sent",
             False,
         ),
         (
-            echo_finding(heard(SENT), SENT, USUAL),
+            echo_finding(ended(SENT), SENT, USUAL),
             "the adapter hears what it sends at 9600 8N1; multidrop takes it out",
             False,
         ),
-        (echo_finding(heard(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+        (echo_finding(ended(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
         (
-            echo_finding(heard(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
+            echo_finding(ended(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
             "none at 9600 8N1; address 247, which should be nobody's, answers with exception 04",
             True,
         ),
         (
-            echo_finding(heard(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
+            echo_finding(ended(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
             "the adapter hears what it sends at 9600 8N1; address 247, which should be nobody's, answers "
             "with a value",
             True,

@@ -138,24 +138,24 @@ class Damage:
     chance: random.Random = field(default_factory=lambda: random.Random(2))
 
     def __call__(self, said: bytes) -> bytes:
-        heard = bytearray()
+        damaged = bytearray()
         for byte in said:
             kind = self.chance.choice(["changed", "lost", "doubled"]) if self.chance.random() < 0.01 else ""
             if kind:
                 self.damaged.append(len(self.said))
             self.said.append(byte)
             if kind != "lost":
-                heard.append(byte ^ self.chance.randrange(1, 256) if kind == "changed" else byte)
+                damaged.append(byte ^ self.chance.randrange(1, 256) if kind == "changed" else byte)
             if kind == "doubled":
-                heard.append(byte)
-        return bytes(heard)
+                damaged.append(byte)
+        return bytes(damaged)
 
     def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
         """Return each exchange's frames, and True where it is whole."""
-        heard = Stream()
-        heard.put(bytes(self.said), 0)
-        heard.end(True)
-        spans = list(Splitter().spans(heard))
+        stream = Stream()
+        stream.put(bytes(self.said), 0)
+        stream.end(True)
+        spans = list(Splitter().spans(stream))
         assert [span.kind for span in spans] == [Kind.REQUEST, Kind.REPLY] * (len(spans) // 2)
         damaged, found, at = set(self.damaged), [], 0
         for pair in zip(spans[::2], spans[1::2], strict=True):
@@ -179,9 +179,9 @@ def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
     is_whole = [whole for whole, _ in exchanges]
     expected = [exchanges[at][1] for at in range(1, len(exchanges) - 1) if all(is_whole[at - 1 : at + 2])]
     assert len(expected) > 0.3 * len(said)
-    heard = [tuple(it["frames"]) for it in told[:-1] if it.get("result") in ("ok", "refused")]
-    rest = iter(heard)
+    sniffed = [tuple(it["frames"]) for it in told[:-1] if it.get("result") in ("ok", "refused")]
+    rest = iter(sniffed)
     assert [it for it in expected if it not in rest] == []  # all of them, in their order
-    assert set(heard) <= {it for _, it in exchanges}  # and nothing that was never said
+    assert set(sniffed) <= {it for _, it in exchanges}  # and nothing that was never said
     unknown = sum(len(bytes.fromhex(it["unknown"])) for it in told[:-1] if "unknown" in it)
     assert told[-1]["summary"]["unknown_bytes"] == unknown > 0

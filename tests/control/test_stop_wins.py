@@ -198,7 +198,7 @@ class Stops(RuleBasedStateMachine):
         """The second one comes when the first one's stops are on the wire."""
 
         def again() -> None:
-            while not self._heard("stops") and not over.is_set():
+            while not self._received("stops") and not over.is_set():
                 over.wait(0.001)
             for number in signals[1:]:
                 os.kill(os.getpid(), number)
@@ -245,7 +245,7 @@ class Stops(RuleBasedStateMachine):
         self.threads.clear()
         begun = self.begun
         self._mark(self.drives[1])
-        late = [at for at in self._heard("moves", 1 if detaches else None, begun) if at < self.begun]
+        late = [at for at in self._received("moves", 1 if detaches else None, begun) if at < self.begun]
         assert [str(self.line.log[at]) for at in late] == [], self._story()
         if detaches:
             self._close()
@@ -299,7 +299,7 @@ class Stops(RuleBasedStateMachine):
             self.threads.append(thread)
         return thread
 
-    def _heard(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
+    def _received(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
         """Return the places in the log of such frames of this episode, or from `begun` on."""
         begun = self.begun if begun is None else begun
         return [
@@ -313,7 +313,7 @@ class Stops(RuleBasedStateMachine):
 
     def _judge_order(self, numbers: Any) -> None:
         for number in numbers:
-            stops, moves = (self._heard(what, number + 1) for what in ("stops", "moves"))
+            stops, moves = (self._received(what, number + 1) for what in ("stops", "moves"))
             if stops:
                 late = [str(self.line.log[at]) for at in moves if at > stops[0]]
                 assert not late, f"after {self.line.log[stops[0]]} came {late}\n{self._story()}"
@@ -321,7 +321,7 @@ class Stops(RuleBasedStateMachine):
     def judge(self, numbers: set[int], failures: list[BaseException]) -> None:
         self._judge_order(numbers)
         for number in numbers:
-            assert self._heard("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
+            assert self._received("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
             if not failures:
                 assert not self.responders[number].runs, f"{number + 1} was left running\n{self._story()}"
 

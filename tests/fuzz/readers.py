@@ -154,11 +154,11 @@ def _pair(capture: Capture) -> None:
     splitters: list[Splitter] = []
     junk = exchanges = 0
     for _ in capture:
-        for at, heard in enumerate(capture.streams):
+        for at, stream in enumerate(capture.streams):
             if at == len(pairings):
                 pairings.append(Pairing())
                 splitters.append(Splitter())
-            told = list(pairings[at].pair(splitters[at].spans(heard)))
+            told = list(pairings[at].pair(splitters[at].spans(stream)))
             junk += sum(len(it.raw) for it in told if isinstance(it, Junk))
             exchanges += sum(1 for it in told if not isinstance(it, Junk) and it.request and it.reply)
     for pairing in pairings:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from damage import BITS, Said, frames
 from differences import LIBMODBUS, PYMODBUS_ASCII, PYMODBUS_RTU, REPLIES, REQUESTS, compare, explain
-from judges import UNKNOWN_CODE, Heard, Libmodbus, Pymodbus, Verdict, expected
+from judges import UNKNOWN_CODE, Libmodbus, Pymodbus, Understood, Verdict, expected
 
 from multidrop.core import (
     FrameFault,
@@ -27,7 +27,7 @@ framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 # ---- what we say ----
 
 
-def heard(said: Said) -> tuple[int, Verdict]:
+def received(said: Said) -> tuple[int, Verdict]:
     used, message = parse_request(said.framing, said.frame)
     return used, FrameFault(used).name if message is None else trimmed(message)
 
@@ -65,9 +65,9 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
     differences = []
     answers = 0
     for said, theirs in zip(requests, libmodbus.hear(requests), strict=True):
-        used, message = heard(said)
+        used, message = received(said)
         ours = message if isinstance(message, str) else expected(used, message)
-        if isinstance(theirs, Heard) and isinstance(message, Message) and theirs.reply:
+        if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
             assert used == len(theirs.reply), said  # what it encodes, we take
             theirs = replace(theirs, reply=theirs.reply[1:-2])
@@ -103,7 +103,7 @@ def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> Non
     differences = []
     for said in frames(3, framing, NUMBER, replies=False):
         assert pymodbus.build_request(said.request) == build_request(framing, said.request)
-        differences += compare(said, heard(said)[1], trim(pymodbus.hear(said)))
+        differences += compare(said, received(said)[1], trim(pymodbus.hear(said)))
     explain(differences, REQUESTS, name(framing))
 
 

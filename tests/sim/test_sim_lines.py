@@ -37,9 +37,9 @@ def expected(address: int = 1) -> bytes:
 
 def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Message:
     os.write(fd, build_request(framing, request))
-    heard = receive(fd, reply_length(framing, request))
-    used, reply = parse_reply(framing, heard, request)
-    assert used == len(heard)
+    received = receive(fd, reply_length(framing, request))
+    used, reply = parse_reply(framing, received, request)
+    assert used == len(received)
     assert reply is not None
     return reply
 

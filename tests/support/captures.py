@@ -65,9 +65,9 @@ def spans(path: Path) -> dict[str, list[FrameSpan]]:
     splitters: dict[str, Splitter] = {}
     with Capture(path) as capture:
         for _ in capture:
-            for name, heard in zip(capture.lines, capture.streams, strict=True):
+            for name, stream in zip(capture.lines, capture.streams, strict=True):
                 splitter = splitters.setdefault(name, Splitter())
-                found.setdefault(name, []).extend(splitter.spans(heard))
+                found.setdefault(name, []).extend(splitter.spans(stream))
     return found
 
 

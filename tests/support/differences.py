@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from damage import COIL_VALUES, ECHOES, FUNCTIONS, MOST, READS, Said, data_bytes, request_body
-from judges import Heard, Verdict
+from judges import Understood, Verdict
 
 LIBMODBUS, PYMODBUS_RTU, PYMODBUS_ASCII = "libmodbus", "pymodbus rtu", "pymodbus ascii"
 PYMODBUS = (PYMODBUS_RTU, PYMODBUS_ASCII)
@@ -204,8 +204,8 @@ REPLIES = [
 @dataclass(frozen=True)
 class Difference:
     said: Said
-    ours: Heard | Verdict
-    theirs: Heard | Verdict
+    ours: Understood | Verdict
+    theirs: Understood | Verdict
 
     @property
     def kind(self) -> str:
@@ -226,7 +226,7 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
     assert not stale, f"{judge} does not differ any more: {[rule.reason for rule in stale]}"
 
 
-def compare(said: Said, ours: Heard | Verdict, theirs: Heard | Verdict) -> list[Difference]:
+def compare(said: Said, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
     """Nothing where both refuse, or both take it for the same."""
     if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
         return []

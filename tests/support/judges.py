@@ -50,9 +50,9 @@ class Libmodbus:
         done = subprocess.run([self._program], input=said, capture_output=True, text=True, check=True)
         return done.stdout.splitlines()
 
-    def hear(self, requests: Sequence[Said]) -> list[Heard | str]:
+    def hear(self, requests: Sequence[Said]) -> list[Understood | str]:
         """Return what its server does at these requests, each addressed to it."""
-        return [_heard(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
+        return [_received(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
 
     def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
         """The requests that its client sends, and what it makes of these replies."""
@@ -65,7 +65,7 @@ class Libmodbus:
 
 
 @dataclass(frozen=True)
-class Heard:
+class Understood:
     """A server's understanding, as far as it shows: bytes used, its reply, and cells (table, address)."""
 
     used: int
@@ -73,13 +73,13 @@ class Heard:
     changes: dict[tuple[int, int], int] = field(default_factory=dict)
 
 
-def _heard(line: str) -> Heard | str:
+def _received(line: str) -> Understood | str:
     word, *rest = line.split()
     if word == "refused":
         return line
     used, reply, changes = rest
     cells = [cell.split(":") for cell in changes.split(",") if changes != "-"]
-    return Heard(
+    return Understood(
         int(used),
         b"" if reply == "-" else bytes.fromhex(reply),
         {(int(table), int(address)): int(value) for table, address, value in cells},
@@ -112,11 +112,11 @@ def _confirmed(request: Message, values: str) -> Message:
 # ---- what a server with the judge's cells must do ----
 
 
-def expected(used: int, request: Message) -> Heard:
+def expected(used: int, request: Message) -> Understood:
     """The same of a server that understood this, by the application protocol V1.1b3, section 6."""
     changes: dict[tuple[int, int], int] = {}
     reply = _carry_out(request, changes)
-    return Heard(used, reply if request.address else b"", changes)
+    return Understood(used, reply if request.address else b"", changes)
 
 
 def _cell(function: int, address: int) -> int:

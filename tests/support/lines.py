@@ -80,10 +80,10 @@ class LateWire(Wire):
 
     def advance(self, now: float) -> bytes:
         self._now = now
-        heard = super().advance(now)
+        received = super().advance(now)
         while self._late and self._late[0][0] <= now:
-            heard += heapq.heappop(self._late)[1]
-        return heard
+            received += heapq.heappop(self._late)[1]
+        return received
 
     @property
     def wake(self) -> float | None:

@@ -43,7 +43,7 @@ def quick(kind: str) -> type[Drive]:
     return type(family.__name__, (family,), without)
 
 
-class Heard:
+class ReceivedRequests:
     """The requests that reach a simulated drive; `loses(request)` says whether its reply is lost."""
 
     def __init__(self, sim: MotorDrive) -> None:

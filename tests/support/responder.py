@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from responder_line import Heard, ResponderLine
+from responder_line import ReceivedFrame, ResponderLine
 from responder_telnet import Telnet
 
-__all__ = ["Heard", "Responder", "ResponderLine"]
+__all__ = ["ReceivedFrame", "Responder", "ResponderLine"]
 
 
 class Responder:
