@@ -62,7 +62,7 @@ def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
 
 
 def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
-    bad = next(it for it in PRINTED if it.verdict == "bad checksum")
+    bad = next(each for each in PRINTED if each.verdict == "bad checksum")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(bad.frame, Side.ASKING, BEGIN, "hall-1")
     assert tshark(tmp_path / "a.pcapng")[0]["mbrtu.crc16.status"] == "0"
@@ -70,7 +70,7 @@ def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
 
 def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> None:
     packets = tshark(write(tmp_path / "a.pcapng", TEXT))
-    frames = [frame.hex() for it in TEXT for frame in (it.request_frame, it.frame)]
+    frames = [frame.hex() for each in TEXT for frame in (each.request_frame, each.frame)]
     assert [packet["data.data"] for packet in packets] == frames
     assert {packet["modbus.func_code"] for packet in packets} == {""}
 
@@ -81,7 +81,7 @@ def test_a_line_is_an_interface_with_its_name(tmp_path: Path) -> None:
             capture.write(RTU[0].frame, Side.ANSWERING, BEGIN + number, line)
     names = [packet["frame.interface_name"] for packet in tshark(tmp_path / "a.pcapng")]
     assert names == ["hall-1", "Halle zwei", "hall-1"]
-    assert {line: len(it) for line, it in spans(tmp_path / "a.pcapng").items()} == {
+    assert {line: len(each) for line, each in spans(tmp_path / "a.pcapng").items()} == {
         "hall-1": 2,
         "Halle zwei": 1,
     }
@@ -95,8 +95,8 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     (found,) = spans(write(tmp_path / "a.pcapng", exchanges)).values()
     assert [(span.kind, span.time_ns, span.raw) for span in found] == [
         (kind, BEGIN + (2 * number + after) * STEP, frame)
-        for number, it in enumerate(exchanges)
-        for kind, after, frame in ((Kind.REQUEST, 0, it.request_frame), (Kind.REPLY, 1, it.frame))
+        for number, each in enumerate(exchanges)
+        for kind, after, frame in ((Kind.REQUEST, 0, each.request_frame), (Kind.REPLY, 1, each.frame))
     ]
 
 
@@ -119,7 +119,7 @@ def hexdump(packets: Iterable[bytes]) -> str:
 @pytest.mark.parametrize("format", ["pcap", "pcapng", "nsecpcap"])
 @pytest.mark.parametrize("link", [147, 162, 250])
 def test_captures_that_wireshark_s_tools_wrote_are_read(tmp_path: Path, format: str, link: int) -> None:
-    frames = [frame for it in (*RTU, *TEXT) for frame in (it.request_frame, it.frame)]
+    frames = [frame for each in (*RTU, *TEXT) for frame in (each.request_frame, each.frame)]
     rtac = struct.pack(">IIBBH", 0, 0, 2, 0, 0) if link == 250 else b""
     path = tmp_path / f"other.{format}"
     subprocess.run(
@@ -137,11 +137,13 @@ def test_captures_that_wireshark_s_tools_wrote_are_read(tmp_path: Path, format: 
 
 
 def test_a_frame_may_lie_in_several_packets_and_several_in_one(tmp_path: Path) -> None:
-    frames = b"".join(it.request_frame + it.frame for it in RTU)
+    frames = b"".join(each.request_frame + each.frame for each in RTU)
     packets = [frames[at : at + 7] for at in range(0, len(frames), 7)]
     header = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 147)  # big-endian, ns
     path = tmp_path / "a.pcap"
-    path.write_bytes(header + b"".join(struct.pack(">IIII", 1, 5, len(it), len(it)) + it for it in packets))
+    path.write_bytes(
+        header + b"".join(struct.pack(">IIII", 1, 5, len(packet), len(packet)) + packet for packet in packets)
+    )
     (found,) = spans(path).values()
     assert b"".join(span.raw for span in found) == frames
     assert {span.kind for span in found[1:]} <= {Kind.REQUEST, Kind.REPLY, Kind.EITHER}

@@ -57,7 +57,7 @@ def test_an_exchange_is_a_row_in_engineering_units(
     tmp_path: Path, model: str, framing: str, request_: str, register: str, value: float
 ) -> None:
     texts = (request_, f":{request_}\\r\\n")
-    exchange = next(it for it in (*RTU, *TEXT) if _text(it.request_frame) in texts)
+    exchange = next(each for each in (*RTU, *TEXT) if _text(each.request_frame) in texts)
     path = write(tmp_path / "a.pcapng", [exchange])
     (row,) = rows(path, plant(tmp_path, model, framing))
     assert row == Row(BEGIN, BEGIN, STEP, "pump", register, value, "ok")
@@ -68,7 +68,9 @@ def _text(frame: bytes) -> str:
 
 
 def test_several_registers_are_a_row_each(tmp_path: Path) -> None:
-    exchange = next(it for it in RTU if _text(it.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8")
+    exchange = next(
+        each for each in RTU if _text(each.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8"
+    )
     found = rows(write(tmp_path / "a.pcapng", [exchange]), plant(tmp_path, "erman-er-g-220", "rtu"))
     assert [(row.register, row.value) for row in found] == [
         ("acceleration_time", 20),
@@ -77,7 +79,7 @@ def test_several_registers_are_a_row_each(tmp_path: Path) -> None:
 
 
 def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
-    exchange = next(it for it in RTU if _text(it.frame) == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4")
+    exchange = next(each for each in RTU if _text(each.frame) == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert [(row.drive, row.register, row.value) for row in found] == [
         ("address 1", f"holding_register_{1 + at}", value) for at, value in enumerate((256, 500, 500, 50))
@@ -85,13 +87,13 @@ def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
 
 
 def test_a_refusal_is_a_miss_with_its_code(tmp_path: Path) -> None:
-    exchange = next(it for it in RTU if _text(it.frame) == "01 83 03 01 31")
+    exchange = next(each for each in RTU if _text(each.frame) == "01 83 03 01 31")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert {(row.value, row.status) for row in found} == {(None, "exception 03")}
 
 
 def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> None:
-    exchange = next(it for it in RTU if _text(it.frame) == "01 03 02 13 88 B5 12")
+    exchange = next(each for each in RTU if _text(each.frame) == "01 03 02 13 88 B5 12")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(exchange.request_frame, Side.ASKING, 1, "hall-1")
         capture.write(exchange.request_frame, Side.ASKING, 2, "hall-1")
@@ -136,11 +138,11 @@ def test_more_requests_than_are_remembered_are_decoded_all_the_same(
 ) -> None:
     """Three quarters of 16384 places are taken; long before, two requests come to want the same."""
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
-    replies = (Message(it.address, 3, it.start, 1, data) if data else None for it in asked)
+    replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
     told = asked if data else asked[:-1]  # nobody knows whether the last one was answered
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
-        (f"address {it.address}", f"holding_register_{it.start}", *end) for it in told
+        (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]
 
 

@@ -92,9 +92,9 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
-    it = find_adapter("/dev/ttyUSB0", sysfs)
-    assert (it.name, it.driver, it.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
-    assert (it.usb_id, it.latency_timer) == ("0403:6001", 16)
+    adapter = find_adapter("/dev/ttyUSB0", sysfs)
+    assert (adapter.name, adapter.driver, adapter.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
+    assert (adapter.usb_id, adapter.latency_timer) == ("0403:6001", 16)
 
 
 def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
@@ -277,7 +277,7 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
     status, out, _ = run("doctor", port, *words)
     assert status == 0
-    findings = {it["topic"]: it for it in json.loads(out)["findings"]}
+    findings = {load["topic"]: load for load in json.loads(out)["findings"]}
     assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
 
 

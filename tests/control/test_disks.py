@@ -45,9 +45,9 @@ def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> 
                 log.add(1, {"write": "lost" * 20})
     other.add(2, {"write": "second"})
     log.add(3, {"write": "third"})
-    for it in (log, other):
-        it.close()
-    assert [it["write"] for it in read_audit(path)] == ["first", "second", "third"]
+    for each in (log, other):
+        each.close()
+    assert [each["write"] for each in read_audit(path)] == ["first", "second", "third"]
     whole = path.read_bytes().splitlines()
     assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
 
@@ -73,7 +73,7 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
     assert "the audit log cannot be written: " in caplog.text
     drive.set_frequency(30)
     line.bus.close()
-    assert [it["write"] for it in read_audit(path)] == [
+    assert [each["write"] for each in read_audit(path)] == [
         "setpoint = 40.00 %",
         "control = FORWARD",
         "setpoint = 60.00 %",
@@ -170,7 +170,7 @@ def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyP
     assert all(gap >= 58 for gap in gaps[1:])  # all but the one in which the clock was set back
     assert sim.counters.eeprom_writes["frequency"] == len(tried)
     line.bus.close()
-    times = [str(it["time"]) for it in read_audit(log)]
+    times = [str(each["time"]) for each in read_audit(log)]
     assert len(times) == len(tried)
     assert times != sorted(times)  # the log says what the clock said, in the order of what was done
 

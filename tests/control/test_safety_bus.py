@@ -57,7 +57,7 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     line, drive, sim = one(monkeypatch, MAKE[model](1))
-    controls = [it for it in drive.registers.values() if it.harmless is not None]
+    controls = [each for each in drive.registers.values() if each.harmless is not None]
     assert controls
     refusals = 0
     for register in controls:
@@ -287,7 +287,7 @@ def test_the_first_look_tells_the_watchdog_once(
     with caplog.at_level("INFO", "multidrop"):
         drive.set_frequency(20)
         drive.start()
-    told = [it.getMessage() for it in caplog.records if "watchdog" in it.getMessage()]
+    told = [record.getMessage() for record in caplog.records if "watchdog" in record.getMessage()]
     off = "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     assert told == [f"{drive.name}: {off}"]
 
@@ -572,7 +572,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(monkeypatch, *sims)
-    first, _ = (line.attach(it.drive) for it in sims)
+    first, _ = (line.attach(sim.drive) for sim in sims)
     for value in set(CHEControl) - {CHEControl.STOP}:
         with pytest.raises(Refused, match="no harmless broadcast"):
             line.bus.broadcast(first.control, value)
@@ -581,7 +581,7 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     assert line.written == []
     found = line.bus.broadcast(first.setpoint, 0.0)
     assert line.written == ["00 06 20 00 00 00 83 DB"]
-    assert {name: it.condition for name, it in found.items() if isinstance(it, State)} == {
+    assert {name: each.condition for name, each in found.items() if isinstance(each, State)} == {
         "invt-che@1": Condition.STOPPED,
         "invt-che@2": Condition.STOPPED,
     }
@@ -594,8 +594,8 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
 def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        line.bus.check_identity(line.attach(it.drive))
+    for sim in sims:
+        line.bus.check_identity(line.attach(sim.drive))
     line.deafens = lambda request: request.address == 2
     found = line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
     assert line.written == ["00 06 10 00 00 05 4C D8"]
@@ -607,9 +607,9 @@ def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytes
 
 
 def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
-    for it in sims:
-        it.pass_time(line.seconds)
-    return not any(it.motor.energised for it in sims)
+    for sim in sims:
+        sim.pass_time(line.seconds)
+    return not any(sim.motor.energised for sim in sims)
 
 
 def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -637,16 +637,16 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
 def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     line = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = line.attach(it.drive)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
     line.sleep(1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()
     assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
-    assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
-    assert all(it.seconds < 11 for it in stopped.values())  # one ramp, not three after another
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
+    assert all(each.seconds < 11 for each in stopped.values())  # one ramp, not three after another
     assert all_stopped(line, sims)
 
 
@@ -654,8 +654,8 @@ def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.
     """The port fails with it, and comes back."""
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = line.attach(it.drive)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
 
@@ -666,7 +666,7 @@ def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.
 
     line.answers = fails
     stopped = line.bus.stop_all()
-    assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
     assert {frame[:17] for frame in line.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
     assert all_stopped(line, sims)
 
@@ -674,13 +674,13 @@ def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.
 def test_stop_all_on_a_line_of_every_family(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(make(address)) for address, make in enumerate(MAKE.values(), 1)]
     line = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = line.attach(it.drive)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
     begun = line.seconds
     stopped = line.bus.stop_all()
-    assert [it.seen for it in stopped.values()] == [Seen.STOPPED] * 6
+    assert [each.seen for each in stopped.values()] == [Seen.STOPPED] * 6
     assert line.seconds - begun < 10  # the ramps went side by side
     assert all_stopped(line, sims)
     assert not any(frame.startswith(("00 ", ":00")) for frame in line.written)
@@ -693,12 +693,12 @@ def test_stop_all_says_of_each_what_is_known(monkeypatch: pytest.MonkeyPatch) ->
         simulated(InvtCHE(3)),
     ]
     line = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        line.attach(it.drive)
+    for sim in sims:
+        line.attach(sim.drive)
     sims[2]["device"] = 0x010A
     line.loses = lambda request: request.address == 2
     stopped = line.bus.stop_all()
-    assert {name: it.seen for name, it in stopped.items()} == {
+    assert {name: each.seen for name, each in stopped.items()} == {
         "invt-che@1": Seen.STOPPED,
         "erman-er-g-220@2": Seen.SENT,
         "invt-che@3": Seen.FAILED,
@@ -716,19 +716,19 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
 ) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     line = SimulatedBus(monkeypatch, *sims)
-    drives = [line.attach(it.drive) for it in sims]
+    drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(20)
     begun = line.seconds
     start_staggered(drives, 2.0, Direction.FORWARD)
     assert 4 <= line.seconds - begun < 6
-    assert all(it.motor.energised for it in sims)
+    assert all(sim.motor.energised for sim in sims)
     line.bus.stop_all()
     sims[1].trip(4)
     line.frames.clear()
     with pytest.raises(Refused, match="OC1"):
         start_staggered(drives, 2.0)
-    assert [it[:17] for it in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
+    assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
     assert all_stopped(line, sims)
 
 
@@ -737,7 +737,7 @@ def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -
     drive.set_frequency(10)
     line.frames.clear()
     ramp(drive, 20.0)  # 80 Hz in 10 s: 4 Hz in half a second
-    setpoints = [int(it[12:17].replace(" ", ""), 16) / 100 for it in line.written]
+    setpoints = [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written]
     assert setpoints == [14.0, 18.0, 20.0]
     with pytest.raises(ValueError, match=r"more than the drive's own, 8 Hz/s"):
         ramp(drive, 0.0, rate=9)
@@ -754,7 +754,7 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
     with pytest.raises(Refused, match="give a rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
-    assert [int(it[12:17].replace(" ", ""), 16) for it in line.written] == [200, 400]  # 0.01 % of 50 Hz
+    assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
 
 
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -784,7 +784,7 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
         drive.start()
     line.bus.close()
     records = list(read_audit(log))
-    assert [(it["write"], it["sent"][:17], it["outcome"]) for it in records] == [
+    assert [(record["write"], record["sent"][:17], record["outcome"]) for record in records] == [
         ("setpoint = 40.00 %", "01 06 20 00 0F A0", "done"),
         ("control = FORWARD", "01 06 10 00 00 01", "unconfirmed"),
     ]
@@ -799,7 +799,7 @@ def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
     drive.stop()
     line.bus.close()
-    assert [it[:17] for it in line.written] == ["01 06 10 00 00 05"]
+    assert [each[:17] for each in line.written] == ["01 06 10 00 00 05"]
     assert "the audit log cannot be written" in caplog.text
 
 
@@ -820,7 +820,7 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     with pytest.raises(LineError):
         drive.start()
     line.bus.close()
-    assert [(it["write"], it["outcome"]) for it in read_audit(log)][1:] == [
+    assert [(each["write"], each["outcome"]) for each in read_audit(log)][1:] == [
         ("control = FORWARD", "unconfirmed")
     ]
 
@@ -879,7 +879,7 @@ def test_a_torn_tail_harms_no_other_line(monkeypatch: pytest.MonkeyPatch, tmp_pa
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
     line.bus.close()
-    assert [it["write"] for it in read_audit(log)] == ["a", "setpoint = 40.00 %"]
+    assert [each["write"] for each in read_audit(log)] == ["a", "setpoint = 40.00 %"]
     assert json.loads(log.read_text().splitlines()[-1])["outcome"] == "done"
 
 
@@ -936,7 +936,7 @@ def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch
     line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
     begun = line.seconds
     line.bus.check_identity(line.attach(Sleepy(1)))
-    assert [(it.start, it.count) for it, _ in line.frames] == [(5, 1), (4, 1)]
+    assert [(each.start, each.count) for each, _ in line.frames] == [(5, 1), (4, 1)]
     assert line.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
 
 

@@ -32,7 +32,7 @@ def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, declared: Drive
 ) -> None:
     line, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
-    stop = next(it for it in drive.registers.values() if it.harmless)
+    stop = next(register for register in drive.registers.values() if register.harmless)
     value = stop.decode(stop.harmless[-1])
     assert line.bus.try_write(drive, stop, value).effect is Effect.DONE
     dies_and_echoes(line, drive)

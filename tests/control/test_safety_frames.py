@@ -30,52 +30,57 @@ def word(request: Message) -> int:
     return int.from_bytes(request.data)
 
 
-def erman(it: Message) -> bool:
+def erman(message: Message) -> bool:
     """Coils 3 to 8 and 10 to 12 are reserved, and so are most registers; 0001H is never written."""
-    if it.function == 5:
-        return it.start in (0, 1, 2, 9)
-    return it.function == 6 and it.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
+    if message.function == 5:
+        return message.start in (0, 1, 2, 9)
+    return message.function == 6 and message.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
 
 
-def che(it: Message) -> bool:
-    return it.function == 6 and (
-        (it.start == 0x1000 and 1 <= word(it) <= 8) or (it.start == 0x2000 and word(it) <= 10_000)
+def che(message: Message) -> bool:
+    return message.function == 6 and (
+        (message.start == 0x1000 and 1 <= word(message) <= 8)
+        or (message.start == 0x2000 and word(message) <= 10_000)
     )
 
 
-def ibd(it: Message) -> bool:
+def ibd(message: Message) -> bool:
     """No direction without a word of its owner's, never the toggle; a reset without run."""
-    if it.start == 0x2000:
-        return it.function == 6 and word(it) in (0, 1, 2, 3, 0x10)
-    return it.function == 6 and (it.start in (107, 108) or (it.start == 0x2001 and word(it) <= 40_000))
+    if message.start == 0x2000:
+        return message.function == 6 and word(message) in (0, 1, 2, 3, 0x10)
+    return message.function == 6 and (
+        message.start in (107, 108) or (message.start == 0x2001 and word(message) <= 40_000)
+    )
 
 
-def delixi(it: Message) -> bool:
+def delixi(message: Message) -> bool:
     """Bits 2, 3 and 6 to 15 are reserved, bits 4 and 5 together are the toggle; run has its direction."""
-    if it.start == 0x2000:
-        return it.function == 6 and word(it) in (0, 1, 0x12, 0x22, 0x13, 0x23)
-    return it.function == 6 and it.start == 2
+    if message.start == 0x2000:
+        return message.function == 6 and word(message) in (0, 1, 0x12, 0x22, 0x13, 0x23)
+    return message.function == 6 and message.start == 2
 
 
-def native(it: Message) -> bool:
-    if it.function == 2:
-        return it.start in (1, 2, 3, 4) and word(it) == 0
-    return (it.function == 4 and it.start in (1, 7)) or (it.function == 6 and it.start == 2)
+def native(message: Message) -> bool:
+    if message.function == 2:
+        return message.start in (1, 2, 3, 4) and word(message) == 0
+    return (message.function == 4 and message.start in (1, 7)) or (
+        message.function == 6 and message.start == 2
+    )
 
 
-def yd(it: Message) -> bool:
+def yd(message: Message) -> bool:
     """Bits 5 and 4 are reserved; bit 15 stays; a reset goes alone; some parameters are the panel's."""
-    if it.start == 0x1000:
-        control = word(it)
+    if message.start == 0x1000:
+        control = word(message)
         resets = control & 0x2000 and control & 0x0500
-        return it.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
+        return message.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
     never = (1, 2, 3, 4, 6, 7, 8, 0x15, 0x16, 0x103, 0x104, *range(0x110, 0x116), 0x0800, 0x0801, 0x0802)
-    readings = it.start == 0x1100 or 0x1200 <= it.start <= 0x1214
+    readings = message.start == 0x1100 or 0x1200 <= message.start <= 0x1214
     return (
-        it.function == 6
-        and it.start not in never
+        message.function == 6
+        and message.start not in never
         and not readings
-        and not set("ABCDEF") & set(f"{it.start:X}")
+        and not set("ABCDEF") & set(f"{message.start:X}")
     )
 
 
@@ -130,7 +135,7 @@ def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any
         return name, lambda line, drive: drive.set_frequency(hz)
     if name in ("write", "broadcast"):
         registers = list(family.registers.values())
-        moving = [it for it in registers if it.harmless is not None]
+        moving = [each for each in registers if each.harmless is not None]
         register = draw(st.one_of(st.sampled_from(moving), st.sampled_from(registers)))
         value = draw(values(register))
         if name == "write":
@@ -206,15 +211,15 @@ def play(line: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
             assert not sim.motor.energised, f"{name} started the motor"
 
 
-def resets(model: str, it: Message) -> bool:
+def resets(model: str, message: Message) -> bool:
     """A reset is a pulse: once in a call."""
-    if it.address == 0:
+    if message.address == 0:
         return False
     return {
-        "erman-er-g-220": it.function == 5 and it.start == 9 and word(it) != 0,
-        "invt-che": it.start == 0x1000 and word(it) == 7,
-        "innovert-ibd": it.start == 0x2000 and bool(word(it) & 0x10),
+        "erman-er-g-220": message.function == 5 and message.start == 9 and word(message) != 0,
+        "invt-che": message.start == 0x1000 and word(message) == 7,
+        "innovert-ibd": message.start == 0x2000 and bool(word(message) & 0x10),
         "delixi-modbus": False,
-        "delixi-native": it.function == 2 and it.start == 4,
-        "yd1000": it.start == 0x1000 and bool(word(it) & 0x2000),
+        "delixi-native": message.function == 2 and message.start == 4,
+        "yd1000": message.start == 0x1000 and bool(word(message) & 0x2000),
     }[model]

@@ -43,7 +43,7 @@ def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[R
         assert isinstance(sim, MotorDrive)
         sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
         received.append(ReceivedRequests(sim))
-    wire = Wire([it.sim for it in received], unpaced=True)
+    wire = Wire([each.sim for each in received], unpaced=True)
     with (
         Simulator([wire]),
         shared(wire.path, ours.settings.baudrate, seed) as pair,
@@ -140,7 +140,9 @@ def test_starts_and_stops_while_another_client_talks(model: str) -> None:
 
 
 def starts(pair: SharedPair, model: str) -> list[Message]:
-    return [it for it in requests(pair) if it.function in (5, 6, 15, 16) and STARTS[model](it)]
+    return [
+        request for request in requests(pair) if request.function in (5, 6, 15, 16) and STARTS[model](request)
+    ]
 
 
 # ---- at the worst moment: ours is lost, and this is heard within our time-out ----
@@ -198,7 +200,7 @@ def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> Non
         with pytest.raises(FAILURES.get(says, Unconfirmed)):
             getattr(drive, verb)()
         assert pair.sent.count(rtu(PULSES[verb])) == 1
-        assert not any(it.starts or it.sim.motor.energised for it in received)
+        assert not any(each.starts or each.sim.motor.energised for each in received)
         assert received[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
 
 

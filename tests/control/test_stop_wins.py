@@ -85,9 +85,12 @@ class Stops(RuleBasedStateMachine):
         """A client anew, that has written its setpoints, and a mark on the wire."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
-        self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.responders]
+        self.drives = [
+            family(responder.address, name=f"drive-{responder.address}", **options)
+            for responder in self.responders
+        ]
         if self.polling:
-            asked = [polled(it, it.readings()[:2]) for it in self.drives]
+            asked = [polled(each, each.readings()[:2]) for each in self.drives]
             self.poller: Poller | None = Poller(
                 plant(declared_line(self.far.ports[0], *asked)), ledger=self._ledger
             )
@@ -264,8 +267,8 @@ class Stops(RuleBasedStateMachine):
         self.far.bring_back(self.line)
         stopping.join()
         self._close()
-        back = [it for it in self.line.log if it.connection == self.line.connection]
-        assert [str(it) for it in back if it.what == "moves"] == []
+        back = [each for each in self.line.log if each.connection == self.line.connection]
+        assert [str(each) for each in back if each.what == "moves"] == []
         assert failures or not self.responders[0].runs
         for drive in self.responders:  # there may have been no way to stop them
             drive.switch_on()
@@ -304,11 +307,11 @@ class Stops(RuleBasedStateMachine):
         begun = self.begun if begun is None else begun
         return [
             at
-            for at, it in enumerate(list(self.line.log))
+            for at, each in enumerate(list(self.line.log))
             if at >= begun
-            and it.what == what
-            and it.asked is not None
-            and (address is None or it.asked.address in (0, address))
+            and each.what == what
+            and each.asked is not None
+            and (address is None or each.asked.address in (0, address))
         ]
 
     def _judge_order(self, numbers: Any) -> None:
@@ -326,11 +329,13 @@ class Stops(RuleBasedStateMachine):
                 assert not self.responders[number].runs, f"{number + 1} was left running\n{self._story()}"
 
     def _story(self) -> str:
-        return "\n".join(str(it) for it in self.line.log[self.begun :])
+        return "\n".join(str(each) for each in self.line.log[self.begun :])
 
     @invariant()
     def no_frame_of_ours_is_damaged(self) -> None:
-        assert [str(it) for it in getattr(self, "line", ResponderLine([])).log if it.what == "damaged"] == []
+        assert [
+            str(each) for each in getattr(self, "line", ResponderLine([])).log if each.what == "damaged"
+        ] == []
 
     def teardown(self) -> None:
         if not hasattr(self, "_stack"):

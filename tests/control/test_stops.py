@@ -41,12 +41,12 @@ from multidrop.sim import simulated
 every_family = pytest.mark.parametrize("model", MAKE)
 
 STOPS: dict[str, Callable[[Message], bool]] = {  # in the documents' words
-    "erman-er-g-220": lambda it: it.function == 5 and it.start == 1 and it.data != b"\0\0",
-    "invt-che": lambda it: it.start == 0x1000 and it.data[-1] == 5,
-    "innovert-ibd": lambda it: it.start == 0x2000 and it.data[-1] == 1,
-    "delixi-modbus": lambda it: it.start == 0x2000 and it.data[-1] == 1,
-    "delixi-native": lambda it: it.function == 2 and it.start == 1,
-    "yd1000": lambda it: it.start == 0x1000 and it.data[0] == 0xC0,
+    "erman-er-g-220": lambda each: each.function == 5 and each.start == 1 and each.data != b"\0\0",
+    "invt-che": lambda each: each.start == 0x1000 and each.data[-1] == 5,
+    "innovert-ibd": lambda each: each.start == 0x2000 and each.data[-1] == 1,
+    "delixi-modbus": lambda each: each.start == 0x2000 and each.data[-1] == 1,
+    "delixi-native": lambda each: each.function == 2 and each.start == 1,
+    "yd1000": lambda each: each.start == 0x1000 and each.data[0] == 0xC0,
 }
 
 
@@ -83,7 +83,7 @@ def writes(line: SimulatedBus, begun: int = 0) -> list[Message]:
 
 def first(line: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
     """Count the frames before the first write of this kind."""
-    wanted = (at for at, (it, _) in enumerate(line.frames[begun:]) if is_write(it) and met(it))
+    wanted = (at for at, (each, _) in enumerate(line.frames[begun:]) if is_write(each) and met(each))
     return next(wanted, None)
 
 
@@ -199,7 +199,7 @@ def test_the_other_stops_win_too(
 def test_other_drives_are_not_held_up_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
-    one_of_them, other = (line.attach(it.drive) for it in sims)
+    one_of_them, other = (line.attach(sim.drive) for sim in sims)
     other.set_frequency(20)
     Meanwhile(line, 2, one_of_them.stop)
     other.start()
@@ -236,7 +236,7 @@ def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     assert meanwhile.has_come
     stop = first(line, begun, STOPS["yd1000"])
     assert stop is not None
-    after = [it for it in writes(line, begun + stop) if it.start == 0x1001]
+    after = [write for write in writes(line, begun + stop) if write.start == 0x1001]
     assert after == []
 
 
@@ -244,7 +244,7 @@ def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPat
     """Also where it came between two starts: the second one is not called after it by anybody."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims)
-    drives = [line.attach(it.drive) for it in sims]
+    drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(20)
     perform = drives[1].perform
@@ -256,7 +256,7 @@ def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(drives[1], "perform", stop_meanwhile)
     with pytest.raises(Overtaken):
         start_staggered(drives, 1.0)
-    assert not any(it.motor.energised for it in sims)
+    assert not any(sim.motor.energised for sim in sims)
 
 
 def test_after_closing_nothing_that_moves_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -449,7 +449,7 @@ def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = line.seconds
     found = line.bus.stop_all(seconds=12)
     assert 12 <= line.seconds - begun < 13
-    assert {name: it.seen for name, it in found.items()} == {
+    assert {name: each.seen for name, each in found.items()} == {
         "invt-che@1": Seen.STOPPED,
         "erman-er-g-220@2": Seen.SENT,
     }
@@ -468,11 +468,11 @@ def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.Mo
     addresses = [request.address for request, _ in line.frames[begun:]]
     assert [request.address for request in writes(line, begun)][:2] == [3, 2]
     assert addresses[0] == 3
-    before = first(line, begun, lambda it: it.address == 2)
+    before = first(line, begun, lambda each: each.address == 2)
     assert before is not None
     assert addresses[:before].count(1) == 1
     assert found["invt-che@1"].seen is Seen.FAILED
-    assert all(it.address != 1 for it in writes(line, begun))
+    assert all(write.address != 1 for write in writes(line, begun))
 
 
 def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
@@ -485,7 +485,7 @@ def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
     hears_at = line.seconds + 10
     line.deafens = lambda request: line.seconds < hears_at
     drive.emergency_stop()
-    pulses = [it for it in writes(line, begun) if it.start == 0x1000 and it.data[0] & 0x10]
+    pulses = [write for write in writes(line, begun) if write.start == 0x1000 and write.data[0] & 0x10]
     assert len(pulses) == 1
     assert not sim.motor.energised
 
@@ -551,7 +551,7 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
     drives[0].stop()
     assert len(writes(line)) == 1
     found = line.bus.stop_all()
-    assert [it.seen for it in found.values()] == [Seen.STOPPED] * 2
+    assert [each.seen for each in found.values()] == [Seen.STOPPED] * 2
     assert "a stop was not counted" in caplog.text
 
 
@@ -564,7 +564,7 @@ def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
     drive.start()
     for _ in range(3):
         drive.stop()
-    assert [it.data for it in writes(line)] == [b"\0\1", b"\0\0", b"\0\0", b"\0\0"]
+    assert [write.data for write in writes(line)] == [b"\0\1", b"\0\0", b"\0\0", b"\0\0"]
     (wear,) = ledger.wear(1_700_000_000 + line.seconds)
     assert wear.writes == 4
 
@@ -592,7 +592,7 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
     for drive in (Broken(1, name="broken"), Breaks(2, name="breaks"), Own(3, name="own")):
         line.attach(drive)
     found = line.bus.stop_all()
-    assert {name: it.seen for name, it in found.items()} == {
+    assert {name: each.seen for name, each in found.items()} == {
         "broken": Seen.FAILED,
         "breaks": Seen.SENT,
         "own": Seen.STOPPED,
@@ -716,7 +716,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
     line.answers = press
     with pytest.raises(KeyboardInterrupt) as interruption:
         line.bus.stop_all() if all_of_them else drive.stop()
-    stops = [it for it in writes(line, begun) if STOPS[model](it)]
+    stops = [write for write in writes(line, begun) if STOPS[model](write)]
     assert len(stops) == 2
     assert interruption.value.__notes__ == [
         f"{drive.name}: the stop was sent {1 if model != 'erman-er-g-220' else 2} times; "
@@ -854,7 +854,9 @@ class Watching(logging.Handler):
 
 def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Each stop was sent before the first record is written."""
-    line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    line = SimulatedBus(
+        monkeypatch, *(simulated(InvtCHE(number)) for number in (1, 2)), audit=tmp_path / "audit"
+    )
     for address in (1, 2):
         line.attach(InvtCHE(address))
     stopped: list[int] = []

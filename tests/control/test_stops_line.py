@@ -55,7 +55,7 @@ def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
         received.sim.motor.run(1)
         wire.delay = 0.6
         with suppress(BusError):
-            bus.read(drive, next(it for it in drive.registers.values() if it.readable))
+            bus.read(drive, next(register for register in drive.registers.values() if register.readable))
         with suppress(Unconfirmed):  # whether the motor stands may never be seen
             drive.stop(seconds=1)
         assert received.writes
@@ -106,7 +106,7 @@ def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
         bus.close() if ending == "close" else bus.detach(drive)
         thread.join(PATIENCE)
         assert not thread.is_alive()
-        assert [type(it) for it in failures] == [Unconfirmed]
+        assert [type(failure) for failure in failures] == [Unconfirmed]
         assert len(received.writes) == begun + 1
 
 
@@ -128,7 +128,7 @@ def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(mode
         drive.stop()
         stopped.set()
         starting.join(PATIENCE)
-        assert [type(it) for it in failures] in ([Overtaken], [Unconfirmed])
+        assert [type(failure) for failure in failures] in ([Overtaken], [Unconfirmed])
         until(lambda: not received.sim.motor.energised)
 
 
@@ -247,7 +247,7 @@ def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
         drive.set_frequency(20)
         received.loses = lambda request: True
         stopping, _ = in_thread(lambda: drive.stop(seconds=1))
-        until(lambda: any(it.data == b"\0\5" for it in received.writes))
+        until(lambda: any(write.data == b"\0\5" for write in received.writes))
         for call in (drive.start, lambda: drive.set_frequency(30)):
             with pytest.raises((Overtaken, NoReply)):
                 call()

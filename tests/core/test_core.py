@@ -95,7 +95,7 @@ class Rows:
     def of(self, name: str, rows: int) -> list[int]:
         """A column, when there are so many rows."""
         wait_until(lambda: self._taken() >= rows)
-        return [it for columns in self._columns for it in columns.array(name)]
+        return [each for columns in self._columns for each in columns.array(name)]
 
     def _taken(self) -> int:
         while columns := self.row_queue.take():
@@ -199,8 +199,8 @@ def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) 
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows, now = Rows(port), now_ns()
         queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
-        port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
-        said = [STATUSES[it] for it in rows.of("status", len(queued))]
+        port.submit([each for each, _ in queued], [now + at * second for _, at in queued])
+        said = [STATUSES[each] for each in rows.of("status", len(queued))]
     over = "not sent: expired"
     assert said == [over, "ok", over, "ok", "ok", "ok"]
     assert fast.peer.counters().missed == {Status.EXPIRED: 2}
@@ -307,7 +307,7 @@ def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         assert (row_queue.chunks, row_queue.dropped) == (2, 20)
         kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
-        assert [it for columns in kept for it in columns.array("value")] == [*range(10), *range(30, 35)]
+        assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
 def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
@@ -473,7 +473,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
 
         start, others = written(2, 50, permit=latch.permit()), written(3, 51, permit=other.permit())
         wanted = [read(0, timeout=30), read(1, timeout=30), start, others, written(2, 98, insists=True)]
-        threads = [threading.Thread(target=carry_out, args=[it]) for it in wanted]
+        threads = [threading.Thread(target=carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
             time.sleep(0.05)  # those that wait come in this order
@@ -520,7 +520,7 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     def carry_out(exchange: Exchange) -> None:
         found.append(port.carry_out(exchange))
 
-    threads = [threading.Thread(target=carry_out, args=[it]) for it in exchanges]
+    threads = [threading.Thread(target=carry_out, args=[each]) for each in exchanges]
     threads[0].start()
     assert came.wait(120)
     threads[1].start()
@@ -529,8 +529,8 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     for thread in threads:
         thread.join(120)
     port.close()
-    assert [it.result for it in found] == [Failure.LINE_LOST] * 2
-    assert sorted(it.sent_ns > 0 for it in found) == [False, True]
+    assert [each.result for each in found] == [Failure.LINE_LOST] * 2
+    assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
 def wait_until_it_sleeps(thread: threading.Thread) -> None:
@@ -557,8 +557,8 @@ def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        wanted = [read(it, timeout=60.0, insists=insists) for it in (9, 1, 2, 3, 4)]
-        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+        wanted = [read(number, timeout=60.0, insists=insists) for number in (9, 1, 2, 3, 4)]
+        threads = [threading.Thread(target=port.carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
             wait_until_it_sleeps(thread)

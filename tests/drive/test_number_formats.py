@@ -61,7 +61,7 @@ FORMATS = [
     *(Meter.register(wire.name.lower()) for wire in PACKED),
     *(Meter.u32_swapped, Meter.i32_swapped, Meter.f32_swapped),
 ]
-formats = pytest.mark.parametrize("register", FORMATS, ids=lambda it: it.name)
+formats = pytest.mark.parametrize("register", FORMATS, ids=lambda each: each.name)
 
 
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
@@ -137,7 +137,7 @@ def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value:
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
-@pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda it: it.name)
+@pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda each: each.name)
 def test_a_float_is_shown_as_what_it_holds(register: Register[float], raw: float) -> None:
     shown = register.format(register.decode(raw)).partition(" ")[0]
     assert register.encode(register.parse(shown)) == raw

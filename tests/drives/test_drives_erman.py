@@ -85,7 +85,7 @@ def test_bits() -> None:
     assert ErmanERG220.status.number_format is ErmanERG220.last_fault.number_format is NumberFormat.U32_EITHER
     assert ErmanERG220.status.decode(0x22) is ErmanStatus.ACCELERATING_OVERLOADED
     assert ErmanERG220.heatsink_temperature.number_format is NumberFormat.I16
-    assert all(it.kept is Kept.UNKNOWN for it in ErmanERG220.registers.values())
+    assert all(register.kept is Kept.UNKNOWN for register in ErmanERG220.registers.values())
 
 
 def test_0001h_is_read_and_never_written() -> None:
@@ -273,9 +273,11 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
     held = line.bus.read_many(drive, coils)
-    assert held == dict.fromkeys((it.name for it in coils), Coil.OFF)
+    assert held == dict.fromkeys((coil.name for coil in coils), Coil.OFF)
     asked = [frame for request, frame in line.frames if request.function == 1]
-    assert asked == [checksums.rtu(it).hex(" ").upper() for it in ("01 01 00 00 00 03", "01 01 00 09 00 01")]
+    assert asked == [
+        checksums.rtu(name).hex(" ").upper() for name in ("01 01 00 00 00 03", "01 01 00 09 00 01")
+    ]
     drive.set_frequency(20)
     drive.start()
     assert line.bus.read(drive, drive.start_held) is Coil.ON

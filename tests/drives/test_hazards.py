@@ -474,7 +474,7 @@ class Mine(InvtCHE):
     acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
 
-@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda it: it.place)
+@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
 def test_the_safe_thing_is_sent_or_nothing(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
     line, drive, sim = one(monkeypatch, hazard.drive())
     for name, value in hazard.shows.items():
@@ -532,13 +532,15 @@ def test_e12_no_bad_address_is_a_device_failure(code: int) -> None:
 
 def test_e9_e10_the_state_is_one_number_in_either_word() -> None:
     assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
-    assert [ErmanERG220.status.decode(it) for it in range(4)] == list(ErmanStatus)[:4]
+    assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
 def test_e13_e16_no_diagnostics_and_nothing_beyond_the_tables() -> None:
-    assert {it.table.read for it in ErmanERG220.registers.values()} <= {1, 3, 4}
-    assert max(it.address for it in ErmanERG220.registers.values()) == 0x0402
-    assert all(it.address <= 0x58 for it in ErmanERG220.registers.values() if it.table.read == 3)
+    assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
+    assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
+    assert all(
+        register.address <= 0x58 for register in ErmanERG220.registers.values() if register.table.read == 3
+    )
 
 
 def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -566,7 +568,7 @@ def test_e7_a_byte_count_of_coils_is_rounded_up() -> None:
 
 
 def test_e8_the_state_s_reserved_registers_are_no_readings() -> None:
-    state = {it.address for it in ErmanERG220.registers.values() if it.table.read == 4}
+    state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
     assert not state & set(range(0x0007, 0x000C))
 
 
@@ -581,12 +583,12 @@ def test_i3_parity_and_stop_bits_are_the_user_s_to_say() -> None:
 
 
 def test_i6_the_example_without_a_meaning_cannot_be_said() -> None:
-    assert not [it for it in InvtCHE.registers.values() if it.address == 0x0008]
+    assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
 def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
-    line.bus.read_many(drive, [it for it in drive.registers.values() if it.readable])
+    line.bus.read_many(drive, [register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
@@ -639,7 +641,7 @@ def test_d7_the_faults_10_to_14_in_both_spellings() -> None:
 
 
 def test_y5_y6_only_two_functions_and_no_address_0() -> None:
-    assert {(it.table.read, it.table.write) for it in YD1000.registers.values()} == {(3, 6)}
+    assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
     assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
@@ -710,9 +712,11 @@ OF_PRINT_ALONE = {
 
 
 def test_every_erratum_has_its_row_or_a_reason_for_none() -> None:
-    told = [it.place for it in HAZARDS] + [name.upper() for name in globals() if name.startswith("test_")]
+    told = [hazard.place for hazard in HAZARDS] + [
+        name.upper() for name in globals() if name.startswith("test_")
+    ]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):
             erratum = f"{family}{number}"
-            shown = [it for it in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", it)]
+            shown = [record for record in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", record)]
             assert bool(shown) != (erratum in OF_PRINT_ALONE), erratum

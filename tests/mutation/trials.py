@@ -31,7 +31,7 @@ MODULE = [*FLAGS, "-O2", "-fPIC", "-DPy_LIMITED_API=0x030b0000"]
 # An editable installation would find its own modules before those of the copy, as workers of xdist do.
 PYTEST = """
 import sys
-sys.meta_path = [it for it in sys.meta_path if isinstance(it, type)]
+sys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]
 sys.path.insert(0, "src")
 import pytest
 sys.exit(pytest.main(sys.argv[1:]))
@@ -77,7 +77,7 @@ TRIALS: dict[str, tuple[Trial, ...]] = {
 def _core(tree: Path) -> list[str]:
     """The names of the core's files."""
     (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", (tree / "csrc" / "CMakeLists.txt").read_text())
-    return [Path(it).stem for it in sources.replace("${WAITER}", "epoll").split()]
+    return [Path(part).stem for part in sources.replace("${WAITER}", "epoll").split()]
 
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:

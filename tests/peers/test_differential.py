@@ -78,7 +78,7 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
 
 
 def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbus) -> None:
-    replies = [it for it in frames(2, RTU, NUMBER, replies=True) if it.request.function != 0x08]
+    replies = [frame for frame in frames(2, RTU, NUMBER, replies=True) if frame.request.function != 0x08]
     differences = []
     values = 0
     for said, (request, theirs) in zip(replies, libmodbus.ask(replies), strict=True):
@@ -87,7 +87,7 @@ def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbu
         values += isinstance(theirs, Message)
     explain(differences, REPLIES, LIBMODBUS)
     assert values > NUMBER / 3
-    assert any(it.theirs == UNKNOWN_CODE for it in differences)
+    assert any(difference.theirs == UNKNOWN_CODE for difference in differences)
 
 
 # ---- pymodbus ----
@@ -119,7 +119,7 @@ def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None
 @framings
 def test_replies_that_pymodbus_encodes_are_ours_byte_by_byte(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
-    whole = [it for it in frames(5, framing, NUMBER, replies=True) if not it.damage]
+    whole = [frame for frame in frames(5, framing, NUMBER, replies=True) if not frame.damage]
     for said in whole:
         used, reply = parse_reply(framing, said.frame, said.request)
         assert reply is not None, said

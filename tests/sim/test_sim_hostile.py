@@ -66,11 +66,11 @@ def test_the_same_seed_brings_the_same_faults() -> None:
 def test_a_frame_is_damaged_once(fault: str, length: int) -> None:
     line = LineClient(**{fault: 0.5})
     found = [line.bytes_after() for _ in range(200)]
-    damaged = [it for it in found if it not in (REPLY, b"")]
+    damaged = [each for each in found if each not in (REPLY, b"")]
     assert 20 < len(damaged) < 80  # half of them, where the request was spared
-    assert {len(it) - len(REPLY) for it in damaged} == {length}
+    assert {len(each) - len(REPLY) for each in damaged} == {length}
     if fault == "flip":
-        assert {bits(it, REPLY) for it in damaged} == {1}
+        assert {bits(each, REPLY) for each in damaged} == {1}
     assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
 
 

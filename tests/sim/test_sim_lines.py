@@ -69,8 +69,8 @@ def test_many_lines_are_one_thread() -> None:
     before = threads()
     with Simulator(wires) as sim:
         assert threads() == before + 1
-        for at, it in enumerate(sim.wires, 1):
-            with opened(it.path) as fd:
+        for at, each in enumerate(sim.wires, 1):
+            with opened(each.path) as fd:
                 assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)
 
 

@@ -63,7 +63,7 @@ def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
         (InnovertIBD(1), "01 03 00 03 00 01", 10e-3),
         (YD1000(1), "01 03 11 00 00 01", 24 * 11 / 9600),
     ],
-    ids=lambda it: getattr(it, "model", None),
+    ids=lambda each: getattr(each, "model", None),
 )
 def test_each_family_s_silence_before_its_reply(drive: Drive, request_: str, silence: float) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
@@ -215,7 +215,7 @@ def test_noise_can_be_put_on_replies() -> None:
 
 
 def test_a_wire_that_nothing_happens_on_needs_no_waking() -> None:
-    wire = Wire([simulated(it) for it in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
+    wire = Wire([simulated(each) for each in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
     assert wire.wake is None
     wire.receive(b"\x01", 0.0)
     assert wire.wake is not None

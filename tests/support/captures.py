@@ -18,19 +18,19 @@ BEGIN = 1_700_000_000_123_456_789
 STEP = 5_000_001  # ns between two frames
 
 RTU = [
-    it
-    for it in PRINTED
-    if it.request is not None and isinstance(it.says, Message) and it.framing is Framing.RTU
+    each
+    for each in PRINTED
+    if each.request is not None and isinstance(each.says, Message) and each.framing is Framing.RTU
 ]
-TEXT = [it for it in PRINTED if it.request is not None and it.framing is not Framing.RTU]
+TEXT = [each for each in PRINTED if each.request is not None and each.framing is not Framing.RTU]
 
 
 def write(path: Path, exchanges: Iterable[Printed], line: str = "hall-1") -> Path:
     with CaptureWriter(path) as capture:
         time = BEGIN
-        for it in exchanges:
-            capture.write(it.request_frame, Side.ASKING, time, line)
-            capture.write(it.frame, Side.ANSWERING, time + STEP, line)
+        for exchange in exchanges:
+            capture.write(exchange.request_frame, Side.ASKING, time, line)
+            capture.write(exchange.frame, Side.ANSWERING, time + STEP, line)
             time += 2 * STEP
     return path
 

@@ -218,9 +218,11 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
     """Every difference has its rule, and every rule its difference."""
     rules = [rule for rule in rules if judge in rule.judges]
     stale = list(rules)
-    for it in differences:
-        found = next((rule for rule in rules if rule.kind == it.kind and rule.when(it.said)), None)
-        assert found is not None, f"{judge} differs without a rule ({it.kind}): {it}"
+    for difference in differences:
+        found = next(
+            (rule for rule in rules if rule.kind == difference.kind and rule.when(difference.said)), None
+        )
+        assert found is not None, f"{judge} differs without a rule ({difference.kind}): {difference}"
         if found in stale:
             stale.remove(found)
     assert not stale, f"{judge} does not differ any more: {[rule.reason for rule in stale]}"

@@ -52,16 +52,19 @@ class Libmodbus:
 
     def hear(self, requests: Sequence[Said]) -> list[Understood | str]:
         """Return what its server does at these requests, each addressed to it."""
-        return [_received(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
+        return [
+            _received(line) for line in self._run(f"request {_text(request.frame)}" for request in requests)
+        ]
 
     def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
         """The requests that its client sends, and what it makes of these replies."""
-        asked = [it.request for it in replies]
+        asked = [reply.request for reply in replies]
         lines = [
-            f"reply {it.address} {it.function} {it.start} {it.count} {_text(it.data)} {_text(said.frame)}"
-            for it, said in zip(asked, replies, strict=True)
+            f"reply {ask.address} {ask.function} {ask.start} {ask.count} {_text(ask.data)} "
+            f"{_text(said.frame)}"
+            for ask, said in zip(asked, replies, strict=True)
         ]
-        return [_answered(it, line) for it, line in zip(asked, self._run(lines), strict=True)]
+        return [_answered(each, line) for each, line in zip(asked, self._run(lines), strict=True)]
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ def rows_of(poller: Poller) -> list[Row]:
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
     """The same for all that is polled, by the names of drive and register."""
     return {
-        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
-        for it in drives
-        for poll in it.polls
+        (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
+        for drive in drives
+        for poll in drive.polls
     }

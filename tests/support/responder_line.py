@@ -107,7 +107,7 @@ class ResponderLine:
     """
 
     def __init__(self, drives: Sequence[ResponderDrive]) -> None:
-        self.drives = {it.address: it for it in drives}
+        self.drives = {drive.address: drive for drive in drives}
         self.log: list[ReceivedFrame] = []
         self.troubles: list[str | int] = []
         self.deaf_until = 0.0  # s, CLOCK_MONOTONIC

@@ -105,7 +105,7 @@ class SharedPair:
         for listener in sorted(self._sides, key=lambda side: side == self._spoke):
             if listener == self._spoke and self._drives in said:
                 sleep(SLOT)  # a pty is slow: who is answered may act before the other has heard the answer
-            others = [it for speaker, it in said.items() if speaker != listener]
+            others = [each for speaker, each in said.items() if speaker != listener]
             received = self._mixed(others)
             if received:
                 with suppress(BlockingIOError):

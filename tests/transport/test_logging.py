@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("_patient")
 
 
 def messages(caplog: pytest.LogCaptureFixture, logger: str) -> list[tuple[str, str]]:
-    return [(it.levelname, it.getMessage()) for it in caplog.records if it.name == logger]
+    return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == logger]
 
 
 def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> None:
