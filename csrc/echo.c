@@ -1,7 +1,7 @@
 /* Adapters that repeat what they send. A reply that is no copy of its request tells whether the adapter
  * does, and so does a copy that is all that comes before a time-out. Until that is known, no copy is taken
  * for the reply. */
-#include "internal.h"
+#include "line.h"
 
 #include <string.h>
 

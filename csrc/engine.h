@@ -3,7 +3,7 @@
 #ifndef MULTIDROP_ENGINE_H
 #define MULTIDROP_ENGINE_H
 
-#include "internal.h"
+#include "turn.h"
 
 #include <pthread.h>
 

@@ -8,46 +8,19 @@
  *
  * A reply that fits an outstanding request as well is counted as that one's. Whichever it answers, the
  * earliest request that it fits is accounted for, and so is all that was sent before it. */
-#include "internal.h"
+#include "line.h"
 
 #include <string.h>
 
-enum { DATA_KEPT = sizeof((struct md_owed){0}.data), LAST_READ = 0x04 };
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no path holds anything up for so long */
 
-/* ---- what could be taken for what ---- */
-
-static uint8_t data_kept(const struct md_message *request)
-{
-    return (uint8_t)(request->data_len < DATA_KEPT ? request->data_len : DATA_KEPT);
-}
-
-static struct md_owed outstanding(const struct md_exchange *exchange)
-{
-    const struct md_message *request = &exchange->request;
-    struct md_owed owed = {.framing = (uint8_t)exchange->framing, .address = request->address,
-                           .function = request->function, .start = request->start, .count = request->count,
-                           .reply_len = (uint16_t)md_reply_length(exchange->framing, request),
-                           .least = exchange->least, .most = exchange->most,
-                           .data_len = data_kept(request)};
-    memcpy(owed.data, request->data, owed.data_len);
-    return owed;
-}
-
-static int is_same_request(const struct md_owed *owed, const struct md_exchange *exchange)
-{
-    const struct md_message *request = &exchange->request;
-    return owed->framing == exchange->framing && owed->function == request->function &&
-           owed->start == request->start && owed->count == request->count &&
-           owed->least == exchange->least && owed->most == exchange->most &&
-           memcmp(owed->data, request->data, data_kept(request)) == 0;
-}
+/* ---- outstanding requests of a drive ---- */
 
 /* Find the same request among the drive's outstanding ones. */
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_same_request(&drive->history->owed[i], exchange))
+        if (md_owed_is_same(&drive->history->owed[i], exchange))
             return &drive->history->owed[i];
     return NULL;
 }
@@ -57,64 +30,10 @@ int md_late_is_repeated(const struct md_exchange *exchange)
     return find_same(exchange->drive, exchange) != NULL;
 }
 
-static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
-{
-    return !owed->most || !exchange->most || (owed->least <= exchange->most && exchange->least <= owed->most);
-}
-
-int md_is_read(int framing, uint8_t function)
-{
-    if (framing == MD_DELIXI)
-        return function == MD_DELIXI_STATE_QUERY || function == MD_DELIXI_PARAMETER_QUERY;
-    return function <= LAST_READ;
-}
-
-/* A reply to the one could pass for the reply to the other. An exception does not say which write it
- * refuses, and a start that is wrongly reported as refused is a motor that is wrongly reported to stand. */
-static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
-{
-    const struct md_message *request = &exchange->request;
-    if (owed->framing != exchange->framing)
-        return 0;
-    if (!md_is_read(exchange->framing, request->function))
-        return exchange->framing == MD_DELIXI || owed->function == request->function;
-    if (owed->function != request->function)
-        return 0;
-    if (exchange->framing == MD_DELIXI)
-        return owed->start == request->start || owed->function == MD_DELIXI_STATE_QUERY;
-    return owed->reply_len == md_reply_length(exchange->framing, request) &&
-           may_hold_the_same(owed, exchange);
-}
-
-int md_is_in_range(const struct md_message *reply, uint16_t least, uint16_t most)
-{
-    int value = reply->data[0] << 8 | reply->data[1];
-    return most == 0 || reply->exception || reply->data_len < 2 || (value >= least && value <= most);
-}
-
-static int64_t last_ns(const struct md_owed *owed)
-{
-    return owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1];
-}
-
-static void add_time(struct md_owed *owed, int64_t sent_ns)
-{
-    if (owed->times >= MD_TIMES_KEPT)
-        memmove(owed->sent_ns + 1, owed->sent_ns + 2, (MD_TIMES_KEPT - 2) * sizeof *owed->sent_ns);
-    owed->times++;
-    owed->sent_ns[(owed->times < MD_TIMES_KEPT ? owed->times : MD_TIMES_KEPT) - 1] = sent_ns;
-}
-
-static void drop_earliest_time(struct md_owed *owed)
-{
-    if (owed->times-- <= MD_TIMES_KEPT)
-        memmove(owed->sent_ns, owed->sent_ns + 1, (MD_TIMES_KEPT - 1) * sizeof *owed->sent_ns);
-}
-
 /* No reply to a later request has come: that would settle this one. */
 static int is_open(const struct md_drive *drive, const struct md_owed *owed)
 {
-    return last_ns(owed) > drive->answered_ns;
+    return md_owed_last_ns(owed) > drive->answered_ns;
 }
 
 static void drop(struct md_drive *drive, struct md_owed *owed)
@@ -127,10 +46,12 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
     for (uint32_t i = drive->owed_count; i-- > 0;) {
         struct md_owed *owed = &drive->history->owed[i];
         int is_over = now_ns >= drive->late_until_ns && (!is_open(drive, owed) || drive->proof_count == 0);
-        if (is_over || now_ns - last_ns(owed) > FORGET_NS)
+        if (is_over || now_ns - md_owed_last_ns(owed) > FORGET_NS)
             drop(drive, owed);
     }
 }
+
+/* ---- what may be sent ---- */
 
 /* An outstanding reply could be taken for the exchange's; `own`: count one to the same request too. */
 static int has_mistakable(const struct md_exchange *exchange, int own)
@@ -139,14 +60,12 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* room is kept for the proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
-        int counts = is_open(drive, owed) && (own || !is_same_request(owed, exchange));
-        if (counts && (is_crowded || is_mistakable(owed, exchange)))
+        int counts = is_open(drive, owed) && (own || !md_owed_is_same(owed, exchange));
+        if (counts && (is_crowded || md_owed_is_mistakable(owed, exchange)))
             return 1;
     }
     return 0;
 }
-
-/* ---- what may be sent ---- */
 
 /* An exception names the function at most, and in Delixi's own protocol not even that. */
 static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
@@ -191,15 +110,15 @@ static const struct md_exchange *last_proof(const struct md_drive *drive)
 static int is_sent_alone(const struct md_exchange *exchange)
 {
     const struct md_exchange *last = last_proof(exchange->drive);
-    struct md_owed own = outstanding(exchange);
+    struct md_owed own = md_owed_of(exchange);
     return exchange->drive->failures > 0 && !has_mistakable(exchange, 0) &&
-           (!last || !is_mistakable(&own, last));
+           (!last || !md_owed_is_mistakable(&own, last));
 }
 
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_open(drive, &drive->history->owed[i]) && is_mistakable(&drive->history->owed[i], proof))
+        if (is_open(drive, &drive->history->owed[i]) && md_owed_is_mistakable(&drive->history->owed[i], proof))
             return 0;
     return 1;
 }
@@ -208,7 +127,7 @@ static int is_free(const struct md_drive *drive, const struct md_exchange *proof
 static int64_t sent_last_ns(struct md_drive *drive, const struct md_exchange *proof)
 {
     const struct md_owed *owed = find_same(drive, proof);
-    return owed ? last_ns(owed) : 0;
+    return owed ? md_owed_last_ns(owed) : 0;
 }
 
 const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int64_t now_ns)
@@ -247,7 +166,7 @@ static struct md_owed *place_of(struct md_drive *drive, const struct md_exchange
     struct md_owed *owed = find_same(drive, exchange);
     if (!owed && drive->owed_count < MD_MOST_OWED) {
         owed = &drive->history->owed[drive->owed_count++];
-        *owed = outstanding(exchange);
+        *owed = md_owed_of(exchange);
     }
     return owed;
 }
@@ -261,7 +180,7 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
     forget_settled(drive, line->quiet_ns);
     struct md_owed *owed = place_of(drive, exchange);
     if (owed)
-        add_time(owed, line->quiet_ns);
+        md_owed_add_time(owed, line->quiet_ns);
     drive->late_until_ns = later(until_ns, drive->late_until_ns);
     md_late_link(line, drive);
 }
@@ -285,19 +204,6 @@ void md_late_inherit(struct md_drive *drive, const struct md_drive *before)
 
 /* ---- late replies ---- */
 
-/* Parse the reply to this that begins there: its length, MD_INCOMPLETE or a reason. */
-static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
-{
-    struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
-                                 .count = owed->count, .data_len = owed->data_len};
-    struct md_message reply;
-    memcpy(request.data, owed->data, owed->data_len);
-    if (owed->framing == MD_RTU && bytes[0] != owed->address)
-        return MD_BAD_ADDRESS;
-    int used = md_parse_reply(owed->framing, bytes, len, &request, &reply);
-    return used > 0 && !md_is_in_range(&reply, owed->least, owed->most) ? MD_BAD_ECHO : used;
-}
-
 /* Account for the earliest request of the drive that the reply there fits: its length, MD_INCOMPLETE or
  * MD_NO_START. One that fits a single request, and not the present one, tells how late the drive is. */
 static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int64_t now_ns, int64_t *since_ns)
@@ -306,7 +212,7 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     int found = MD_NO_START, length = 0, fits = 0;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         struct md_owed *owed = &drive->history->owed[i];
-        int used = parse_owed(owed, line->rx + at, line->rx_len - at);
+        int used = md_owed_parse(owed, line->rx + at, line->rx_len - at);
         if (used == MD_INCOMPLETE)
             found = used;
         fits += used > 0;
@@ -321,10 +227,10 @@ static int take_of(struct md_drive *drive, struct md_line *line, size_t at, int6
     md_count_failures(drive, 0);
     drive->answered_ns = later(drive->answered_ns, earliest->sent_ns[0] - 1);
     if (since_ns)
-        *since_ns = is_same_request(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
+        *since_ns = md_owed_is_same(earliest, line->exchange) ? earliest->sent_ns[0] : 0;
     else if (fits == 1)
-        md_learn_lateness(drive, now_ns - last_ns(earliest), earliest->times == 1);
-    drop_earliest_time(earliest);
+        md_learn_lateness(drive, now_ns - md_owed_last_ns(earliest), earliest->times == 1);
+    md_owed_drop_time(earliest);
     if (earliest->times == 0)
         drop(drive, earliest);
     if (drive->owed_count == 0)

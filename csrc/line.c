@@ -3,7 +3,7 @@
  *
  * Junk, an echo, or another station's frame may come before the reply on real lines. Neither they nor a
  * damaged frame end the exchange: the time-out keeps running (serial-line guide V1.02, 2.4.1). */
-#include "internal.h"
+#include "line.h"
 
 #include <errno.h>
 #include <string.h>
@@ -40,81 +40,7 @@ static int go(struct md_line *line, enum md_line_event event)
     return 1;
 }
 
-/* At least a part of the request has left. */
-static int is_under_way(const struct md_line *line)
-{
-    return line->state >= WRITING;
-}
-
 /* ---- the end of an exchange ---- */
-
-/* The drive does not answer, or cannot be reached. Damage says that it does. */
-static int is_failure(int result)
-{
-    switch (result) {
-    case MD_BAD_CHECKSUM:
-    case MD_BAD_CHARACTER:
-    case MD_LATE_ANSWER_DUE:
-    case MD_MAYBE_ECHO:
-    case MD_EXPIRED:
-    case MD_LINE_LOST:
-    case MD_POLL_ENDED:
-        return 0;
-    default:
-        return result < 0;
-    }
-}
-
-static void count_reply(struct md_block *block, uint8_t exception)
-{
-    if (exception) {
-        block->refusals++;
-        block->refusal = exception;
-    } else if (block->refusals || !block->is_answered) { /* mostly nothing is written */
-        block->refusals = 0;
-        block->is_answered = 1;
-    }
-    if (block->failures)
-        block->failures = 0;
-}
-
-static void count(const struct md_exchange *exchange, const struct md_completion *completion)
-{
-    struct md_drive *drive = exchange->drive;
-    struct md_block *block = exchange->block;
-    md_counters_end(exchange, completion);
-    if (is_failure(completion->result)) {
-        md_count_failures(drive, drive->failures + 1);
-        if (block)
-            block->failures++;
-    }
-    if (completion->result <= 0)
-        return;
-    md_count_failures(drive, 0);
-    if (block)
-        count_reply(block, completion->reply.exception);
-}
-
-static void tap(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
-{
-    if (line->tap && is_under_way(line)) /* what came before was put there when it came */
-        md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
-}
-
-/* What came since the request began to leave: the reply, or what came in its place, amid the rest. */
-static void tap_received(const struct md_line *line, struct md_ending ending)
-{
-    const struct md_completion *completion = line->completion;
-    size_t at = ending.at, len = ending.len;
-    int may_be_echo = ending.result <= 0 && !line->transactions && line->tx_len > 0;
-    if (may_be_echo && at == 0 && len >= line->tx_len && md_echo_is_copy(line, 0)) {
-        at += line->tx_len; /* the adapter's echo */
-        len -= line->tx_len;
-    }
-    tap(line, MD_NOISE, completion->first_ns, line->rx, at);
-    tap(line, ending.result > 0 ? MD_ANSWERING : MD_FAILED, completion->first_ns, line->rx + at, len);
-    tap(line, MD_NOISE, completion->last_ns, line->rx + at + len, line->rx_len - at - len);
-}
 
 /* A network needs none. Where replies have no ids to be told by, it shows whether more is to come, such as a
  * second copy, which could otherwise be taken for the next reply. */
@@ -127,13 +53,8 @@ static int64_t silence_of(const struct md_line *line, const struct md_exchange *
 
 static void finish(struct md_line *line, struct md_ending ending)
 {
-    struct md_completion *completion = line->completion;
-    if (line->tap)
-        tap_received(line, ending);
-    size_t most = sizeof completion->raw, cut = ending.len > most ? ending.len - most : 0;
-    completion->result = ending.result;
-    completion->raw_len = (uint16_t)(ending.len - cut);
-    memcpy(completion->raw, line->rx + ending.at + cut, completion->raw_len);
+    const struct md_completion *completion = line->completion;
+    md_line_complete(line, ending);
     line->rx_len = line->rx_from = 0;
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
     if (line->transactions && completion->last_ns) /* a network takes the next request at once */
@@ -141,7 +62,6 @@ static void finish(struct md_line *line, struct md_ending ending)
     if (completion->sent_ns) /* else the silence after what went before still holds */
         line->silence_ns = silence_of(line, line->exchange);
     go(line, MD_ENDED);
-    count(line->exchange, completion);
 }
 
 /* End it with all that came. */
@@ -283,8 +203,8 @@ static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
-    if (is_under_way(line)) /* else there is no completion, or its owner has it back */
-        tap(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
+    if (md_line_is_under_way(line)) /* else there is no completion, or its owner has it back */
+        md_line_tap(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
     line->rx_from = (uint16_t)(line->rx_from > GONE ? line->rx_from - GONE : 0);
@@ -308,7 +228,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
     if (line->state != IDLE)
         line->completion->stale += (uint32_t)len;
-    if (!is_under_way(line))
+    if (!md_line_is_under_way(line))
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
     if (line->state == IDLE || now_ns < line->give_up_ns)
         go(line, MD_STRAY_BYTES);

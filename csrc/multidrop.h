@@ -1,26 +1,25 @@
-/* The functions of the C core that Python calls; internal.h has those that only C calls.
+/* The functions of the C core that Python calls: frames, drives and ports. Those of rows are in rows.h, those
+ * of captures in capture.h, and those that only C calls in internal.h, line.h, turn.h and engine.h.
  *
  * Each section begins with its one return rule. Times are in ns, of CLOCK_MONOTONIC where they are moments.
  * All but port, engine, row queue and clock are pure: no I/O, no callbacks, no globals. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
-#include <stddef.h>
-#include <stdint.h>
+#include "rows.h"
 
 /* cdef: begin */
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
+    MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
     MD_STATUSES = 19,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
     MD_MOST_PROOFS = 4,
-    MD_TIMES_KEPT = 6,        /* of the same request */
-    MD_MOST_NUMBERS = 65536,  /* of a row queue's ports */
-    MD_MOST_INVALID = 8       /* counts of a register that mean no value */
+    MD_TIMES_KEPT = 6         /* of the same request */
 };
 
 /* ---- checksum.c: return the checksum ---- */
@@ -100,94 +99,6 @@ int64_t md_now_ns(void);
 /* Return UTC - CLOCK_MONOTONIC. The value is kept while it is right to 0.1 ms, so that a moment has the same
  * UTC in every recording. */
 int64_t md_utc_minus_monotonic_ns(void);
-
-/* ---- columns.c: return NULL where there is no memory; md_value a number, NaN where there is none ---- */
-
-enum md_number_format {
-    MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
-    MD_I8, /* the low byte of a word */
-    MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32,
-    MD_LOW_WORD_FIRST = 0x40, /* added to a format of several words */
-    MD_LOW_BYTE_FIRST = 0x80  /* added to any but MD_BIT: within each word */
-};
-
-/* Read the number at word (MD_BIT: bit) `at` of a reply's data: none where a BCD digit is above 9. */
-double md_value(const uint8_t *data, size_t len, size_t at, int format);
-
-/* A register's place in a block's reply, and its scale: value = raw * multiplier / divisor. */
-struct md_field {
-    uint16_t at;
-    uint8_t format; /* enum md_number_format */
-    uint16_t reg;   /* code of its name */
-    uint16_t extra; /* 0: none; else it is the block's extra[extra - 1] */
-    double multiplier, divisor;
-};
-
-/* Bits of a number that mean that there is no value: bits & mask == pattern. */
-struct md_invalid {
-    uint64_t mask, pattern;
-};
-
-/* The rest of a field, which few have. */
-struct md_extra {
-    double addend;         /* value = (raw * multiplier + addend) / divisor */
-    uint8_t low, bits;     /* raw is so many bits of the number, from this one on; bits 0: the number */
-    uint8_t scale_format;  /* of the number whose power of ten it is multiplied by, at word scale_at; */
-    uint8_t has_scale;     /* beyond 10^-22 to 10^22 there is no value */
-    uint16_t scale_at;
-    uint8_t invalid_count, scale_invalid_count; /* the scale's follow on the number's own */
-    struct md_invalid invalid[MD_MOST_INVALID];
-};
-
-/* The fields of a drive's reply. Drives of a kind share them. */
-struct md_block {
-    const struct md_field *fields;
-    const struct md_extra *extra;
-    int count;
-    uint32_t refusals; /* exceptions in a row */
-    uint32_t failures; /* exchanges in a row without a reply, or with a bad one */
-    uint8_t refusal;   /* the last one's code */
-    uint8_t may_lack;  /* a good reply may hold no value for some field */
-    uint8_t is_answered; /* a good reply came once that was no exception */
-    uint16_t drive;    /* code of its name */
-};
-
-/* A row's status: why it has no value. Any other is -enum md_failure or -enum md_frame_fault. */
-enum md_status {
-    MD_OK = 0,
-    MD_NOT_ASKED = 15, /* the drive is silent and is given a rest */
-    MD_NO_VALUE = 18,  /* the reply holds what the device gives in place of a value: NaN, an invalid count */
-    MD_EXCEPTION = 256 /* + the exception's code */
-};
-
-/* Rows. All arrays have `room` elements. */
-struct md_columns {
-    int64_t *time, *sent;           /* of the request, UTC and monotonic; of its turn where it never left */
-    int64_t *uncertainty;           /* ns until the reply began */
-    uint16_t *drive, *reg, *status; /* enum md_status */
-    double *value;
-    uint8_t *valid;                 /* bitmap, least significant bit first: value and uncertainty exist */
-    size_t rows, room;
-};
-
-struct md_columns *md_columns_new(size_t room);
-void md_columns_free(struct md_columns *columns);
-
-/* Write the names of `n` codes as an Arrow utf8 column: n + 1 offsets, and the text. Name i is
- * bytes[offsets[i]] to bytes[offsets[i + 1]]. Return the text's length; -1 where `room` is too small or a
- * code has no name. */
-int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
-                 int32_t *out_offsets, uint8_t *out, size_t room);
-
-/* ---- narrow.c: columns as recordings hold them ---- */
-
-/* The next float that is no less. */
-void md_narrow_up(const int64_t *numbers, size_t n, float *out);
-/* Whole numbers of floats, 0 where the bitmap `valid` (NULL: all are) has none; -1 where one is none. */
-int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
-/* The numbers of codes below `known`; return the place of the first code whose number is negative, else n. */
-size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
-void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
 
 /* ---- delay.c, late.c, counters.c: what is known of a drive; return a time in ns ---- */
 
@@ -328,7 +239,6 @@ struct md_progress {
 
 struct md_engine;
 struct md_port;
-struct md_row_queue;
 struct md_tap;
 
 struct md_engine *md_engine_start(void); /* the thread for every line of the process; it ends with that */
@@ -369,176 +279,6 @@ void md_count_stop(uint32_t *stops);
  * a 20th of the line, one exchange at a time, but none while one that insists waits. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
-
-/* ---- row_queue.c: return NULL where there is nothing, or no memory; else a number ---- */
-
-/* Keep up to `most_chunks` chunks of rows; rows that come when all are full are dropped and counted. */
-struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
-/* Free it once no port reports to it. Chunks taken before may be given back afterwards. */
-void md_row_queue_free(struct md_row_queue *row_queue);
-/* Add rows for values that were due at a time and not asked for. */
-void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
-                       int64_t due_ns);
-struct md_columns *md_row_queue_take(struct md_row_queue *row_queue); /* the oldest chunk */
-void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *columns);
-size_t md_row_queue_chunks(struct md_row_queue *row_queue); /* with rows; the newest is still being filled */
-uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* rows */
-void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client about this port */
-/* Wait for a call, at most so long; write the numbers called, each once, and return how many. */
-int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
-
-/* ---- tap.c: return a length in bytes ---- */
-
-/* The sender, where it is known. The last two are no frames by the master's own account. */
-enum md_side {
-    MD_EITHER_SIDE,
-    MD_ASKING,
-    MD_ANSWERING,
-    MD_FAILED, /* came in place of a reply */
-    MD_NOISE,  /* stray bytes, echo, late replies */
-    MD_SIDES
-};
-
-/* A ring with one writer and one reader. Zeroed but for `ring` and `room` it is empty. */
-struct md_tap {
-    uint8_t *ring;
-    uint32_t room;       /* bytes, a power of two */
-    uint32_t put, taken; /* each has one writer, only grows, and wraps around */
-    uint64_t lost;       /* bytes without room */
-};
-
-/* Header and trailer of a packet. Each side has two: for any bytes, and for those that begin with ':'. */
-struct md_wrapping {
-    const uint8_t *head, *tail;
-    uint32_t head_len, tail_len; /* the tail's is a multiple of 4 */
-};
-
-/* Write whole pcapng packets to `out` while there is room. */
-size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
-                   int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
-/* Return the length of the packet with `len` bytes that begin with `first`. */
-size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
-void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
-                   const uint8_t *bytes, size_t len, uint8_t *out);
-
-/* ---- split.c: return 1; 0 when room (md_stream_put) or more bytes (md_split) are needed ---- */
-
-/* Bytes that came together, from `at` up to the next piece. */
-struct md_piece {
-    size_t at;
-    int64_t time_ns;
-    uint8_t side;           /* enum md_side */
-    uint8_t is_after_pause; /* the line was silent before them: a hint */
-};
-
-/* Sniffed bytes that are not yet forgotten. */
-struct md_stream {
-    uint8_t *bytes;
-    struct md_piece *pieces;
-    size_t len, room, count, most; /* of the bytes, of the pieces */
-    int is_all;                    /* nothing more will come */
-    int is_tcp;                    /* all frames are MD_TCP's; else none is */
-};
-
-enum md_kind {
-    MD_JUNK,    /* no frame */
-    MD_REQUEST,
-    MD_EITHER,  /* a request, or its copy that confirms it: what came before was not understood */
-    MD_REPLY,   /* to the request before it */
-    MD_STRAY    /* a reply without its request */
-};
-
-/* Sniffed bytes that belong together. */
-struct md_span {
-    size_t at, len;
-    int64_t time_ns; /* time and side of the piece in which it begins */
-    int side;
-    int kind, framing;
-    struct md_message message;
-};
-
-/* Zeroed, it is at the beginning. */
-struct md_splitter {
-    size_t at, piece;          /* what comes next */
-    size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* a frame came last: requests and their copies alternate */
-    int awaited, framing;      /* of the reply to `request` */
-    struct md_message request; /* the last one */
-};
-
-/* Append a piece. */
-int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
-/* Forget what was split. */
-void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
-/* Find the next span. Every byte is part of one. Only pauses and sides matter of how the bytes came in; junk
- * comes in any number of spans. */
-int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
-
-/* ---- decode.c: return an enum md_decoded ---- */
-
-/* The fields of a request's reply; key 0: an empty place. */
-struct md_known {
-    uint64_t key;
-    const struct md_block *block;
-};
-
-/* Zeroed but for `known` and `places`, a power of two, it is at the beginning. */
-struct md_decoder {
-    struct md_splitter splitter;
-    struct md_span span;
-    struct md_known *known;
-    size_t places, taken;
-    const struct md_block *block; /* of the last request */
-    int64_t asked_ns;
-    int is_sure, failure;         /* it was a request; why it has no reply, if none comes */
-    int is_due;                   /* `span` is still to be dealt with */
-    uint64_t frames, exchanges, junk, strays;
-    struct md_completion completion;
-};
-
-enum md_decoded {
-    MD_ALL_DECODED, /* but for what needs more bytes */
-    MD_NO_ROOM,     /* in the columns */
-    MD_UNKNOWN      /* the request in `span`: call md_know(), and again */
-};
-
-/* Say what replies to this request hold; NULL: nothing that makes rows. Return 0 when the table is full. */
-int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
-            const struct md_block *block);
-/* Add the rows of every sniffed exchange, also of requests without a reply. */
-int md_decode(struct md_decoder *decoder, const struct md_stream *stream, struct md_columns *columns);
-
-/* ---- unpack.c: return an enum md_unpacked ---- */
-
-enum { MD_LINK_RTAC = 250, MD_LINK_EXPORTED = 252 }; /* link types with a header; all others: bare bytes */
-
-/* One interface of a capture: a line. */
-struct md_channel {
-    uint32_t link;
-    int has_sides;        /* the packets' directions are right */
-    uint64_t ticks_per_s; /* of the packets' time stamps */
-    int64_t offset_ns;
-    struct md_stream stream;
-};
-
-struct md_capture {
-    const uint8_t *bytes;
-    size_t len, at;
-    int is_pcapng, is_big_endian;
-    struct md_channel *channels;
-    size_t count;
-};
-
-enum md_unpacked {
-    MD_UNPACKED,      /* all of it */
-    MD_CHANNEL_FULL,  /* split what the channels hold, and again */
-    MD_OTHER_BLOCK,   /* of a pcapng file, at `at`: for the caller to read */
-    MD_CUT,           /* the file ends within a packet */
-    MD_NONSENSE       /* no packet begins at `at` */
-};
-
-/* Append packets to their channels' streams. */
-int md_unpack(struct md_capture *capture);
 /* cdef: end */
 
 #endif

@@ -2,25 +2,17 @@
  * is repeated. The last two keep a share of the line beside urgent requests without end, but for those that
  * insist.
  *
- * Before an exchange come, where they are needed, proofs that no late reply is taken for its own, and an
- * echo probe. Its caller brings the time, carries the bytes, and guards it: only md_turn_submit() takes no
- * lock. */
-#include "internal.h"
+ * Its caller brings the time, carries the bytes, and guards it: only md_turn_submit() takes no lock. */
+#include "turn.h"
 
 enum {
-    POLLED = 20,             /* one part in so many of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000, /* of that, where there was nothing to poll */
-    MOST_PROOFS_SENT = 12    /* before one exchange */
+    POLLED = 20,            /* one part in so many of a line that urgent requests keep busy */
+    MOST_OWED_NS = 50000000 /* of that, where there was nothing to poll */
 };
 
-static uint32_t get(const uint32_t *counter)
+static uint32_t pending(const struct md_turn *turn)
 {
-    return __atomic_load_n(counter, __ATOMIC_SEQ_CST);
-}
-
-static void put(uint32_t *counter, uint32_t value)
-{
-    __atomic_store_n(counter, value, __ATOMIC_SEQ_CST);
+    return md_load(&turn->progress.submitted) - turn->progress.done;
 }
 
 static void call(struct md_turn *turn)
@@ -29,112 +21,7 @@ static void call(struct md_turn *turn)
         md_row_queue_call(turn->row_queue, turn->number);
 }
 
-static uint32_t pending(const struct md_turn *turn)
-{
-    return get(&turn->progress.submitted) - turn->progress.done;
-}
-
-/* ---- what its clients want ---- */
-
-void md_turn_init(struct md_turn *turn, struct md_slot *slots, uint32_t room, int64_t now_ns)
-{
-    *turn = (struct md_turn){.slots = slots, .room = room, .is_idle = 1};
-    md_line_init(&turn->line, now_ns);
-}
-
-int md_turn_submit(struct md_turn *turn, const struct md_exchange *const *exchanges,
-                   const int64_t *not_before_ns, int n)
-{
-    uint32_t submitted = turn->progress.submitted;
-    uint32_t free_slots = turn->room - (submitted - get(&turn->progress.done));
-    int taken = 0;
-    for (; taken < n && (uint32_t)taken < free_slots; taken++)
-        turn->slots[(submitted + (uint32_t)taken) & (turn->room - 1)] =
-            (struct md_slot){.exchange = exchanges[taken], .not_before_ns = not_before_ns[taken]};
-    put(&turn->progress.submitted, submitted + (uint32_t)taken);
-    return taken;
-}
-
-uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *exchanges, uint32_t n)
-{
-    uint32_t next = turn->round_at;
-    turn->round = exchanges;
-    turn->round_len = turn->progress.lost ? 0 : n;
-    turn->round_at = 0;
-    put(&turn->progress.repeating, turn->round_len > 0);
-    return next;
-}
-
-void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
-{
-    struct md_urgent **at = &turn->urgent;
-    if (*at && turn->whose == MD_URGENT) /* it is under way */
-        at = &(*at)->next;
-    for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* the first one goes first */
-            at = &(*waiting)->next;
-    urgent->next = *at;
-    *at = urgent;
-}
-
-void md_turn_tell_echo(struct md_turn *turn, int echo)
-{
-    turn->line.echo = (uint8_t)echo;
-    turn->line.echo_is_told = echo == MD_ECHO; /* an echo that shows is believed: it confirms no write */
-    put(&turn->progress.echo, (uint32_t)echo);
-}
-
-int md_turn_end(struct md_turn *turn)
-{
-    turn->is_ending = 1;
-    return turn->whose != MD_NOBODYS && turn->whose != MD_URGENT;
-}
-
-int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive)
-{
-    if (turn->whose != MD_NOBODYS && turn->line.exchange->drive == drive)
-        return 1;
-    uint32_t submitted = get(&turn->progress.submitted);
-    for (uint32_t at = turn->progress.done; at != submitted; at++)
-        if (turn->slots[at & (turn->room - 1)].exchange->drive == drive)
-            return 1;
-    for (uint32_t at = 0; at < turn->round_len; at++)
-        if (turn->round[at]->drive == drive)
-            return 1;
-    for (const struct md_urgent *urgent = turn->urgent; urgent; urgent = urgent->next)
-        if (urgent->exchange->drive == drive)
-            return 1;
-    return 0;
-}
-
-/* ---- what goes before an exchange ---- */
-
-static uint64_t replies(const struct md_drive *drive)
-{
-    return drive->counters.answered + drive->counters.late;
-}
-
-/* Return what to send before the exchange; NULL: it is its turn. */
-static const struct md_exchange *find_first(struct md_before *before, const struct md_exchange *exchange,
-                                            int echo, int64_t now_ns)
-{
-    const struct md_drive *drive = exchange->drive;
-    if (before->then != exchange)
-        *before = (struct md_before){.then = exchange, .failures = drive->failures};
-    const struct md_exchange *proof = md_late_proof(exchange, now_ns);
-    int has_helped = before->proofs == 0 || replies(drive) != before->replies;
-    if (proof && has_helped && before->proofs < MOST_PROOFS_SENT) {
-        before->proofs++;
-        before->replies = replies(drive);
-        return proof;
-    }
-    if (!exchange->echo_probe || echo != MD_ECHO_UNKNOWN || before->is_probed)
-        return NULL;
-    before->is_probed = 1;
-    return exchange->echo_probe;
-}
-
-/* ---- drives that bear no request soon after another ---- */
+/* ---- the beginning of an exchange ---- */
 
 /* Return when its drive may be asked. A broadcast waits for none. */
 static int64_t ready_ns(const struct md_exchange *exchange)
@@ -142,33 +29,11 @@ static int64_t ready_ns(const struct md_exchange *exchange)
     return exchange->request.address ? exchange->drive->ready_ns : 0;
 }
 
-/* Give its drive a rest after an exchange that was sent. */
-static void rest(const struct md_exchange *exchange, const struct md_completion *completion, int64_t now_ns)
-{
-    if (exchange->drive->interval_ns && completion->sent_ns)
-        exchange->drive->ready_ns = now_ns + exchange->drive->interval_ns;
-}
-
-/* ---- the end of a turn, and its beginning ---- */
-
-/* Its turn is over; 1: its reply may have been an earlier one, and it is sent again. A write never is: it may
- * have started a motor. */
-static int is_sent_again(struct md_before *before, const struct md_exchange *exchange,
-                         const struct md_completion *completion)
-{
-    int is_in_doubt = completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns;
-    if (is_in_doubt && md_is_read(exchange->framing, exchange->request.function) &&
-        before->proofs < MOST_PROOFS_SENT)
-        return 1;
-    before->then = NULL;
-    return 0;
-}
-
 /* Take it up, or what goes before it: then 0. */
 static int begin(struct md_turn *turn, int whose, const struct md_exchange *exchange,
                  struct md_completion *completion, int64_t now_ns)
 {
-    const struct md_exchange *first = find_first(&turn->before, exchange, turn->line.echo, now_ns);
+    const struct md_exchange *first = md_before_find(&turn->before, exchange, turn->line.echo, now_ns);
     turn->whose = first ? MD_BEFOREHAND : whose;
     md_line_begin(&turn->line, first ? first : exchange, first ? &turn->completion : completion, now_ns);
     if (turn->progress.lost)
@@ -185,7 +50,7 @@ static int is_expired(const struct md_turn *turn, int64_t now_ns)
         return 0;
     const struct md_urgent *urgent = turn->urgent;
     const struct md_exchange *exchange = urgent->exchange;
-    int is_overtaken = exchange->stops && get(exchange->stops) != exchange->stops_seen;
+    int is_overtaken = exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
     return is_overtaken || (urgent->expires_ns && now_ns > urgent->expires_ns);
 }
 
@@ -224,7 +89,7 @@ static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64
     int64_t period_ns = slot->exchange->period_ns;
     if (!period_ns || now_ns < slot->not_before_ns + period_ns)
         return 0;
-    uint32_t submitted = get(&turn->progress.submitted);
+    uint32_t submitted = md_load(&turn->progress.submitted);
     for (uint32_t at = turn->progress.done + 1; at != submitted; at++) {
         const struct md_slot *next = &turn->slots[at & (turn->room - 1)];
         if (next->exchange == slot->exchange)
@@ -268,7 +133,7 @@ static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 static void stop_repeating(struct md_turn *turn)
 {
     turn->round_len = 0;
-    put(&turn->progress.repeating, 0);
+    md_store(&turn->progress.repeating, 0);
     call(turn);
 }
 
@@ -282,6 +147,13 @@ static void settle(struct md_turn *turn, int64_t took_ns)
     else if (turn->whose != MD_BEFOREHAND && turn->owed_ns > 0)
         turn->owed_ns -= took_ns;
     turn->owed_ns = sooner(turn->owed_ns, MOST_OWED_NS);
+}
+
+/* Give its drive a rest after an exchange that was sent. */
+static void rest(const struct md_exchange *exchange, const struct md_completion *completion, int64_t now_ns)
+{
+    if (exchange->drive->interval_ns && completion->sent_ns)
+        exchange->drive->ready_ns = now_ns + exchange->drive->interval_ns;
 }
 
 /* One exchange of what is polled may hold up urgent requests: never two in a row, and never a stop. */
@@ -306,7 +178,7 @@ static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         return 1;
     }
     if (!turn->is_ending && !pending(turn)) {
-        put(&turn->is_idle, 1);
+        md_store(&turn->is_idle, 1);
         if (pending(turn)) /* it came just now */
             *wake_ns = now_ns;
     }
@@ -332,11 +204,11 @@ static void finish(struct md_turn *turn)
     turn->last = whose;
     turn->whose = MD_NOBODYS;
     if (turn->progress.echo != (uint32_t)turn->line.echo)
-        put(&turn->progress.echo, (uint32_t)turn->line.echo);
+        md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
     if (whose == MD_BEFOREHAND)
         return;
     int goes_on = !turn->progress.lost && (whose == MD_URGENT || !turn->is_ending);
-    if (is_sent_again(&turn->before, turn->line.exchange, turn->line.completion) && goes_on) {
+    if (md_before_is_again(&turn->before, turn->line.exchange, turn->line.completion) && goes_on) {
         if (whose == MD_REPEATED && turn->round_len)
             turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
         return;
@@ -348,7 +220,7 @@ static void finish(struct md_turn *turn)
     }
     report(turn);
     if (whose == MD_QUEUED) {
-        put(&turn->progress.done, turn->progress.done + 1);
+        md_store(&turn->progress.done, turn->progress.done + 1);
         uint32_t left = pending(turn);
         if (left == turn->room / 4 || left == 0)
             call(turn);
@@ -380,7 +252,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 void md_turn_lose(struct md_turn *turn, int error)
 {
     turn->lost_error = error;
-    put(&turn->progress.lost, 1);
+    md_store(&turn->progress.lost, 1);
     md_line_abandon(&turn->line, MD_LINE_LOST, error);
     stop_repeating(turn);
 }
@@ -396,9 +268,4 @@ void md_turn_close(struct md_turn *turn)
         *turn->urgent->completion = (struct md_completion){.result = MD_LINE_LOST};
         turn->urgent->is_done = turn->has_done_urgent = 1;
     }
-}
-
-void md_count_stop(uint32_t *stops)
-{
-    __atomic_fetch_add(stops, 1, __ATOMIC_SEQ_CST);
 }

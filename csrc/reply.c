@@ -1,7 +1,7 @@
 /* The reply among the bytes that came since the request left: when to look, where it begins, what it tells.
  *
  * It may begin at any byte. Late replies stand in front of it, or in its place. */
-#include "internal.h"
+#include "line.h"
 
 #include <string.h>
 

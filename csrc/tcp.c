@@ -6,7 +6,7 @@
  *
  * A frame's length stands in its header alone. What is no header leaves no place to begin again: the
  * connection must be made anew. */
-#include "internal.h"
+#include "line.h"
 
 #include <string.h>
 

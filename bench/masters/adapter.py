@@ -128,14 +128,19 @@ def decoder(drives: int) -> Callable[[], Batch]:
     registers = list(Played.registers.values())
     replies = []
     for address in range(1, drives + 1):
-        fields = [Field(it.address, it.number_format, it.address, 1, 10) for it in registers]
+        fields = [
+            Field(register.address, register.number_format, register.address, 1, 10) for register in registers
+        ]
         data = b"".join(value.to_bytes(2, "big") for value in expected(address))
         found = ffi.new("struct md_completion *")
         found.result, found.sent_ns, found.first_ns = 5 + len(data), address, address + 1
         found.reply.data_len, found.reply.data[0 : len(data)] = len(data), list(data)
         replies.append((RowLayout(address - 1, fields), found))
     turns = replies * (BATCH_ROWS // REGISTERS // drives + 1)
-    names = Names(f"drive-{address}" for address in range(1, drives + 1)), Names(it.name for it in registers)
+    names = (
+        Names(f"drive-{address}" for address in range(1, drives + 1)),
+        Names(register.name for register in registers),
+    )
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)

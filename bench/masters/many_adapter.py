@@ -54,7 +54,8 @@ def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -
             None,
             None,
             tuple(
-                PolledDrive(it, tuple(Polled(register, every) for register in it.readings())) for it in drives
+                PolledDrive(drive, tuple(Polled(register, every) for register in drive.readings()))
+                for drive in drives
             ),
         )
         for port, drives in lines.items()
@@ -114,16 +115,18 @@ def mixed() -> Mixed:
         for at, (family, framing) in enumerate(kinds, 1)
     ]
     exchanges = [
-        it for drive in drives for it in planned(drive, ((register, None) for register in drive.readings()))
+        each
+        for drive in drives
+        for each in planned(drive, ((register, None) for register in drive.readings()))
     ]
     words = [
         ":".join(
-            str(it)
-            for it in (
+            str(each)
+            for each in (
                 drive.address,
                 int(drive.framing),
                 drive.settings.baudrate,
-                *(round(1e9 * it) for it in (drive.settings.character, drive.response_delay, demanded)),
+                *(round(1e9 * each) for each in (drive.settings.character, drive.response_delay, demanded)),
             )
         )
         for drive in drives
@@ -202,7 +205,7 @@ def _judge(batch: Batch, held: Mapping[tuple[str, str], int], judged: Judged) ->
     bad = columns.filter(columns["value"].is_null())
     judged.misses.update(bad["status"].to_pylist())
     for drive, register, sent in zip(
-        *(bad[it].to_pylist() for it in ("drive", "register", "monotonic_ns")), strict=True
+        *(bad[each].to_pylist() for each in ("drive", "register", "monotonic_ns")), strict=True
     ):
         judged.asked_ns[drive, held[drive, register]] = sent
     good = columns.filter(columns["value"].is_valid())

@@ -42,7 +42,7 @@ def write_plant(directory: Path, lines: int) -> Path:
         for address, (name, model, framing) in enumerate([*DRIVES, (MOTOR, "yd1000", "rtu")], 1):
             family = MODELS[model]
             options = "".join(f"{key} = {value}\n" for key, value in OPTIONS.items() if key in family.options)
-            first, *others = (it.name for it in family.readings())
+            first, *others = (reading.name for reading in family.readings())
             poll = ", ".join([f'{{ register = "{first}", every = "{EVERY:g} s" }}', *map(repr, others)])
             tables.append(
                 f'[[line.drive]]\nname = "{name}-{number}"\nmodel = "{model}"\nframing = "{framing}"\n'
@@ -55,11 +55,11 @@ def write_plant(directory: Path, lines: int) -> Path:
 def proofs(plant: Plant) -> dict[tuple[str, str], float]:
     """Return each register's value, by names of drive and register; those of motors are unknown."""
     return {
-        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
+        (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for line in plant.lines
-        for it in line.drives
-        if not is_motor(it.drive.name)
-        for poll in it.polls
+        for drive in line.drives
+        if not is_motor(drive.drive.name)
+        for poll in drive.polls
     }
 
 
@@ -91,8 +91,8 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
     return [
         FaultyWire(
             [
-                simulated(it.drive) if is_motor(it.drive.name) else EncodedDrive(it.drive)
-                for it in line.drives
+                simulated(drive.drive) if is_motor(drive.drive.name) else EncodedDrive(drive.drive)
+                for drive in line.drives
             ],
             faults,
             name=line.name,

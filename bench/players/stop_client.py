@@ -91,7 +91,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
     """The buses of a poller, which reads two registers of each drive as fast as the lines allow."""
     lines = []
     for port, found in zip(ports, drives, strict=True):
-        asked = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings()[:2])) for it in found]
+        asked = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings()[:2])) for each in found]
         lines.append(PlantLine(port, port, None, None, tuple(asked)))
     return list(stack.enter_context(Poller(Plant(tuple(lines), Path("plant.toml")))).buses.values())
 

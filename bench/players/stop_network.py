@@ -131,7 +131,7 @@ def _cut_one(
         begun = len(line.log)
         client.ask(do="call", drive=0, verb="start")
         client.hear("called")
-        looks = next(at for at, it in enumerate(line.log[begun:]) if it.what == "moves")
+        looks = next(at for at, each in enumerate(line.log[begun:]) if each.what == "moves")
         client.ask(do="call", drive=0, verb="stop")
         client.hear("called")
     client.hold(looks - 1)
@@ -149,9 +149,9 @@ def _cut_one(
     made.mend()
     time.sleep(3.0 if is_long else 1.5)  # what TCP held back comes now
     counters.rounds += 1
-    late = [it for it in client.heard(line, 1, "moves") if it.at > told_ns]
+    late = [each for each in client.received(line, 1, "moves") if each.at > told_ns]
     counters.moved += len(late)
     port = client.far.ports[0].partition(":")[0]
     counters.stories += [
-        f"{port}, told {said['failure']!r}: {(it.at - told_ns) / 1e9:.1f} s later {it}" for it in late
+        f"{port}, told {said['failure']!r}: {(each.at - told_ns) / 1e9:.1f} s later {each}" for each in late
     ]

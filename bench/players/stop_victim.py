@@ -16,7 +16,7 @@ from typing import Any
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from responder import Heard, Responder, ResponderLine
+from responder import ReceivedFrame, Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 
 CLIENT = "bench.players.stop_client"
@@ -102,12 +102,12 @@ class Victim:
     def release(self) -> None:
         self.far.release(self.lines[0])
 
-    def heard(self, line: ResponderLine, address: int, what: str) -> list[Heard]:
+    def received(self, line: ResponderLine, address: int, what: str) -> list[ReceivedFrame]:
         """In this episode."""
         return [
-            it
-            for it in line.log[self._begun.get(line, 0) :]
-            if it.what == what and it.asked is not None and it.asked.address in (0, address)
+            each
+            for each in line.log[self._begun.get(line, 0) :]
+            if each.what == what and each.asked is not None and each.asked.address in (0, address)
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
@@ -115,18 +115,20 @@ class Victim:
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():
-                stops = self.heard(line, address, "stops")
+                stops = self.received(line, address, "stops")
                 counters.asked += 1
                 if stops and self.asked_ns:
                     counters.first_ms.append((stops[0].at - self.asked_ns) / 1e6)
-                late = [it for it in self.heard(line, address, "moves") if stops and it.at > stops[0].at]
+                late = [
+                    each for each in self.received(line, address, "moves") if stops and each.at > stops[0].at
+                ]
                 counters.moved += len(late)
                 counters.unsent += not stops
                 counters.turning += drive.runs and not excuse
                 counters.excused += drive.runs and excuse
                 if late or drive.runs:
                     said = self.errors.strip().splitlines()[-1:]
-                    story = "; ".join(str(it) for it in (*stops[:3], *late))
+                    story = "; ".join(str(stop) for stop in (*stops[:3], *late))
                     counters.stories.append(
                         f"{what}: {drive.kind.name}@{address}: {story or 'no stop'} {said}"
                     )

@@ -43,7 +43,7 @@ def of_pymodbus(job: Job) -> tuple[int, numpy.ndarray]:
         while (begun := time.monotonic()) < end:
             read(1 + len(took) % job.drives)
             took.append(time.monotonic() - begun - wire)
-    good = [it for it in took if it < TIMEOUT_S]
+    good = [each for each in took if each < TIMEOUT_S]
     return len(good), numpy.array(good) * 1e3
 
 

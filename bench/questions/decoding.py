@@ -34,7 +34,7 @@ def main() -> None:
         path = Path(directory) / "line.pcap"
         for registers in arguments.registers:
             size = write(path, registers, arguments.megabytes * 1e6)
-            values, seconds = min((decoded(path) for _ in range(arguments.slices)), key=lambda it: it[1])
+            values, seconds = min((decoded(path) for _ in range(arguments.slices)), key=lambda each: each[1])
             of_frames, of_file = size / seconds / 1e6, path.stat().st_size / seconds / 1e6
             rows.append(
                 (registers, values, f"{of_frames:.0f}", f"{of_file:.0f}", f"{values / seconds / 1e6:.1f}")

@@ -57,7 +57,7 @@ def of_bare_timer(arguments: argparse.Namespace) -> list[float]:
 def row(what: str, late: list[float], yard: list[float]) -> tuple[str, ...]:
     p50, p99, most = numpy.percentile(late, [50, 99, 100])
     more = p99 - numpy.percentile(yard, 99)
-    return what, str(len(late)), *(f"{it:.1f}" for it in (p50, p99, most)), f"{more:+.1f}"
+    return what, str(len(late)), *(f"{each:.1f}" for each in (p50, p99, most)), f"{more:+.1f}"
 
 
 def main() -> None:

@@ -51,7 +51,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
     for number, port in enumerate(ports, 1):
         found = [InnovertIBD(at, name=f"ibd-{number}-{at}") for at in range(1, drives)]
         motor = YD1000(drives, name=f"{plants.MOTOR}-{number}")
-        polled = [PolledDrive(it, tuple(Polled(reg, None) for reg in it.readings())) for it in found]
+        polled = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings())) for each in found]
         polled.append(PolledDrive(motor, (Polled(YD1000.register("status"), 1.0),)))
         lines.append(PlantLine(f"line-{number}", port, None, None, tuple(polled)))
     return Plant(tuple(lines), Path("plant.toml"))
@@ -62,8 +62,8 @@ def wires(lines: int, drives: int) -> list[Wire]:
     return [
         Wire(
             [
-                simulated(it.drive) if plants.is_motor(it.drive.name) else EncodedDrive(it.drive)
-                for it in line.drives
+                simulated(drive.drive) if plants.is_motor(drive.drive.name) else EncodedDrive(drive.drive)
+                for drive in line.drives
             ],
             name=line.name,
             unpaced=True,
@@ -99,15 +99,15 @@ class Round:
         ]
         begun = time.monotonic()
         with self.poller:
-            for it in actors:
-                it.start()
+            for actor in actors:
+                actor.start()
             self._leave.wait(seconds)
             self._leave.set()
-            for it in actors:
-                it.join(PATIENCE)
-                if it.is_alive():
+            for actor in actors:
+                actor.join(PATIENCE)
+                if actor.is_alive():
                     faulthandler.dump_traceback(all_threads=True)
-                    self.failures.append(f"a thread that does {it.name!r} does not end")
+                    self.failures.append(f"a thread that does {actor.name!r} does not end")
         self.take_all()
         self.seconds = time.monotonic() - begun
 
@@ -200,30 +200,34 @@ def main() -> int:
         os.environ["XDG_STATE_HOME"] = name
         with plants.running(wires, arguments.lines, arguments.drives) as simulator:
             for number in range(arguments.rounds):
-                it = Round(plant(simulator.ports, arguments.drives), number)
-                it.run(60 * arguments.minutes / arguments.rounds)
-                exchanges, lost = it.told()
+                this_round = Round(plant(simulator.ports, arguments.drives), number)
+                this_round.run(60 * arguments.minutes / arguments.rounds)
+                exchanges, lost = this_round.told()
                 descriptors = len(list(Path("/proc/self/fd").iterdir()))
                 gc.collect()  # who refers to each other in a circle waits for that
                 seen.append((resident_kb(os.getpid()), descriptors, threading.active_count()))
                 cells = (
                     exchanges,
-                    f"{exchanges / it.seconds:.0f}",
-                    it.counts["values"],
-                    it.counts["rows"] - it.counts["values"],
-                    it.counts["misattributed"],
+                    f"{exchanges / this_round.seconds:.0f}",
+                    this_round.counts["values"],
+                    this_round.counts["rows"] - this_round.counts["values"],
+                    this_round.counts["misattributed"],
                     lost,
-                    it.counts["moved"],
-                    it.counts["given"],
-                    it.counts["failed"],
+                    this_round.counts["moved"],
+                    this_round.counts["given"],
+                    this_round.counts["failed"],
                     *seen[-1],
                 )
                 print(
                     "  ".join(str(cell).rjust(len(head)) for cell, head in zip(cells, HEAD, strict=True)),
                     flush=True,
                 )
-                failures += it.failures
-                if it.counts["misattributed"] or lost or it.counts["given"] != it.counts["ended"]:
+                failures += this_round.failures
+                if (
+                    this_round.counts["misattributed"]
+                    or lost
+                    or this_round.counts["given"] != this_round.counts["ended"]
+                ):
                     failures.append(f"round {number + 1}: a value is another's, or a row or command is lost")
     half = seen[len(seen) // 2]  # by then what is used again and again has its size
     if seen[-1][0] - half[0] > MOST_GROWTH_KB or seen[-1][1:] != seen[0][1:]:

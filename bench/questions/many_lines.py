@@ -128,17 +128,17 @@ Slices = list[dict[str, Any]]
 
 def row(kind: str, count: int, master: str, slices: Slices, bare: Slices) -> list[str]:
     pairs = list(zip(slices, bare, strict=True))
-    python = [it["python_seconds"] / it["exchanges"] * 1e6 for it in slices if "python_seconds" in it]
+    python = [each["python_seconds"] / each["exchanges"] * 1e6 for each in slices if "python_seconds" in each]
     return [
         kind,
         str(count),
         master,
-        f"{median(it['rate'] for it in slices):.0f}",
-        f"{median(it['rate'] / yard['rate'] for it, yard in pairs):.3f}",
-        f"{median(it['cpu'] for it in slices):.2f}",
-        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        f"{median(each['rate'] for each in slices):.0f}",
+        f"{median(each['rate'] / yard['rate'] for each, yard in pairs):.3f}",
+        f"{median(each['cpu'] for each in slices):.2f}",
+        f"{median(each['cpu'] / yard['cpu'] for each, yard in pairs):.2f}",
         f"{median(python):.2f}" if python else "",
-        str(sum(it["failures"] for it in slices)),
+        str(sum(each["failures"] for each in slices)),
     ]
 
 

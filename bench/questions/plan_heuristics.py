@@ -34,7 +34,7 @@ def plant(lot: random.Random) -> Plant:
     drives: Plant = []
     for address in range(1, lot.randint(1, MOST_DRIVES) + 1):
         family = lot.choice(list(MODELS.values()))
-        readable = [it for it in family.registers.values() if it.readable]
+        readable = [register for register in family.registers.values() if register.readable]
         wanted = lot.sample(readable, lot.randint(1, len(readable)))
         drive = family(address, framing=lot.choice(family.framings), baudrate=lot.choice(family.baudrates))
         drives.append((drive, wanted))
@@ -52,7 +52,7 @@ def merged(drive: Drive, registers: Registers, most_gap: int) -> list[Block]:
     found = []
     for wanted in tables.values():
         groups: list[list[Register[Any]]] = []
-        for register in sorted(wanted, key=lambda it: it.address):
+        for register in sorted(wanted, key=lambda each: each.address):
             if groups and most_gap >= 0 and joins(drive, groups[-1], register, most_gap):
                 groups[-1].append(register)
             else:
@@ -65,9 +65,9 @@ def joins(drive: Drive, group: Registers, register: Register[Any], most_gap: int
     between = range(end(group[-1]), register.address)
     known = {
         address
-        for it in drive.registers.values()
-        if it.table == register.table and it.readable
-        for address in range(it.address, end(it))
+        for each in drive.registers.values()
+        if each.table == register.table and each.readable
+        for address in range(each.address, end(each))
     }
     allowed = drive.readable_gaps.get(register.table, range(0))
     return (
@@ -88,8 +88,8 @@ def cycle(drives: Iterable[Drive], of_drive: dict[Drive, Iterable[Block]]) -> fl
     """Seconds for reading everything once, in this order of the drives."""
     exchanges = [Planned(drive, block) for drive in drives for block in of_drive[drive]]
     return sum(
-        gap(exchanges[at - 1].drive, it.drive) + sending(it.drive, it.block) + it.drive.response_delay
-        for at, it in enumerate(exchanges)
+        gap(exchanges[at - 1].drive, each.drive) + sending(each.drive, each.block) + each.drive.response_delay
+        for at, each in enumerate(exchanges)
     )
 
 
@@ -120,8 +120,11 @@ def main() -> None:
 
     def all_cycles(plan: Callable[[Drive, Registers], Iterable[Block]]) -> list[float]:
         return [
-            cycle(cycle_order(drive for drive, _ in it), {drive: plan(drive, wanted) for drive, wanted in it})
-            for it in plants
+            cycle(
+                cycle_order(drive for drive, _ in plant),
+                {drive: plan(drive, wanted) for drive, wanted in plant},
+            )
+            for plant in plants
         ]
 
     ours = all_cycles(blocks)
@@ -133,8 +136,8 @@ def main() -> None:
         f"the best gap for all plants: {best}": by_gap[best],
         "the best gap for each plant": [min(cycles) for cycles in zip(*by_gap.values(), strict=True)],
         "the plant file's order": [
-            cycle((drive for drive, _ in it), {drive: blocks(drive, wanted) for drive, wanted in it})
-            for it in plants
+            cycle((drive for drive, _ in each), {drive: blocks(drive, wanted) for drive, wanted in each})
+            for each in plants
         ],
     }
     columns = ("plan", "s", "mean saving", "median", "most", "worse")

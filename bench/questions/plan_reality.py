@@ -46,11 +46,11 @@ class Case:
 
     def row(self) -> list[str]:
         seconds = (self.predicted, self.known, self.measured)
-        off = (self.measured / it - 1 for it in seconds[:2])
+        off = (self.measured / each - 1 for each in seconds[:2])
         return [
             self.name,
-            *(f"{it * 1e3:.2f}" for it in seconds),
-            *(f"{it:+.2%}" for it in off),
+            *(f"{each * 1e3:.2f}" for each in seconds),
+            *(f"{each:+.2%}" for each in off),
             str(self.missed),
         ]
 

@@ -102,7 +102,7 @@ class Commander(threading.Thread):
                     return
 
     def _command(self, bus: Bus, verb: str) -> None:
-        (motor,) = (it for it in bus.drives if plants.is_motor(it.name))
+        (motor,) = (drive for drive in bus.drives if plants.is_motor(drive.name))
         self.given += 1
         try:
             if verb == "start":
@@ -126,10 +126,10 @@ class Soak:
         self.simulator = simulator
         self.truth = plants.proofs(plant)
         self.timed = {
-            (it.drive.name, poll.register.name): line.name
+            (drive.drive.name, poll.register.name): line.name
             for line in plant.lines
-            for it in line.drives
-            for poll in it.polls
+            for drive in line.drives
+            for poll in drive.polls
             if poll.every
         }
         self.slots: Counter[tuple[str, str]] = Counter()  # rows of what is polled at a rate
@@ -248,7 +248,9 @@ def main() -> int:
         path = plants.write_plant(directory, arguments.lines)
         with plants.running(plants.hostile_wires, path, load_faults(arguments.faults)) as simulator:
             plant = load_plant(path)
-            lines = [replace(it, port=port) for it, port in zip(plant.lines, simulator.ports, strict=True)]
+            lines = [
+                replace(each, port=port) for each, port in zip(plant.lines, simulator.ports, strict=True)
+            ]
             plant = replace(plant, lines=tuple(lines))
             with Poller(plant) as poller:
                 soak = Soak(plant, poller, arguments.out or directory / "soak.arrows", simulator)
@@ -259,7 +261,7 @@ def main() -> int:
                     soak.check_growth(periods[0], periods[-1])
                 commander.leave()
     if threading.active_count() > 1:
-        soak.faults.append(f"threads are left: {', '.join(it.name for it in threading.enumerate())}")
+        soak.faults.append(f"threads are left: {', '.join(each.name for each in threading.enumerate())}")
     print("\nmissed: " + ", ".join(f"{why} {n}" for why, n in soak.total.misses.most_common()))
     print("\n".join(soak.faults) or "nothing misattributed, nothing unexplained, nothing grows")
     return 1 if soak.faults else 0

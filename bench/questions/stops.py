@@ -65,7 +65,7 @@ def signals(number: int, leaving: bool) -> Attack:
                     client.signal(sent[-1])
                 client.wait()
                 cut_short = number > 2 and CUT_SHORT in client.errors
-                client.judge(counters, f"signals {[it.name for it in sent]}", excuse=cut_short)
+                client.judge(counters, f"signals {[each.name for each in sent]}", excuse=cut_short)
         return counters
 
     return attack
@@ -180,9 +180,9 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
             client.process.send_signal(signal.SIGCONT)
             client.hear("called")
             counters.rounds += 1
-            late = [it for it in client.lines[0].log[known:] if it.what == "moves"]
+            late = [each for each in client.lines[0].log[known:] if each.what == "moves"]
             counters.moved += len(late)
-            counters.stories += [f"start of {kind} after a pause of {PAUSE:g} s: {it}" for it in late]
+            counters.stories += [f"start of {kind} after a pause of {PAUSE:g} s: {each}" for each in late]
     return counters
 
 

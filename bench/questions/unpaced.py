@@ -36,15 +36,15 @@ def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:
 
 def row(where: str, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
     pairs = list(zip(slices, bare, strict=True))
-    failed = sum(it["failures"] for it in slices)
+    failed = sum(each["failures"] for each in slices)
     return [
         where,
         master,
         slices[0]["version"],
-        f"{median(it['rate'] for it in slices):.0f}",
-        f"{median(it['rate'] / yard['rate'] for it, yard in pairs):.3f}",
-        f"{median(it['cpu'] for it in slices):.1f}",
-        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        f"{median(each['rate'] for each in slices):.0f}",
+        f"{median(each['rate'] / yard['rate'] for each, yard in pairs):.3f}",
+        f"{median(each['cpu'] for each in slices):.1f}",
+        f"{median(each['cpu'] / yard['cpu'] for each, yard in pairs):.2f}",
         str(failed),
     ]
 

@@ -60,10 +60,10 @@ def measured(master: str, baudrate: int, seconds: float) -> dict[str, Any]:
 
 def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dict[str, Any]]) -> list[str]:
     def middle(key: str) -> float:
-        return float(median(it[key] for it in slices))
+        return float(median(each[key] for each in slices))
 
     def total(key: str) -> int:
-        return sum(it[key] for it in slices)
+        return sum(each[key] for each in slices)
 
     pairs = list(zip(slices, bare, strict=True))
     return [
@@ -71,13 +71,13 @@ def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dic
         master,
         slices[0]["version"],
         f"{middle('utilisation'):.4f}",
-        f"{median(it['utilisation'] - yard['utilisation'] for it, yard in pairs):+.4f}",
+        f"{median(each['utilisation'] - yard['utilisation'] for each, yard in pairs):+.4f}",
         str(total("requests")),
         str(total("early")),
         f"{total('early') / max(1, total('requests')):.2%}",
         f"{middle('late'):.0f}",
         f"{middle('cpu'):.0f}",
-        f"{median(it['cpu'] / yard['cpu'] for it, yard in pairs):.2f}",
+        f"{median(each['cpu'] / yard['cpu'] for each, yard in pairs):.2f}",
         str(total("failed")),
     ]
 

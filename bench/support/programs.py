@@ -18,7 +18,7 @@ HERE = Path(__file__).parents[1]
 PROCESSORS = sorted(os.sched_getaffinity(0))
 CORE = HERE.parent / "csrc"
 CHECKSUM = (f"-I{CORE}", str(CORE / "checksum.c"))  # for programs that take the core's own checksums
-FRAMES = (*CHECKSUM, str(CORE / "frame.c"))
+FRAMES = (*CHECKSUM, str(CORE / "body.c"), str(CORE / "frame.c"))
 
 
 @cache

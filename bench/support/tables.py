@@ -24,7 +24,7 @@ def _machine() -> str:
     cpus = Path("/proc/cpuinfo")
     names = [line for line in cpus.read_text().splitlines() if "model name" in line] if cpus.exists() else []
     cpu = names[0].partition(":")[2].strip() if names else platform.processor() or platform.machine()
-    load = ", ".join(f"{it:.1f}" for it in os.getloadavg())
+    load = ", ".join(f"{each:.1f}" for each in os.getloadavg())
     return (
         f"{os.cpu_count()} x {cpu}, {platform.system()} {platform.release()}, "
         f"Python {platform.python_version()}, load before {load}"

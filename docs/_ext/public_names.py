@@ -42,6 +42,7 @@ def _defined(node: ast.stmt) -> Iterator[str]:
         yield from (target.id for target in node.targets if isinstance(target, ast.Name))
 
 
+IN_PARTS = {"Drive", "Poller"}  # their bases have no users of their own
 INTERNAL = "forked, leave, part, tended, peer, peers"  # methods that other rooms call
 
 
@@ -82,7 +83,8 @@ def _documented(package: ModuleType, name: str) -> list[str]:
     if inspect.isclass(found) and issubclass(found, BaseException):
         return [f".. autoexception:: {place}", "   :show-inheritance:", ""]
     if inspect.isclass(found):
-        return [f".. autoclass:: {place}", "   :members:", f"   :exclude-members: {INTERNAL}", ""]
+        bases = ["   :inherited-members:"] if name in IN_PARTS else []
+        return [f".. autoclass:: {place}", "   :members:", *bases, f"   :exclude-members: {INTERNAL}", ""]
     if inspect.isfunction(found):
         return [f".. autofunction:: {place}", ""]
     return [f".. py:data:: {place}", f"   :value: {found!r}", ""]

@@ -1,13 +1,12 @@
 """Poller: all lines of a plant, polled continuously, as batches of rows.
 
 The lines are kept busy by the core's own thread; one thread here tends them all when the core calls.
-Rows gather in the core, in chunks of bounded number, and are taken from there, the oldest first.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,21 +21,18 @@ from multidrop.drive.register import Register
 from multidrop.errors import LineError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.adoption import GONE, Adoption
-from multidrop.polling.batch import Batch
-from multidrop.polling.batch_caller import BatchCaller
-from multidrop.polling.line_set import NOBODY, LineSet
+from multidrop.polling.line_set import LineSet
 from multidrop.polling.polled_line import PolledLine
+from multidrop.polling.row_source import RowSource
 from multidrop.toml_check import check_period
 from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
-from multidrop.transport.wakeup import WakeUp
 
 LOOK_S = 0.05  # between looks at the lines, while one of them or a reader of `fileno` needs them
 REST_S = 0.5  # the same, where neither does
-FILLING_NS = 10_000_000  # for which new rows gather before they are taken from a chunk that is not full
 
 
-class Poller:
+class Poller(RowSource):
     """Polls a plant as its file says, from `with` on until the block is left.
 
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
@@ -56,17 +52,11 @@ class Poller:
     ) -> None:
         if not isinstance(plant, Plant):
             raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
-        self._row_queue = RowQueue()
-        self._lines = LineSet(self._row_queue, ledger, audit)
+        row_queue = RowQueue()
+        self._lines = LineSet(row_queue, ledger, audit)
+        super().__init__(row_queue, self._lines.names)
         self._path = plant.path
-        self._wakeup = WakeUp()
-        self._is_watched = False  # somebody waits for `fileno`
-        self._taken_ns = 0  # the newest rows
         self._stops_on_exit = False
-        self._closing = False
-        self._over = threading.Event()  # all lines are closed, and no row comes any more
-        self._caller: BatchCaller | None = None
-        self._changing = threading.Lock()  # one drive or line comes or goes at a time
         self._thread = threading.Thread(target=self._poll, name="multidrop poller", daemon=True)
         register_at_fork(self)
         try:
@@ -139,9 +129,6 @@ class Poller:
             seconds = LOOK_S if restless or self._is_watched else REST_S
             lines = self._lines.called(self._row_queue.await_calls(seconds))
             called = dict.fromkeys([*restless, *lines])
-
-    def _call_thread(self) -> None:
-        self._row_queue.call(NOBODY)
 
     # ---- lines and drives ----
 
@@ -268,56 +255,6 @@ class Poller:
         self._stops_on_exit = True
         for line in self._lines:
             line.bus.stop_on_exit()
-
-    # ---- rows ----
-
-    def fileno(self) -> int:
-        """Return a descriptor that is readable while rows wait to be taken, for select or an asyncio loop."""
-        self._is_watched = True
-        self._call_thread()
-        return self._wakeup.fileno()
-
-    def take(self) -> Batch | None:
-        """Return the oldest rows that wait, at once; None when there are none, or only a few new ones."""
-        now, chunks = clock.now_ns(), self._row_queue.chunks
-        if chunks < 2:
-            if self._is_watched:
-                self._wakeup.clear()
-            if now - self._taken_ns < FILLING_NS and not self._closing:
-                return None
-            self._taken_ns = now
-        columns = self._row_queue.take()
-        return Batch(columns, self._lines.names.drives, self._lines.names.registers) if columns else None
-
-    def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
-        """Yield batches as they come, about one in `every` s, for `seconds` s or until the caller stops.
-
-        Once the poller is closed what is left comes at once, and then no more.
-        """
-        end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
-        is_over = False
-        while not is_over and (end_ns is None or clock.now_ns() < end_ns):
-            left = every if end_ns is None else max(0.0, (end_ns - clock.now_ns()) / 1e9)
-            is_over = self._over.wait(min(every, left))
-            while batch := self.take():
-                yield batch
-
-    def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
-        """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
-
-        It holds no line up, however slow it is: rows gather meanwhile, as many as `take` leaves, and further
-        ones are dropped and counted in `summary()`. Closing waits until it has had the last batch. When it
-        raises, that is logged at once, it is called no more, and closing raises the same. A batch goes to
-        one taker: do not take others beside it. Raises ValueError for a second function.
-        """
-        if not callable(function):
-            raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
-        with self._changing:
-            if self._caller:
-                raise ValueError("on_batch has a function already, which gets every batch")
-            if self._closing:
-                raise ValueError("polling has ended: no batches come any more")
-            self._caller = BatchCaller(self.batches(every=every), function)
 
     # ---- how it went ----
 

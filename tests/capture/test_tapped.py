@@ -33,7 +33,7 @@ from multidrop.recording import RecordingError
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
 FATES = Counter({"ok": 300, "no reply": 10, "bad checksum": 5, "bad character": 5, "reply cut short": 5})
-NEVER_ON_THE_LINE = {str(it) for it in (Status.NOT_ASKED, Status.LATE_ANSWER_DUE, Status.EXPIRED)}
+NEVER_ON_THE_LINE = {str(each) for each in (Status.NOT_ASKED, Status.LATE_ANSWER_DUE, Status.EXPIRED)}
 
 
 class RoughWire(LateWire):
@@ -154,15 +154,15 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
 def test_a_capture_of_all_variants_says_what_was_recorded(mixed: Mixed) -> None:
     check(mixed.rows, mixed.decoded)
     samples = {row.drive for row in mixed.decoded if row.value is not None}
-    assert samples == {it.drive.name for it in mixed.drives}
+    assert samples == {polled.drive.name for polled in mixed.drives}
 
 
 def test_wireshark_reads_what_was_recorded(mixed: Mixed) -> None:
     """Each value of an RTU drive: who was asked for what and when, and the registers in the reply."""
     packets = tshark(mixed.capture)
-    by_time = {it["frame.time_epoch"]: (number, it) for number, it in enumerate(packets, 1)}
-    replies = {it["modbus.request_frame"]: it for it in packets if it["modbus.request_frame"]}
-    drives = {it.drive.name: it.drive for it in mixed.drives}
+    by_time = {each["frame.time_epoch"]: (number, each) for number, each in enumerate(packets, 1)}
+    replies = {each["modbus.request_frame"]: each for each in packets if each["modbus.request_frame"]}
+    drives = {each.drive.name: each.drive for each in mixed.drives}
     checked = set()
     for row in mixed.rows:
         drive = drives[row.drive]
@@ -283,39 +283,43 @@ def seconds_in(path: Path) -> list[int]:
         return [
             span.time_ns // 10**9
             for _ in capture
-            for heard in capture.streams
-            for span in splitter.spans(heard)
+            for stream in capture.streams
+            for span in splitter.spans(stream)
         ]
 
 
 def test_the_last_minutes_and_what_follows_are_written_when_something_goes_wrong(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    it = Flight(tmp_path / "flights", monkeypatch, seconds=20)
-    it.pass_(50)
-    assert it.recorder.written == []
-    it.pass_(0, "hall-1: pump-1: bad checksum", "hall-1: pump-1: bad checksum", "hall-1: pump-2: fell silent")
-    it.pass_(10)
-    (path,) = it.recorder.written
+    one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
+    one_flight.pass_(50)
+    assert one_flight.recorder.written == []
+    one_flight.pass_(
+        0, "hall-1: pump-1: bad checksum", "hall-1: pump-1: bad checksum", "hall-1: pump-2: fell silent"
+    )
+    one_flight.pass_(10)
+    (path,) = one_flight.recorder.written
     assert path == tmp_path / "flights" / "flight-20231114T223052Z.pcapng"
     assert seconds_in(path) == list(range(1032, 1053))
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
 def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    it = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
+    one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
     (tmp_path / "flight-plan.pcapng").touch()  # somebody's own
     for _ in range(600):
-        it.pass_(1, "hall-1: pump-1: bad checksum")
-    assert len(it.recorder.written) == 10
-    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "flight-plan.pcapng", *it.recorder.written[-3:]])
+        one_flight.pass_(1, "hall-1: pump-1: bad checksum")
+    assert len(one_flight.recorder.written) == 10
+    assert sorted(tmp_path.iterdir()) == sorted(
+        [tmp_path / "flight-plan.pcapng", *one_flight.recorder.written[-3:]]
+    )
 
 
 def test_no_more_is_kept_in_memory_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    it = Flight(tmp_path, monkeypatch, most_bytes=1000)
-    it.pass_(200, "hall-1: the port was lost")
-    it.recorder.close()
-    (path,) = it.recorder.written
+    one_flight = Flight(tmp_path, monkeypatch, most_bytes=1000)
+    one_flight.pass_(200, "hall-1: the port was lost")
+    one_flight.recorder.close()
+    (path,) = one_flight.recorder.written
     assert 800 < path.stat().st_size < 1300
     seconds = seconds_in(path)
     assert seconds == list(range(seconds[0], 1201))
@@ -324,13 +328,13 @@ def test_no_more_is_kept_in_memory_than_allowed(tmp_path: Path, monkeypatch: pyt
 def test_trouble_that_is_not_written_yet_is_written_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    it = Flight(tmp_path, monkeypatch)
-    it.pass_(3)
-    it.recorder.close()
-    assert it.recorder.written == []
-    it.pass_(3, "hall-1: the port was lost")
-    it.recorder.close()
-    assert [seconds_in(path) for path in it.recorder.written] == [list(range(1001, 1007))]
+    one_flight = Flight(tmp_path, monkeypatch)
+    one_flight.pass_(3)
+    one_flight.recorder.close()
+    assert one_flight.recorder.written == []
+    one_flight.pass_(3, "hall-1: the port was lost")
+    one_flight.recorder.close()
+    assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
 def test_a_directory_that_cannot_be_made_is_told_in_a_sentence(tmp_path: Path) -> None:
@@ -448,9 +452,9 @@ def test_a_flight_is_written_when_a_drive_s_replies_are_damaged(
 
 @pytest.fixture
 def wire() -> Iterator[Faulty]:
-    it = Faulty([EncodedDrive(InnovertIBD(1))], lambda reply: reply, unpaced=True)
-    with Simulator([it]):
-        yield it
+    one_flight = Faulty([EncodedDrive(InnovertIBD(1))], lambda reply: reply, unpaced=True)
+    with Simulator([one_flight]):
+        yield one_flight
 
 
 @pytest.fixture

@@ -57,13 +57,13 @@ def test_wireshark_says_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> No
     command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
     said = subprocess.run([*command, *fields], capture_output=True, text=True, check=True).stdout
     lines = [line.split("\t") for line in said.splitlines()]
-    packets = [it for it in lines if it[1]]  # a late reply is part of no exchange
+    packets = [each for each in lines if each[1]]  # a late reply is part of no exchange
     assert len(packets) > 0.9 * len(lines)
-    answered = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Response")]
-    asked = [it for it in packets if it[2] == "3" and it[0].strip().startswith("Query")]
+    answered = [packet for packet in packets if packet[2] == "3" and packet[0].strip().startswith("Response")]
+    asked = [packet for packet in packets if packet[2] == "3" and packet[0].strip().startswith("Query")]
     assert len(answered) == len({row.monotonic_ns for row in rows if row.value is not None})
-    assert {it[1] for it in answered} <= {it[1] for it in asked}
-    assert {(it[2], it[3]) for it in packets} == {("3", "3"), ("4", "3")}
+    assert {each[1] for each in answered} <= {each[1] for each in asked}
+    assert {(packet[2], packet[3]) for packet in packets} == {("3", "3"), ("4", "3")}
     assert "Malformed" not in said
 
 

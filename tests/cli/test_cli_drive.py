@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from commands import TOY, Run
 from lines import Faulty, patient, until
-from motors import Heard
+from motors import ReceivedRequests
 from toy import Status, Toy
 
 from multidrop.control import eeprom_ledger as ledger
@@ -140,7 +140,7 @@ def test_a_family_that_cannot_say_its_state_is_stopped_all_the_same(
     assert (status, err) == (0, is_run)
     assert out.startswith("mute@1: stop done; state: the family cannot say")
     assert json.loads(run(*words, "--json")[1])["state"] is None
-    assert [(it.address, it.raw) for it in toy.counters.writes] == [(0x14, 0), (0x14, 0)]
+    assert [(write.address, write.raw) for write in toy.counters.writes] == [(0x14, 0), (0x14, 0)]
 
 
 def test_write_says_in_one_line_what_became_of_it(run: Run, port: str, toy: SimulatedDrive) -> None:
@@ -203,7 +203,7 @@ def test_a_value_between_two_steps_is_told_as_it_is_taken(run: Run, port: str, t
     status, out, err = run("start", port, TOY, 1, "--frequency", "12.345", "--yes", "--json")
     assert (status, err) == (0, note)
     assert json.loads(out)["setpoint"] == {"register": "frequency", "value": 12.34, "unit": "Hz"}
-    assert {it.raw for it in toy.counters.writes if it.name == "frequency"} == {1234}
+    assert {write.raw for write in toy.counters.writes if write.name == "frequency"} == {1234}
     status, out, err = run("write", port, TOY, 1, "frequency", "12.345")
     assert (status, out) == (1, "")
     assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
@@ -243,7 +243,7 @@ def test_a_drive_that_cannot_say_its_setpoint_is_started_with_one(run: Run) -> N
 @patient
 def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
     assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
-    assert [it.name for it in toy.counters.writes] == ["frequency", "control"]
+    assert [write.name for write in toy.counters.writes] == ["frequency", "control"]
 
 
 @patient
@@ -271,7 +271,9 @@ def test_every_write_is_noted_in_the_audit_log(run: Run, port: str, tmp_path: Pa
     run("start", port, TOY, 1, "--yes", "--audit", log)
     run("stop", port, TOY, 1, "--audit", log)
     records = [json.loads(line) for line in log.read_text().splitlines()]
-    assert [(it["drive"], it["write"], it["sent"][:17], it["outcome"]) for it in records] == [
+    assert [
+        (record["drive"], record["write"], record["sent"][:17], record["outcome"]) for record in records
+    ] == [
         ("toy@1", "frequency = 20.00 Hz", "01 06 00 15 07 D0", "done"),
         ("toy@1", "control = RUNNING", "01 06 00 14 00 01", "done"),
         ("toy@1", "control = none", "01 06 00 14 00 00", "done"),
@@ -343,14 +345,17 @@ def test_a_port_in_use_is_a_sentence(run: Run, port: str) -> None:
 # ---- interruptions ----
 
 
+Che = tuple[ReceivedRequests, list[object]]
+
+
 @pytest.fixture
-def che() -> Iterator[tuple[Heard, list[object]]]:
+def che() -> Iterator[Che]:
     """Return the requests of a CHE, and the words that name it."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
-        yield Heard(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
+        yield ReceivedRequests(sim), [simulator.wires[0].path, "invt-che", 1, "--option=maximum_frequency=50"]
 
 
 def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
@@ -367,36 +372,34 @@ def pressing(when: Callable[[Message], bool]) -> Callable[[Message], bool]:
 
 
 @patient
-def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(
-    run: Run, che: tuple[Heard, list[object]]
-) -> None:
-    heard, words = che
-    heard.loses = pressing(lambda request: request in heard.starts)
+def test_a_start_that_is_interrupted_says_what_was_sent_and_how_to_stop_it(run: Run, che: Che) -> None:
+    received, words = che
+    received.loses = pressing(lambda request: request in received.starts)
     status, _, err = run("start", *words, "--frequency", 20, "--yes")
     assert status == 130
-    assert len(heard.starts) == 1
+    assert len(received.starts) == 1
     assert "multidrop: interrupted\nmultidrop: invt-che@1: control = FORWARD " in err
     assert f"multidrop: to stop it, type: multidrop stop {words[0]} invt-che 1 --option=maximum" in err
 
 
 @patient
-def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: tuple[Heard, list[object]]) -> None:
-    heard, words = che
+def test_a_stop_that_is_interrupted_is_sent_once_more(run: Run, che: Che) -> None:
+    received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
-    begun = len(heard.writes)
-    heard.loses = pressing(lambda request: request.start == 0x1000)
+    begun = len(received.writes)
+    received.loses = pressing(lambda request: request.start == 0x1000)
     status, _, err = run("stop", *words)
     assert status == 130
-    until(lambda: len(heard.writes) >= begun + 2)  # the drive may hear it when the client has left
-    assert [it.data for it in heard.writes[begun:]] == [b"\0\5"] * 2
+    until(lambda: len(received.writes) >= begun + 2)  # the drive may hear it when the client has left
+    assert [write.data for write in received.writes[begun:]] == [b"\0\5"] * 2
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
 
 
-def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: tuple[Heard, list[object]]) -> None:
-    heard, words = che
-    heard.loses = lambda request: True
+def test_a_stop_takes_the_seconds_that_it_is_given(run: Run, che: Che) -> None:
+    received, words = che
+    received.loses = lambda request: True
     status, _, err = run("stop", *words, "--seconds", 1)
     assert status == 1
     assert "it was never confirmed" in err
-    assert {it.data for it in heard.writes} == {b"\0\5"}
+    assert {write.data for write in received.writes} == {b"\0\5"}

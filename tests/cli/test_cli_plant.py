@@ -47,8 +47,8 @@ def plant(tmp_path: Path) -> Path:
     """A plant of two lines, with ports that are not there."""
     path = tmp_path / "plant.toml"
     drives = (("pump-1", TOY, 1), ("fan-1", FAN, 3), ("che-1", "invt-che", 4))
-    hall = LINE.format("hall-1", "/dev/none-1") + "".join(DRIVE.format(*drive) for drive in drives)
-    path.write_text(hall + LINE.format("roof", "/dev/none-2") + DRIVE.format("pump-2", TOY, 2))
+    line = LINE.format("hall-1", "/dev/none-1") + "".join(DRIVE.format(*drive) for drive in drives)
+    path.write_text(line + LINE.format("roof", "/dev/none-2") + DRIVE.format("pump-2", TOY, 2))
     return path
 
 

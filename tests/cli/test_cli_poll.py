@@ -99,7 +99,7 @@ def test_options_of_segments_that_do_not_fit(run: Run, plant: Path, words: list[
     assert sentence in told
 
 
-LATE_OR_SILENT = {str(it) for it in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
+LATE_OR_SILENT = {str(each) for each in (Status.NO_REPLY, Status.LATE_ANSWER_DUE, Status.NOT_ASKED)}
 
 
 def test_poll_records_what_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
@@ -292,7 +292,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     summary = json.loads(done.stdout)
     drives = open_reader(out).metadata["drives"]
-    assert {(it["model"], it["framing"]) for it in drives.values()} == {
+    assert {(drive["model"], drive["framing"]) for drive in drives.values()} == {
         ("erman-er-g-220", "rtu"),
         ("invt-che", "rtu"),
         ("innovert-ibd", "rtu"),

@@ -52,7 +52,7 @@ def test_json_is_one_object(run: Run, port: str) -> None:
     told = json.loads(out)
     assert status == 0
     assert told["finished"]
-    assert [(it["address"], it["models"], it["framing"]) for it in told["drives"]] == [
+    assert [(record["address"], record["models"], record["framing"]) for record in told["drives"]] == [
         (1, ["invt-che"], "rtu"),
         (3, [], "rtu"),
     ]
@@ -74,7 +74,7 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
     assert run("scan", port, *words)[0] == 0
     (line,) = load_plant(out).lines
     assert line.port == port
-    assert [(it.drive.address, it.drive.model) for it in line.drives] == [
+    assert [(polled.drive.address, polled.drive.model) for polled in line.drives] == [
         (1, "invt-che"),
         (2, "innovert-ibd"),
         (3, "toy"),
@@ -83,7 +83,7 @@ def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path
     assert status == 0
     polled = json.loads(told)["lines"]["line-1"]["drives"]
     assert set(polled) == {"invt-che-1", "innovert-ibd-2", "toy-3"}
-    assert all(it["samples"] for it in polled.values())
+    assert all(each["samples"] for each in polled.values())
     status, _, err = run("scan", port, *words)
     assert status == 2
     assert "is there already" in err
@@ -163,7 +163,7 @@ def test_every_finding_is_a_sentence() -> None:
 
 
 def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
-    families = {it.model: it for it in (InvtCHE, InnovertIBD, DelixiModbus)}
+    families = {each.model: each for each in (InvtCHE, InnovertIBD, DelixiModbus)}
     found = [
         Found(4, USUAL, Framing.RTU, (), 0.005),
         Found(2, Settings(9600, "8N2"), Framing.RTU, ("invt-che", "delixi-modbus"), 0.005, "damaged"),
@@ -179,7 +179,7 @@ def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
         "invt-che",
         "9600 8N2",
     )
-    comments = [it for it in path.read_text().splitlines() if it.startswith("#")]
+    comments = [each for each in path.read_text().splitlines() if each.startswith("#")]
     assert comments[:2] == ["# damaged", "# it may as well be delixi-modbus"]
     assert "# invt-che-2 has this address too" in comments[2]
     assert 'name = "innovert-ibd-2"' in comments[4]
@@ -206,7 +206,7 @@ def test_what_was_found_is_kept_when_it_is_interrupted(
     plant = tmp_path / "found.toml"
     status, out, err = run("scan", port, *BRISKLY, "--out", plant, *words)
     assert (status, err) == (130, "multidrop: interrupted\n")
-    assert [it.drive.address for it in load_plant(plant).lines[0].drives] == [1]
+    assert [polled.drive.address for polled in load_plant(plant).lines[0].drives] == [1]
     assert json.loads(out)["finished"] is False if words else "1 drive found" in out
 
 
@@ -216,5 +216,5 @@ def test_on_a_terminal_progress_is_one_line(port: str) -> None:
         terminal.wait_for("3 drives found in ")
         assert terminal.process.wait(timeout=60) == 0
         lines = terminal.text.splitlines()
-    assert next(it for it in lines if "innovert-ibd" in it).startswith("address 2: ")
+    assert next(line for line in lines if "innovert-ibd" in line).startswith("address 2: ")
     assert terminal.written.count(b"\r\x1b[K") > 3

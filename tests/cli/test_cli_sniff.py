@@ -98,7 +98,7 @@ def test_a_poll_s_values_are_heard_captured_and_decoded(
     for name, column in polled.items():
         assert decoded[name][: len(column)] == column  # the last one may have come too late for the poll
         assert len(decoded[name]) <= len(column) + 1
-    assert {it["line"] for it in sniffer.exchanges} == {"hall-1"}
+    assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
 def test_the_listener_cannot_send(line: tuple[str, str]) -> None:
@@ -163,11 +163,11 @@ def test_a_line_behind_a_network_is_heard_and_told_nothing(run: Run, kind: str) 
     status, out, err = run("sniff", url, "--baudrate", 19200, "--format", "8E1", "--seconds", 2, "--json")
     assert (status, err) == (0, f"listening on {url}, Ctrl-C ends\n")
     told = [json.loads(line) for line in out.splitlines()]
-    assert {it["line"] for it in told[:-1]} == {url}
+    assert {record["line"] for record in told[:-1]} == {url}
     assert told[-1]["summary"]["exchanges"] > 10
-    heard = [it.get("frames", [])[1:] for it in told[2:-2]]  # it may begin, and end, amid a frame
-    pair = [[it.frame.hex(" ").upper()] for it in (READ, WRITE)]
-    assert heard in ((len(heard) * pair)[: len(heard)], (len(heard) * pair)[1 : len(heard) + 1])
+    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # it may begin, and end, amid a frame
+    pair = [[each.frame.hex(" ").upper()] for each in (READ, WRITE)]
+    assert sniffed in ((len(sniffed) * pair)[: len(sniffed)], (len(sniffed) * pair)[1 : len(sniffed) + 1])
     if server:
         assert (server.port.baudrate, server.port.parity) == (19200, "E")
         server.close()
@@ -193,7 +193,7 @@ def test_a_network_that_goes_away_ends_it_with_a_sentence(run: Run) -> None:
 
 # ---- replay ----
 
-PAIRS = {it.frame: it for it in PRINTED if it.request is not None}
+PAIRS = {each.frame: each for each in PRINTED if each.request is not None}
 READ = PAIRS[bytes.fromhex("01 03 02 13 88 B5 12")]
 WRITE = PAIRS[bytes.fromhex("01 06 00 02 13 88 25 5C")]
 
@@ -201,13 +201,13 @@ WRITE = PAIRS[bytes.fromhex("01 06 00 02 13 88 25 5C")]
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
     path = tmp_path / "a.pcapng"
-    with CaptureWriter(path) as it:
+    with CaptureWriter(path) as writer:
         time = 1_700_000_000_000_000_000
         for exchange in (READ, WRITE):
-            it.write(exchange.request_frame, Side.ASKING, time, "hall-1")
-            it.write(exchange.frame, Side.ANSWERING, time + 5_300_000, "hall-1")
-        it.write(b"\xff\x00", Side.EITHER, time + 6_000_000, "hall-1")
-        it.write(READ.request_frame, Side.ASKING, time + 7_000_000, "hall-1")
+            writer.write(exchange.request_frame, Side.ASKING, time, "hall-1")
+            writer.write(exchange.frame, Side.ANSWERING, time + 5_300_000, "hall-1")
+        writer.write(b"\xff\x00", Side.EITHER, time + 6_000_000, "hall-1")
+        writer.write(READ.request_frame, Side.ASKING, time + 7_000_000, "hall-1")
     return path
 
 
@@ -258,9 +258,9 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
     """Return what `decode` says of a capture of these, one in every ms, without its times of day."""
-    with CaptureWriter(path) as it:
+    with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
-            it.write(raw, side, number * 1_000_000, "hall-1")
+            writer.write(raw, side, number * 1_000_000, "hall-1")
     status, out, err = run("decode", path, *words)
     assert status == 0
     assert not err or err.endswith("/meter.py is run as Python: a model of one's own is a program\n")
@@ -289,12 +289,12 @@ def test_what_is_no_ordinary_read_is_told_too(run: Run, tmp_path: Path) -> None:
 
 
 def test_noise_is_told_though_it_does_not_end() -> None:
-    heard, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
+    stream, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
     for time in range(4):
-        heard.put(b"\xff" * 1500, time)
-        told.append([(it.time_ns, len(it.raw)) for it in pairing.pair(splitter.spans(heard))])
+        stream.put(b"\xff" * 1500, time)
+        told.append([(each.time_ns, len(each.raw)) for each in pairing.pair(splitter.spans(stream))])
     assert told == [[], [], [(0, 4500)], []]
-    assert [(it.time_ns, len(it.raw)) for it in pairing.flush()] == [(3, 1500)]
+    assert [(each.time_ns, len(each.raw)) for each in pairing.flush()] == [(3, 1500)]
 
 
 METER = """\

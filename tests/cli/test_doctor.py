@@ -47,7 +47,7 @@ SENT = bytes.fromhex("F7 03 00 00 00 01 90 9C")
 REFUSAL = bytes.fromhex("F7 83 04 61 1E")
 
 
-def heard(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
+def ended(raw: bytes, result: int = Failure.NO_REPLY, skipped: int = 0, exception: int = 0) -> Completion:
     """Return the result of the request that nobody should answer."""
     reply = Message(0xF7, 3, exception=exception)
     return completed(result, reply, raw, at_ns=1, skipped=skipped)
@@ -93,9 +93,9 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
-    it = find_adapter("/dev/ttyUSB0", sysfs)
-    assert (it.name, it.driver, it.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
-    assert (it.usb_id, it.latency_timer) == ("0403:6001", 16)
+    adapter = find_adapter("/dev/ttyUSB0", sysfs)
+    assert (adapter.name, adapter.driver, adapter.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
+    assert (adapter.usb_id, adapter.latency_timer) == ("0403:6001", 16)
 
 
 def test_a_link_is_followed_to_its_device(sysfs: Path) -> None:
@@ -167,23 +167,23 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
             False,
         ),
         (
-            echo_finding(heard(b""), SENT, USUAL),
+            echo_finding(ended(b""), SENT, USUAL),
             "none at 9600 8N1: nothing came back of what was sent",
             False,
         ),
         (
-            echo_finding(heard(SENT), SENT, USUAL),
+            echo_finding(ended(SENT), SENT, USUAL),
             "the adapter hears what it sends at 9600 8N1; multidrop takes it out",
             False,
         ),
-        (echo_finding(heard(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
+        (echo_finding(ended(b"\x00\xff"), SENT, USUAL), "2 bytes came unasked at 9600 8N1: 00 FF", True),
         (
-            echo_finding(heard(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
+            echo_finding(ended(REFUSAL, len(REFUSAL), exception=4), SENT, USUAL),
             "none at 9600 8N1; address 247, which should be nobody's, answers with exception 04",
             True,
         ),
         (
-            echo_finding(heard(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
+            echo_finding(ended(REFUSAL, len(REFUSAL), len(SENT)), SENT, USUAL),
             "the adapter hears what it sends at 9600 8N1; address 247, which should be nobody's, answers "
             "with a value",
             True,
@@ -278,7 +278,7 @@ def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
     words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
     status, out, _ = run("doctor", port, *words)
     assert status == 0
-    findings = {it["topic"]: it for it in json.loads(out)["findings"]}
+    findings = {load["topic"]: load for load in json.loads(out)["findings"]}
     assert findings["round trip"]["what"].startswith("innovert-ibd@2 begins to answer after ")
 
 

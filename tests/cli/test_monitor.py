@@ -72,7 +72,7 @@ def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) ->
 @pytest.fixture
 def watched(tmp_path: Path) -> LivePlant:
     """One drive that runs, one with a fault, one that never answered."""
-    it = LivePlant(a_plant(tmp_path))
+    live = LivePlant(a_plant(tmp_path))
     rows = [
         row("drive-1", "output_frequency", 42.5),
         row("drive-1", "output_current", 2.5),
@@ -83,10 +83,10 @@ def watched(tmp_path: Path) -> LivePlant:
         row("drive-2", "output_frequency", None, "bad checksum"),
         *(row("drive-3", register, None, "no reply") for register in CHE),
     ]
-    it.add(from_rows(rows))
-    it.tick(100.0, told(10, 1000, 0.9))
-    it.tick(101.0, told(11, 1050, 0.9))
-    return it
+    live.add(from_rows(rows))
+    live.tick(100.0, told(10, 1000, 0.9))
+    live.tick(101.0, told(11, 1050, 0.9))
+    return live
 
 
 def texts(lines: list[Any]) -> list[str]:
@@ -97,13 +97,13 @@ def texts(lines: list[Any]) -> list[str]:
 
 
 def test_states_are_what_is_polled_anyway(watched: LivePlant) -> None:
-    assert [(it.state, it.fault, it.why_silent) for it in watched.drives] == [
+    assert [(drive.state, drive.fault, drive.why_silent) for drive in watched.drives] == [
         ("forward", "", ""),
         ("fault", "oc1_overcurrent_accelerating", ""),
         ("silent", "", "no reply"),
     ]
-    assert [it.age(NOW) for it in watched.drives] == [0.5, 9.0, None]
-    assert [it.so_far.misses.total() for it in watched.drives] == [12, 0, 0]
+    assert [drive.age(NOW) for drive in watched.drives] == [0.5, 9.0, None]
+    assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
 def test_a_rested_drive_tells_why_it_is_rested(watched: LivePlant) -> None:
@@ -112,11 +112,11 @@ def test_a_rested_drive_tells_why_it_is_rested(watched: LivePlant) -> None:
 
 
 def test_no_frequency_is_not_called_a_stop(tmp_path: Path) -> None:
-    it = LivePlant(a_plant(tmp_path, 1))
-    it.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
-    assert it.drives[0].state == ""
-    it.add(from_rows([row("drive-1", "output_frequency", 3.0)]))
-    assert it.drives[0].state == "turns"
+    live = LivePlant(a_plant(tmp_path, 1))
+    live.add(from_rows([row("drive-1", "output_frequency", 0.0)]))
+    assert live.drives[0].state == ""
+    live.add(from_rows([row("drive-1", "output_frequency", 3.0)]))
+    assert live.drives[0].state == "turns"
 
 
 def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
@@ -132,7 +132,7 @@ def test_rates_are_those_of_the_last_seconds(watched: LivePlant) -> None:
 
 
 def test_history_has_a_gap_where_a_value_was_missed(watched: LivePlant) -> None:
-    assert [list(it.history) for it in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
+    assert [list(drive.history) for drive in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
     assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
     assert sparkline([50, 50, 50], 2) == "██"
     assert sparkline([0, 0], 5) == "▁▁"
@@ -159,9 +159,9 @@ def test_the_overview_says_it_in_words(watched: LivePlant) -> None:
 @pytest.mark.parametrize("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @pytest.mark.parametrize("drives", [1, 31, 247])
 def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
-    it = LivePlant(a_plant(tmp_path, min(drives, 247)))
-    it.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
-    it.tick(1.0, told(1, 1, 1.0, drives))
+    live = LivePlant(a_plant(tmp_path, min(drives, 247)))
+    live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
+    live.tick(1.0, told(1, 1, 1.0, drives))
     for chosen in (0, drives - 1):
         failed = [f"drive-{number}: " + "why " * 40 for number in range(30)]
         for at in (
@@ -172,22 +172,22 @@ def test_it_fills_every_size_and_no_more(tmp_path: Path, size: tuple[int, int], 
             Position(chosen, question="Leave?", failures=["x" * 5000]),
         ):
             for lines in (
-                overview(it, at, size, NOW, BLOCKS),
-                page(it.drives[chosen], {}, at, size, NOW),
+                overview(live, at, size, NOW, BLOCKS),
+                page(live.drives[chosen], {}, at, size, NOW),
             ):
                 assert len(lines) == size[1]
                 assert max(len(line) for line in texts(lines)) <= size[0]
-        shown = texts(overview(it, Position(chosen), size, NOW, BLOCKS))
+        shown = texts(overview(live, Position(chosen), size, NOW, BLOCKS))
         assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
 
 
 def test_the_page_has_every_register(watched: LivePlant) -> None:
-    it = watched.drives[1]
+    live = watched.drives[1]
     others = {"motor_speed": "0 rpm"}
-    lines = texts(page(it, others, Position(1, page=True), (80, 40), NOW))
+    lines = texts(page(live, others, Position(1, page=True), (80, 40), NOW))
     assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
     rows = {line.split()[0]: line for line in lines[3:-2] if line.strip()}
-    readable = {name for name, register in it.polled.drive.registers.items() if register.readable}
+    readable = {name for name, register in live.polled.drive.registers.items() if register.readable}
     assert set(rows) == readable
     assert rows["output_frequency"].split()[1:] == ["0.00", "Hz", "9.0", "s", "bad", "checksum"]
     assert rows["status"].split()[1:3] == ["not", "yet"]
@@ -222,10 +222,8 @@ def test_the_page_scrolls_as_far_as_there_is_something(watched: LivePlant) -> No
     at = Position(0, page=True, scrolled=1000)
     lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
     assert lines[9].strip()
-    assert (
-        f"of {len([it for it in watched.drives[0].polled.drive.registers.values() if it.readable])}"
-        in lines[-2]
-    )
+    registers = watched.drives[0].polled.drive.registers.values()
+    assert f"of {len([register for register in registers if register.readable])}" in lines[-2]
 
 
 # ---- its keys ----

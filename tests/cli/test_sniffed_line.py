@@ -58,15 +58,17 @@ def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Call
     def master(port: str, chance: random.Random) -> Iterator[Said]:
         client = require_module("pymodbus.client")
         kind = require_module("pymodbus").FramerType(framer)
-        with client.ModbusSerialClient(port, framer=kind, baudrate=BAUDRATE, timeout=60) as it:
+        with client.ModbusSerialClient(port, framer=kind, baudrate=BAUDRATE, timeout=60) as connection:
             for _ in range(TURN):
                 if chance.random() < 0.6:
                     start = chance.choice(starts)
-                    reply = it.read_holding_registers(start, count=chance.randint(1, 3), device_id=address)
+                    reply = connection.read_holding_registers(
+                        start, count=chance.randint(1, 3), device_id=address
+                    )
                     yield address, 3, -reply.exception_code if reply.isError() else reply.registers
                 else:
                     number = next(NUMBERS) % 10_000
-                    assert not it.write_register(written, number, device_id=address).isError()
+                    assert not connection.write_register(written, number, device_id=address).isError()
                     yield address, 6, [number]
 
     return master
@@ -117,7 +119,7 @@ def told_as_said(told: dict[str, Any]) -> Said:
 @pytest.mark.slow
 def test_every_exchange_of_a_mixed_line_is_heard() -> None:
     said, told = mastered()
-    assert [told_as_said(it) for it in told[:-1]] == said
+    assert [told_as_said(record) for record in told[:-1]] == said
     assert told[-1]["summary"] == {
         "exchanges": len(said),
         "broadcasts": 0,
@@ -125,7 +127,7 @@ def test_every_exchange_of_a_mixed_line_is_heard() -> None:
         "strays": 0,
         "unknown_bytes": 0,
     }
-    assert {it["framing"] for it in told[:-1]} == {"rtu", "ascii", "delixi"}
+    assert {record["framing"] for record in told[:-1]} == {"rtu", "ascii", "delixi"}
 
 
 # ---- with damage ----
@@ -140,24 +142,24 @@ class Damage:
     chance: random.Random = field(default_factory=lambda: random.Random(2))
 
     def __call__(self, said: bytes) -> bytes:
-        heard = bytearray()
+        damaged = bytearray()
         for byte in said:
             kind = self.chance.choice(["changed", "lost", "doubled"]) if self.chance.random() < 0.01 else ""
             if kind:
                 self.damaged.append(len(self.said))
             self.said.append(byte)
             if kind != "lost":
-                heard.append(byte ^ self.chance.randrange(1, 256) if kind == "changed" else byte)
+                damaged.append(byte ^ self.chance.randrange(1, 256) if kind == "changed" else byte)
             if kind == "doubled":
-                heard.append(byte)
-        return bytes(heard)
+                damaged.append(byte)
+        return bytes(damaged)
 
     def exchanges(self) -> list[tuple[bool, tuple[str, ...]]]:
         """Return each exchange's frames, and True where it is whole."""
-        heard = Stream()
-        heard.put(bytes(self.said), 0)
-        heard.end(True)
-        spans = list(Splitter().spans(heard))
+        stream = Stream()
+        stream.put(bytes(self.said), 0)
+        stream.end(True)
+        spans = list(Splitter().spans(stream))
         assert [span.kind for span in spans] == [Kind.REQUEST, Kind.REPLY] * (len(spans) // 2)
         damaged, found, at = set(self.damaged), [], 0
         for pair in zip(spans[::2], spans[1::2], strict=True):
@@ -181,9 +183,9 @@ def test_every_exchange_that_is_not_next_to_damage_is_heard() -> None:
     is_whole = [whole for whole, _ in exchanges]
     expected = [exchanges[at][1] for at in range(1, len(exchanges) - 1) if all(is_whole[at - 1 : at + 2])]
     assert len(expected) > 0.3 * len(said)
-    heard = [tuple(it["frames"]) for it in told[:-1] if it.get("result") in ("ok", "refused")]
-    rest = iter(heard)
-    assert [it for it in expected if it not in rest] == []  # all of them, in their order
-    assert set(heard) <= {it for _, it in exchanges}  # and nothing that was never said
-    unknown = sum(len(bytes.fromhex(it["unknown"])) for it in told[:-1] if "unknown" in it)
+    sniffed = [tuple(record["frames"]) for record in told[:-1] if record.get("result") in ("ok", "refused")]
+    rest = iter(sniffed)
+    assert [each for each in expected if each not in rest] == []  # all of them, in their order
+    assert set(sniffed) <= {each for _, each in exchanges}  # and nothing that was never said
+    unknown = sum(len(bytes.fromhex(record["unknown"])) for record in told[:-1] if "unknown" in record)
     assert told[-1]["summary"]["unknown_bytes"] == unknown > 0

@@ -130,8 +130,12 @@ def test_names_in_a_picture_are_no_mathematics_and_in_its_legend(tmp_path: Path,
 def test_the_interfaces_and_comments_of_a_capture_are_told_without_their_commands(
     run: Run, tmp_path: Path
 ) -> None:
-    exchanges = [it for it in PRINTED if it.framing is Framing.RTU and isinstance(it.says, Message)]
-    path = write(tmp_path / "it.pcapng", [it for it in exchanges if it.request is not None][:3], line=TRAP)
+    exchanges = [each for each in PRINTED if each.framing is Framing.RTU and isinstance(each.says, Message)]
+    path = write(
+        tmp_path / "it.pcapng",
+        [exchange for exchange in exchanges if exchange.request is not None][:3],
+        line=TRAP,
+    )
     comment = struct.pack("<HH4s", 1, 4, b"\x1b[2J")
     section = struct.pack("<III", 0x0A0D0D0A, 36, 0x1A2B3C4D) + struct.pack("<HHq", 1, 0, -1) + comment
     path.write_bytes(section + struct.pack("<I", 36) + path.read_bytes()[section_length(path) :])

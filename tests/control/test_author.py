@@ -27,9 +27,9 @@ class Audited:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
         self.path = path
-        self.hall: SimulatedBus
-        self.hall, self.drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
-        self.bus = self.hall.bus
+        self.line: SimulatedBus
+        self.line, self.drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+        self.bus = self.line.bus
 
     def noted(self) -> Noted:
         return [(entry["write"], entry.get("by"), entry.get("way")) for entry in read_audit(self.path)]
@@ -65,7 +65,7 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
 
 
 def test_a_write_in_doubt_has_its_author(audited: Audited) -> None:
-    audited.hall.loses = lambda request: request.function == 6
+    audited.line.loses = lambda request: request.function == 6
     with written_by("anna"), suppress(Unconfirmed):
         audited.drive.set_frequency(20)
     assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
@@ -75,7 +75,7 @@ def test_a_stop_that_follows_a_failed_start_is_its_callers(audited: Audited) -> 
     """`start_staggered` stops its drives on threads of their own."""
     drive = audited.drive
     drive.set_frequency(20)
-    audited.hall.loses = lambda request: request.data == b"\0\1"
+    audited.line.loses = lambda request: request.data == b"\0\1"
     with written_by("anna"), pytest.raises(BusError):
         start_staggered([drive], gap=1.0)
     assert [by for _, by, _ in audited.noted()][1:] == ["anna"] * (len(audited.noted()) - 1)
@@ -124,7 +124,7 @@ def test_a_name_that_would_spoil_the_log_is_refused(audited: Audited, who: str) 
     way: Any = 7
     with pytest.raises(TypeError, match="way = 7 is no text"), written_by("anna", way):
         audited.drive.set_frequency(20)
-    assert audited.hall.written == []
+    assert audited.line.written == []
 
 
 def test_a_log_from_before_is_read(audited: Audited) -> None:

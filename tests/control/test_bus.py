@@ -212,7 +212,11 @@ def test_the_alias_in_ram_is_written_where_there_is_one() -> None:
         ours = bus.attach(MyCHE, 1)
         for seconds in (5.0, 6.0, 7.0):
             assert bus.write(ours, ours.acceleration_time, seconds) == seconds
-    assert [(it.address, it.raw) for it in che.counters.writes] == [(0x8008, 50), (0x8008, 60), (0x8008, 70)]
+    assert [(write.address, write.raw) for write in che.counters.writes] == [
+        (0x8008, 50),
+        (0x8008, 60),
+        (0x8008, 70),
+    ]
     assert not che.counters.eeprom_writes
 
 
@@ -503,7 +507,7 @@ def test_a_refusal_has_its_family_s_meaning(
         (YD1000(1, baudrate=2400), 440, 500),
         (YD1000(1, baudrate=1200), 500, 500),
     ],
-    ids=lambda it: f"{it.name} {it.settings}" if isinstance(it, Drive) else None,
+    ids=lambda each: f"{each.name} {each.settings}" if isinstance(each, Drive) else None,
 )
 def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, most_ms: int) -> None:
     with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
@@ -518,10 +522,10 @@ def test_a_drive_s_document_bounds_its_time_out(drive: Drive, least_ms: int, mos
 def test_a_stop_to_all_of_one_family() -> None:
     drives = [simulated(InnovertIBD(address)) for address in (1, 2)]
     with unpaced(*drives) as sim, Bus(path(sim)) as bus:
-        for it in drives:
-            bus.attach(it.drive)
+        for drive in drives:
+            bus.attach(drive.drive)
         bus.broadcast(InnovertIBD.control, IBDControl.STOP)
-    assert [it.counters.broadcasts for it in drives] == [1, 1]
+    assert [drive.counters.broadcasts for drive in drives] == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -537,11 +541,11 @@ def test_a_stop_to_all_of_one_family() -> None:
 def test_a_broadcast_that_could_do_harm_is_refused(drives: list[Drive], value: IBDControl) -> None:
     there = [simulated(drive) for drive in drives]
     with unpaced(*there) as sim, Bus(path(sim)) as bus:
-        for it in there:
-            bus.attach(it.drive)
+        for each in there:
+            bus.attach(each.drive)
         with pytest.raises(Refused):
             bus.broadcast(InnovertIBD.control, value)
-    assert [it.counters.broadcasts for it in there] == [0, 0]
+    assert [each.counters.broadcasts for each in there] == [0, 0]
 
 
 # ---- one bus for all ----

@@ -45,9 +45,9 @@ def test_a_record_that_had_no_room_harms_no_other(tmp_path: Path, room: int) -> 
                 log.add(1, {"write": "lost" * 20})
     other.add(2, {"write": "second"})
     log.add(3, {"write": "third"})
-    for it in (log, other):
-        it.close()
-    assert [it["write"] for it in read_audit(path)] == ["first", "second", "third"]
+    for each in (log, other):
+        each.close()
+    assert [each["write"] for each in read_audit(path)] == ["first", "second", "third"]
     whole = path.read_bytes().splitlines()
     assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
 
@@ -64,7 +64,7 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "audit.jsonl"
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
     drive.set_frequency(20)
     drive.start()
     with full_at(path.stat().st_size + 50):
@@ -72,8 +72,8 @@ def test_a_full_disk_hinders_no_stop_and_what_comes_after_is_noted(
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
     drive.set_frequency(30)
-    hall.bus.close()
-    assert [it["write"] for it in read_audit(path)] == [
+    line.bus.close()
+    assert [each["write"] for each in read_audit(path)] == [
         "setpoint = 40.00 %",
         "control = FORWARD",
         "setpoint = 60.00 %",
@@ -118,12 +118,12 @@ def test_a_ledger_that_was_begun_on_a_full_disk(tmp_path: Path, room: int) -> No
 def test_a_ledger_in_a_read_only_directory_keeps_the_write_back(monkeypatch: pytest.MonkeyPatch) -> None:
     with read_only_directory() as directory:
         for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
-            hall, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
+            line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
             with pytest.raises(OSError, match=r"the ledger of EEPROM writes .*wear\.sqlite cannot be kept"):
                 drive.set_frequency(10)
-            assert hall.written == []
+            assert line.written == []
             drive.stop()  # needs none
-            assert len(hall.written) == 1
+            assert len(line.written) == 1
 
 
 def test_a_clock_that_is_set_back_an_hour_frees_one_write_and_no_more(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_a_clock_that_is_set_back_gives_no_budget_back(tmp_path: Path) -> None:
 def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """10 Hz to an EEPROM for an hour of such a clock: once a minute at most, and once for the jump."""
     log = tmp_path / "audit.jsonl"
-    hall, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
+    line, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
     utc = [1_700_000_000 * 10**9]
     monkeypatch.setattr("multidrop.transport.clock.utc_minus_monotonic_ns", lambda: utc[0])
     tried = []
@@ -163,14 +163,14 @@ def test_a_setpoint_loop_while_the_clock_is_set_back(monkeypatch: pytest.MonkeyP
         except Refused:
             continue
         finally:
-            hall.sleep(1)
+            line.sleep(1)
         tried.append(second)
     gaps = sorted(after - before for before, after in pairwise(tried))
     assert len(tried) >= 5
     assert all(gap >= 58 for gap in gaps[1:])  # all but the one in which the clock was set back
     assert sim.counters.eeprom_writes["frequency"] == len(tried)
-    hall.bus.close()
-    times = [str(it["time"]) for it in read_audit(log)]
+    line.bus.close()
+    times = [str(each["time"]) for each in read_audit(log)]
     assert len(times) == len(tried)
     assert times != sorted(times)  # the log says what the clock said, in the order of what was done
 

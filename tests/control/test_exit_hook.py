@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from lines import PATIENCE, until
-from motors import Heard
+from motors import ReceivedRequests
 
 from multidrop.control.exit_hook import CUT_SHORT, ExitHook
 from multidrop.drives import InvtCHE
@@ -42,8 +42,8 @@ def caught() -> Iterator[list[int]]:
     """The signals that had the effect that they had before."""
     found: list[int] = []
     before = [
-        (it, signal.signal(it, lambda number, frame: found.append(number)))
-        for it in (signal.SIGINT, signal.SIGTERM)
+        (each, signal.signal(each, lambda number, frame: found.append(number)))
+        for each in (signal.SIGINT, signal.SIGTERM)
     ]
     yield found
     for number, handler in before:
@@ -155,17 +155,17 @@ with ExitStack() as stack:
 
 
 @contextmanager
-def lines(count: int) -> Iterator[tuple[list[list[Heard]], list[str]]]:
+def lines(count: int) -> Iterator[tuple[list[list[ReceivedRequests]], list[str]]]:
     """The requests of the four drives of each line, and the ports."""
-    heard: list[list[Heard]] = []
+    received: list[list[ReceivedRequests]] = []
     for _ in range(count):
         sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3, 4)]
         for sim in sims:
             assert isinstance(sim, MotorDrive)
             sim.motor.acceleration_time, sim.motor.deceleration_time = 0.2, 3.0
-        heard.append([Heard(sim) for sim in sims if isinstance(sim, MotorDrive)])
-    with Simulator([Wire([it.sim for it in one], unpaced=True) for one in heard]) as simulator:
-        yield heard, [wire.path for wire in simulator.wires]
+        received.append([ReceivedRequests(sim) for sim in sims if isinstance(sim, MotorDrive)])
+    with Simulator([Wire([each.sim for each in one], unpaced=True) for one in received]) as simulator:
+        yield received, [wire.path for wire in simulator.wires]
 
 
 @contextmanager
@@ -179,17 +179,19 @@ def client(how: str, ports: list[str]) -> Iterator[subprocess.Popen[str]]:
         yield process
 
 
-def stops(heard: list[Heard]) -> int:
-    broadcast = max(sum(it.address == 0 for it in one.requests) for one in heard)
-    return broadcast + sum(it.data[-1] == 5 for one in heard for it in one.writes if it.start == 0x1000)
+def stops(received: list[ReceivedRequests]) -> int:
+    broadcast = max(sum(request.address == 0 for request in one.requests) for one in received)
+    return broadcast + sum(
+        write.data[-1] == 5 for one in received for write in one.writes if write.start == 0x1000
+    )
 
 
 def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
-    with lines(1) as (heard, ports), client("wait", ports) as process:
-        for it in heard[0]:
-            it.loses = lambda request: True
+    with lines(1) as (received, ports), client("wait", ports) as process:
+        for each in received[0]:
+            each.loses = lambda request: True
         process.send_signal(signal.SIGINT)
-        until(lambda: stops(heard[0]))
+        until(lambda: stops(received[0]))
         for _ in range(20):  # two that come at once are one
             process.send_signal(signal.SIGINT)
             try:
@@ -205,45 +207,45 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
 @BOTH
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
     """It comes when the first drive has its stop, and the others have none perhaps."""
-    with lines(1) as (heard, ports), client("wait", ports) as process:
+    with lines(1) as (received, ports), client("wait", ports) as process:
         process.send_signal(number)
-        until(lambda: stops(heard[0]))
+        until(lambda: stops(received[0]))
         process.send_signal(number)
         process.communicate()
         assert process.returncode == -number
-        assert not any(it.sim.motor.energised for it in heard[0])
+        assert not any(each.sim.motor.energised for each in received[0])
 
 
 def test_a_signal_while_the_block_is_left_leaves_no_motor_running() -> None:
-    with lines(1) as (heard, ports), client("leave", ports) as process:
-        until(lambda: stops(heard[0]))
+    with lines(1) as (received, ports), client("leave", ports) as process:
+        until(lambda: stops(received[0]))
         process.send_signal(signal.SIGTERM)
         process.communicate()
         assert process.returncode == -signal.SIGTERM
-        assert not any(it.sim.motor.energised for it in heard[0])
+        assert not any(each.sim.motor.energised for each in received[0])
 
 
 def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
-    with lines(2) as (heard, ports), client("wait", ports) as process:
+    with lines(2) as (received, ports), client("wait", ports) as process:
         turning_at_last_stop: list[bool] = []
-        for one, others in (heard, heard[::-1]):
-            for it in one:
-                it.loses = seen(it, others, turning_at_last_stop)
+        for one, others in (received, received[::-1]):
+            for each in one:
+                each.loses = seen(each, others, turning_at_last_stop)
         process.send_signal(signal.SIGTERM)
         process.communicate()
         assert process.returncode == -signal.SIGTERM
-        assert all(stops(one) for one in heard)
+        assert all(stops(one) for one in received)
         assert turning_at_last_stop
         assert all(turning_at_last_stop)
-        assert not any(it.sim.motor.energised for one in heard for it in one)
+        assert not any(each.sim.motor.energised for one in received for each in one)
 
 
-def seen(drive: Heard, others: list[Heard], found: list[bool]) -> Callable[[Any], bool]:
+def seen(drive: ReceivedRequests, others: list[ReceivedRequests], found: list[bool]) -> Callable[[Any], bool]:
     """Note at its first stop that the others still turn along their ramps."""
 
     def loses(request: Any) -> bool:
         if request.start == 0x1000 and request.data[-1:] == b"\5" and drive.sim.motor.frequency > 0:
-            found.append(all(it.sim.motor.frequency > 0 for it in others))
+            found.append(all(other.sim.motor.frequency > 0 for other in others))
         return False
 
     return loses
@@ -254,7 +256,7 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
 
     from multidrop.poller import Poller
 
-    with lines(2) as (heard, ports):
+    with lines(2) as (received, ports):
         drives = [InvtCHE(1, maximum_frequency=50, name=f"pump-{number}") for number in (1, 2)]
         declared = [
             line(port, polled(drive, [drive.output_frequency]), name=f"line-{number}")
@@ -266,4 +268,4 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
                 drive.set_frequency(20)
                 drive.start()
             poller.stop_on_exit()
-        assert not any(it.sim.motor.energised for one in heard for it in one)
+        assert not any(each.sim.motor.energised for one in received for each in one)

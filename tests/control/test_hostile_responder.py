@@ -104,11 +104,11 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
         kind: quick(kind)(address, name=kind, **KINDS[kind].makes) for address, kind in enumerate(KINDS, 1)
     }
     asked = {
-        kind: polled(it, [reg for reg in it.readings() if reg.values is None][:REGISTERS])
-        for kind, it in drives.items()
+        kind: polled(each, [reg for reg in each.readings() if reg.values is None][:REGISTERS])
+        for kind, each in drives.items()
     }
     asked[MOTOR] = polled(drives[MOTOR], [])  # its values are its motor's
-    responder_line = ResponderLine([responder_drive(kind, it) for kind, it in asked.items()])
+    responder_line = ResponderLine([responder_drive(kind, each) for kind, each in asked.items()])
     hostile = Hostile(seed)
     responder_line.mangle = hostile.mangle
     starts: list[str] = []
@@ -134,9 +134,9 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
             over.set()
             commander.join()
     truth = {
-        (kind, poll.register.name): value(it.drive.address, at) * poll.register.scale
-        for kind, it in asked.items()
-        for at, poll in enumerate(it.polls)
+        (kind, poll.register.name): value(each.drive.address, at) * poll.register.scale
+        for kind, each in asked.items()
+        for at, poll in enumerate(each.polls)
     }
     rows = rows_of(poller)
     samples = [row for row in rows if row.value is not None]
@@ -144,8 +144,8 @@ def test_nothing_is_mistaken_and_nothing_moves_unasked(seed: int) -> None:
     assert [row for row in samples if row.value != float(truth[row.drive, row.register])] == []
     assert {row.drive for row in samples} == set(drives) - {MOTOR}
     misses = {row.status for row in rows if row.value is None}
-    assert {it for it in misses if not it.startswith("exception ")} <= REASONS
-    assert [str(it) for it in responder_line.log if it.what == "damaged"] == []
-    moves = [str(it) for it in responder_line.log if it.what == "moves"]
+    assert {miss for miss in misses if not miss.startswith("exception ")} <= REASONS
+    assert [str(each) for each in responder_line.log if each.what == "damaged"] == []
+    moves = [str(each) for each in responder_line.log if each.what == "moves"]
     assert len(moves) <= len(starts), "a motor was started that nobody started, or twice"
     assert hostile.struck.total() > FRAMES / 10

@@ -71,7 +71,7 @@ def test_one_write_a_minute_by_whatever_name_of_a_host(tmp_path: Path) -> None:
         write(path, 12.0, ledger)
         with pytest.raises(Refused, match="is written once in 60 s at most"):
             write(path.replace("127.0.0.1", "localhost"), 13.0, ledger)
-        assert [it.cell.port for it in ledger.wear(0)] == [path.removeprefix("socket://")]
+        assert [each.cell.port for each in ledger.wear(0)] == [path.removeprefix("socket://")]
 
 
 def test_an_adapter_is_known_by_its_serial_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +132,7 @@ def test_what_an_older_ledger_counted_still_counts(tmp_path: Path, old: str) -> 
     assert ledger.enter(cell, 1002.0, 0.0) == ""
     assert "written 3 times in a year" in ledger.enter(cell, 1003.0, 0.0)
     if old != "socket://hall:1":
-        assert [(it.cell.port, it.writes) for it in ledger.wear(1003.0)] == [(now, 3)]
+        assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
 # ---- what wears ----
@@ -149,13 +149,13 @@ def test_what_cannot_wear_is_not_counted(tmp_path: Path, monkeypatch: pytest.Mon
 
     ledger = Ledger(tmp_path / "wear")
     sim = SimulatedDrive(Fan(1))
-    hall = SimulatedBus(monkeypatch, sim, ledger=ledger)
-    fan = hall.attach(Fan(1, ram=["known"]))
+    line = SimulatedBus(monkeypatch, sim, ledger=ledger)
+    fan = line.attach(Fan(1, ram=["known"]))
     for register in (fan.relay, fan.speed, fan.known):
-        hall.bus.write(fan, register, 1)
+        line.bus.write(fan, register, 1)
     assert ledger.wear(0) == []
-    hall.bus.write(fan, fan.latch, 1)
-    assert [it.cell.register for it in ledger.wear(0)] == ["latch"]
+    line.bus.write(fan, fan.latch, 1)
+    assert [each.cell.register for each in ledger.wear(0)] == ["latch"]
     assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # what its owner knows, its class does not
 
 

@@ -41,10 +41,10 @@ from multidrop.transport.exchange import READ_ATTEMPTS
 every_family = pytest.mark.parametrize("model", MAKE)
 
 
-def starts(hall: SimulatedBus, model: str) -> list[str]:
+def starts(line: SimulatedBus, model: str) -> list[str]:
     return [
         frame
-        for request, frame in hall.frames
+        for request, frame in line.frames
         if request.function in (2, 5, 6, 15, 16) and STARTS[model](request)
     ]
 
@@ -56,8 +56,8 @@ def starts(hall: SimulatedBus, model: str) -> list[str]:
 def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
-    controls = [it for it in drive.registers.values() if it.harmless is not None]
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
+    controls = [each for each in drive.registers.values() if each.harmless is not None]
     assert controls
     refusals = 0
     for register in controls:
@@ -69,17 +69,17 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
                 continue
             refusals += 1
             with pytest.raises(Refused, match=r"commands the motor.*use start\(\)") as refusal:
-                hall.bus.write(drive, register, value)
+                line.bus.write(drive, register, value)
             assert refusal.value.register == register.name
             assert refusal.value.place
     assert refusals >= 3
-    assert hall.frames == []
+    assert line.frames == []
     assert not sim.motor.energised
 
 
 def test_a_stop_may_be_written_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
-    assert hall.bus.write(drive, drive.control, CHEControl.STOP) is CHEControl.STOP
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    assert line.bus.write(drive, drive.control, CHEControl.STOP) is CHEControl.STOP
 
 
 @pytest.mark.parametrize(
@@ -115,39 +115,39 @@ def test_a_stop_may_be_written_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_against_a_rule_is_refused_and_not_sent(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, name: str, value: float, sentence: str
 ) -> None:
-    hall, _, _ = one(monkeypatch, drive)
+    line, _, _ = one(monkeypatch, drive)
     register = drive.register(name)
     with pytest.raises(Refused, match=sentence) as refusal:
-        hall.bus.write(drive, register, value)
+        line.bus.write(drive, register, value)
     assert isinstance(refusal.value, ValueError)  # a mistake of the caller's
     assert (refusal.value.register, bool(refusal.value.rule), bool(refusal.value.place)) == (name, True, True)
-    assert hall.written == []
+    assert line.written == []
 
 
 def test_what_changes_only_at_rest_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(20)
     drive.start()
-    hall.sleep(1)
-    before = list(hall.written)
+    line.sleep(1)
+    before = list(line.written)
     with pytest.raises(
         Refused, match=r"maximum_frequency .* only while the motor stands; state: running.*FH"
     ):
-        hall.bus.write(drive, drive.maximum_frequency, 90)
-    assert hall.written == before
+        line.bus.write(drive, drive.maximum_frequency, 90)
+    assert line.written == before
     drive.stop()
-    assert hall.bus.write(drive, drive.maximum_frequency, 90) == 90
+    assert line.bus.write(drive, drive.maximum_frequency, 90) == 90
     assert sim["maximum_frequency"] == 90
 
 
 def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
-    assert hall.bus.raw(drive, 6, 0x0000, b"\x00\x01") == b"\x00\x01"
-    assert hall.written == ["01 06 00 00 00 01 48 0A"]
-    hall.loses = lambda request: True
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    assert line.bus.raw(drive, 6, 0x0000, b"\x00\x01") == b"\x00\x01"
+    assert line.written == ["01 06 00 00 00 01 48 0A"]
+    line.loses = lambda request: True
     with pytest.raises(Unconfirmed, match="raw request 01 06 00 00 00 01"):
-        hall.bus.raw(drive, 6, 0x0000, b"\x00\x01")
-    assert len(hall.written) == 2  # once each
+        line.bus.raw(drive, 6, 0x0000, b"\x00\x01")
+    assert len(line.written) == 2  # once each
 
 
 # ---- identity ----
@@ -157,17 +157,17 @@ def test_raw_goes_past_every_rule_and_is_called_that(monkeypatch: pytest.MonkeyP
 def test_the_first_write_is_preceded_by_a_look_and_the_second_is_not(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
-    assert hall.frames[0][1] not in hall.written
-    assert hall.written
+    assert line.frames[0][1] not in line.written
+    assert line.written
     looks: list[str] = []
     monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
-    hall.sleep(61)
+    line.sleep(61)
     drive.set_frequency(25)
     assert looks == []
-    hall.queue = object()  # the port was opened anew: who knows what is on it
-    hall.sleep(61)
+    line.queue = object()  # the port was opened anew: who knows what is on it
+    line.sleep(61)
     drive.set_frequency(30)
     assert looks == ["look"]
 
@@ -181,78 +181,78 @@ def test_a_drive_of_another_family_is_not_written_to(
         return
     sim = simulated(MAKE[actual](1))
     assert isinstance(sim, MotorDrive)
-    hall = SimulatedBus(monkeypatch, sim)
-    drive = hall.attach(MAKE[model](1))
+    line = SimulatedBus(monkeypatch, sim)
+    drive = line.attach(MAKE[model](1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.jog, drive.reset_fault):
         with pytest.raises((Refused, NoReply, Unsupported)):
             call()
-    assert hall.written == []
+    assert line.written == []
     assert not sim.counters.writes
 
 
 def test_a_goodrive_is_not_taken_for_a_che(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = 0x010A
     for call in (lambda: drive.set_frequency(20), drive.start, drive.stop, drive.coast):
         with pytest.raises(Refused, match="010AH"):
             call()
-    assert hall.written == []
+    assert line.written == []
 
 
 def test_a_stop_is_sent_to_a_drive_that_cannot_be_heard_and_nothing_else_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    hall.loses = lambda request: True
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.loses = lambda request: True
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
         with pytest.raises(NoReply):
             call()
-    assert hall.written == []
-    begun = hall.seconds
+    assert line.written == []
+    begun = line.seconds
     with pytest.raises(Unconfirmed, match="never confirmed"):
         drive.stop()
-    assert set(hall.written) == {"01 06 10 00 00 05 4D 09"}
-    assert len(hall.written) > 50  # for 30 s
-    assert 30 <= hall.seconds - begun < 32
+    assert set(line.written) == {"01 06 10 00 00 05 4D 09"}
+    assert len(line.written) > 50  # for 30 s
+    assert 30 <= line.seconds - begun < 32
 
 
 def test_an_ibd_that_cannot_be_told_apart_needs_its_owner_s_word(monkeypatch: pytest.MonkeyPatch) -> None:
     for confirmed in (0, 1):
-        hall, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
+        line, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
         if confirmed:
             drive.set_frequency(20)
-            assert hall.written == ["01 06 20 01 07 D0 D0 66"]
+            assert line.written == ["01 06 20 01 07 D0 D0 66"]
             assert sim.counters.requests > 1  # a read went before: it tells whether the adapter echoes
-            assert hall.frames[0][0].function == 3
+            assert line.frames[0][0].function == 3
         else:
             with pytest.raises(Refused, match="confirmed = 1"):
                 drive.set_frequency(20)
-            assert hall.written == []
+            assert line.written == []
 
 
 # ---- outcomes ----
 
 
 def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
-    outcome = hall.bus.try_write(drive, drive.acceleration_time, 20.0)
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    outcome = line.bus.try_write(drive, drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)
     assert str(outcome) == "innovert-ibd@1: acceleration_time = 20.0 s: done (read back)"
-    outcome = hall.bus.try_write(drive, drive.acceleration_time, 6000.0)
+    outcome = line.bus.try_write(drive, drive.acceleration_time, 6000.0)
     assert (outcome.effect, outcome.held, outcome.value) == (Effect.TAKEN_AS, 3600.0, 3600.0)
     assert str(outcome) == "innovert-ibd@1: acceleration_time = 6000.0 s: taken as 3600.0 s"
-    outcome = hall.bus.try_write(drive, drive.frequency, 20.0)
+    outcome = line.bus.try_write(drive, drive.frequency, 20.0)
     assert str(outcome).endswith("frequency = 20.00 Hz: done (cannot be read back)")
-    hall.loses = lambda request: request.function == 6
-    outcome = hall.bus.try_write(drive, drive.frequency, 25.0)
+    line.loses = lambda request: request.function == 6
+    outcome = line.bus.try_write(drive, drive.frequency, 25.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, None)
     assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
-    assert hall.bus.try_write(drive, drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
-    hall.deafens = hall.loses
-    outcome = hall.bus.try_write(drive, drive.acceleration_time, 30.0)
+    assert line.bus.try_write(drive, drive.acceleration_time, 10.0).effect is Effect.DONE  # it was looked up
+    line.deafens = line.loses
+    outcome = line.bus.try_write(drive, drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
 
 
@@ -260,16 +260,16 @@ def test_done_taken_refused_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None
 def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
     insisted: list[bool] = []
-    carry_out = hall.carry_out
+    carry_out = line.carry_out
 
     def watched(exchange: Exchange, **times: int) -> Completion:
         if is_write(exchange.request):
             insisted.append(bool(exchange.c.insists))
         return carry_out(exchange, **times)
 
-    monkeypatch.setattr(hall, "carry_out", watched)
+    monkeypatch.setattr(line, "carry_out", watched)
     drive.set_frequency(20)
     drive.start()
     assert not insisted[-1]
@@ -282,59 +282,59 @@ def test_only_a_stop_is_sent_before_an_earlier_answer_has_come(
 def test_the_first_look_tells_the_watchdog_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
-    assert not hall.frames  # attached, and nothing was sent
+    line, drive, _ = one(monkeypatch, YD1000(1))
+    assert not line.frames  # attached, and nothing was sent
     with caplog.at_level("INFO", "multidrop"):
         drive.set_frequency(20)
         drive.start()
-    told = [it.getMessage() for it in caplog.records if "watchdog" in it.getMessage()]
+    told = [record.getMessage() for record in caplog.records if "watchdog" in record.getMessage()]
     off = "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     assert told == [f"{drive.name}: {off}"]
 
 
 def test_refused_by_the_drive_has_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
-    hall.bus.check_identity(drive)
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    line.bus.check_identity(drive)
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
-    hall.answers = lambda request: refusal if request.function == 6 else None
-    outcome = hall.bus.try_write(drive, drive.setpoint, 50.0)
+    line.answers = lambda request: refusal if request.function == 6 else None
+    outcome = line.bus.try_write(drive, drive.setpoint, 50.0)
     assert outcome.effect is Effect.REFUSED
     with pytest.raises(DriveRefused, match="code 12H, write not allowed: out of range"):
         assert outcome.value
-    assert len(hall.written) == 1
+    assert len(line.written) == 1
 
 
 def test_a_raw_request_that_is_refused_is_noted_as_that(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
+    line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
-    hall.answers = lambda request: refusal if request.function == 6 else None
+    line.answers = lambda request: refusal if request.function == 6 else None
     with pytest.raises(DriveRefused, match="code 12H"):
-        hall.bus.raw(drive, 6, 0x1000, b"\0\5")
-    hall.bus.close()
+        line.bus.raw(drive, 6, 0x1000, b"\0\5")
+    line.bus.close()
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
 
 
 def test_a_drive_that_refuses_to_tell_its_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
+    line, drive, _ = one(monkeypatch, YD1000(1))
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
-    hall.answers = lambda request: refusal if request.function == 3 else None
-    assert hall.bus.watchdog(drive) == drive.watchdog
+    line.answers = lambda request: refusal if request.function == 3 else None
+    assert line.bus.watchdog(drive) == drive.watchdog
 
 
 def test_a_write_whose_turn_comes_too_late_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
-    written = list(hall.written)
-    hall.queue_time = 1.5
+    written = list(line.written)
+    line.queue_time = 1.5
     with pytest.raises(Expired, match="within 1 s"):
         drive.set_frequency(30)
     with pytest.raises(Expired, match="control = FORWARD was not sent"):
         drive.start()
-    assert hall.written == written
+    assert line.written == written
     drive.stop()  # is never too late
-    assert len(hall.written) == len(written) + 1
+    assert len(line.written) == len(written) + 1
 
 
 # ---- faults on the way ----
@@ -342,12 +342,12 @@ def test_a_write_whose_turn_comes_too_late_is_not_sent(monkeypatch: pytest.Monke
 
 @every_family
 def test_a_start_whose_reply_is_lost_is_sent_once(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
-    hall.loses = lambda request: request.function in (2, 5, 6) and STARTS[model](request)
+    line.loses = lambda request: request.function in (2, 5, 6) and STARTS[model](request)
     with pytest.raises(Unconfirmed, match="no reply"):
         drive.start()
-    assert len(starts(hall, model)) == 1
+    assert len(starts(line, model)) == 1
     assert sim.motor.energised  # it did happen, and the caller was told that it may have
 
 
@@ -355,13 +355,13 @@ def test_a_start_whose_reply_is_lost_is_sent_once(monkeypatch: pytest.MonkeyPatc
 def test_a_stop_whose_reply_is_lost_is_sent_until_it_is_answered(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
-    begun = len(hall.written)
-    hall.loses = lambda request: request.function in (2, 5, 6) and len(hall.written) - begun < 3
+    begun = len(line.written)
+    line.loses = lambda request: request.function in (2, 5, 6) and len(line.written) - begun < 3
     drive.stop()
-    stops = hall.written[begun:]
+    stops = line.written[begun:]
     assert stops[0] == stops[1] == stops[2]
     assert not sim.motor.energised
 
@@ -370,16 +370,16 @@ def test_a_stop_whose_reply_is_lost_is_sent_until_it_is_answered(
 def test_a_stop_whose_reply_is_always_lost_is_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
-    begun = len(hall.written)
-    hall.loses = lambda request: request.function in (2, 5, 6)
+    begun = len(line.written)
+    line.loses = lambda request: request.function in (2, 5, 6)
     with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed"):
         drive.stop(seconds=3.9)
-    assert len(hall.written) > begun + 8
-    hall.sleep(60)
-    sim.pass_time(hall.seconds)
+    assert len(line.written) > begun + 8
+    line.sleep(60)
+    sim.pass_time(line.seconds)
     assert not sim.motor.energised  # it had heard the first one
 
 
@@ -389,84 +389,84 @@ def test_a_drive_that_is_heard_no_more_after_its_command(
     monkeypatch: pytest.MonkeyPatch, model: str, verb: str
 ) -> None:
     """An effect that cannot be seen is unconfirmed: NoReply would say that nothing was sent."""
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     if verb == "stop":
         drive.start()
-    begun = len(hall.written)
-    hall.loses = lambda request: len(hall.written) > begun and not is_write(request)
+    begun = len(line.written)
+    line.loses = lambda request: len(line.written) > begun and not is_write(request)
     with pytest.raises(
         Unconfirmed, match=r"it was confirmed, but its effect could not be seen: .*not answer"
     ):
         getattr(drive, verb)()
-    assert len(starts(hall, model)) == 1
-    hall.sleep(60)
-    sim.pass_time(hall.seconds)
+    assert len(starts(line, model)) == 1
+    line.sleep(60)
+    sim.pass_time(line.seconds)
     assert sim.motor.energised == (verb == "start")
 
 
 def test_a_drive_that_refuses_to_be_read_after_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """DriveRefused would say that it did not start."""
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
-    hall.answers = lambda request: busy if starts(hall, "invt-che") and not is_write(request) else None
+    line.answers = lambda request: busy if starts(line, "invt-che") and not is_write(request) else None
     with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*code 06H"):
         drive.start()
-    assert len(starts(hall, "invt-che")) == 1
+    assert len(starts(line, "invt-che")) == 1
     assert sim.motor.energised
 
 
 def test_noise_at_the_start_hides_a_look_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     spoilt: list[Message] = []
 
     def loses(request: Message) -> bool:
-        if not starts(hall, "invt-che") or len(spoilt) == 2 * READ_ATTEMPTS:
+        if not starts(line, "invt-che") or len(spoilt) == 2 * READ_ATTEMPTS:
             return False
         spoilt.append(request)
         return not is_write(request)
 
-    hall.loses = loses
+    line.loses = loses
     drive.start()
-    assert len(starts(hall, "invt-che")) == 1
+    assert len(starts(line, "invt-che")) == 1
     assert len(spoilt) == 2 * READ_ATTEMPTS
     assert sim.motor.energised
 
 
 def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     control = sim.obeys[3, 0x1000]
     trips = {(3, 0x1000): lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
     monkeypatch.setattr(type(sim), "obeys", trips)
     with pytest.raises(NotDone, match="tripped: OC1"):
         drive.start()
-    assert len(starts(hall, "invt-che")) == 1
+    assert len(starts(line, "invt-che")) == 1
     with pytest.raises(Refused, match=r"OC1.*reset_fault"):
         drive.start()
     drive.reset_fault()
-    assert len(starts(hall, "invt-che")) == 1
+    assert len(starts(line, "invt-che")) == 1
     assert drive.state().condition is Condition.STOPPED
 
 
 def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
     """The drive has forgotten its setpoint: it stays off, and the next start says so."""
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(40)
     drive.start()
-    hall.sleep(1)
-    sim.pass_time(hall.seconds)
+    line.sleep(1)
+    sim.pass_time(line.seconds)
     assert 0 < sim.motor.frequency < 40
-    sim.now = hall.seconds
+    sim.now = line.seconds
     sim._restart()  # all but the EEPROM is gone
-    hall.sleep(5)
-    sent = len(hall.written)
+    line.sleep(5)
+    sent = len(line.written)
     assert drive.state().condition is Condition.STOPPED
     with pytest.raises(Refused, match="set_frequency"):
         drive.start()
-    assert len(hall.written) == sent
+    assert len(line.written) == sent
     assert not sim.motor.energised
     drive.set_frequency(40)
     drive.start()
@@ -475,17 +475,17 @@ def test_a_power_cycle_in_mid_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_two_clients_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another client changes the setpoint between ours and our start: no start at its setpoint."""
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     sim["frequency"] = 60.0
     with pytest.raises(Refused, match=r"holds 60\.00 Hz and not 10\.00 Hz"):
         drive.start()
-    assert starts(hall, "yd1000") == []
+    assert starts(line, "yd1000") == []
     assert not sim.motor.energised
 
 
 def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, ErmanERG220(1))
+    line, drive, sim = one(monkeypatch, ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(
         type(sim),
@@ -494,35 +494,35 @@ def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pyt
     )
     with pytest.raises(NotDone, match=r"frequency = 45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
         drive.set_frequency(45)
-    assert hall.written == ["01 06 00 02 01 C2 A8 0B"]
+    assert line.written == ["01 06 00 02 01 C2 A8 0B"]
 
 
 # ---- EEPROM ----
 
 
 def test_a_setpoint_loop_to_an_eeprom_is_stopped_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, DelixiModbus(1))
+    line, drive, sim = one(monkeypatch, DelixiModbus(1))
     drive.set_frequency(10.0)
     for step in range(600):  # a minute at 10 Hz
         with pytest.raises(Refused, match=r"written once in 60 s at most; .*kept in RAM.*P00\.02"):
             drive.set_frequency(10.1 + 0.1 * (step % 9))
-        hall.sleep(0.1 - 0.04)
+        line.sleep(0.1 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1
     for _ in range(100):
         drive.set_frequency(10.0)  # as it is: never written
-    hall.sleep(60)
+    line.sleep(60)
     drive.set_frequency(12.0)
     assert sim.counters.eeprom_writes["frequency"] == 2
 
 
 def test_the_budget_of_a_year(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    hall, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=20))
+    line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=20))
     for step in range(20):  # unknown storage: budgeted, and not held to once a minute
         drive.set_frequency(10 + step)
     with pytest.raises(Refused, match=r'written 20 times in a year.*ram = \["frequency"\].*b\.007'):
         drive.set_frequency(45)
     assert sim.counters.eeprom_writes["frequency"] == 20
-    hall.sleep(366 * 86400)
+    line.sleep(366 * 86400)
     drive.set_frequency(45)
 
 
@@ -530,10 +530,10 @@ def test_what_its_owner_knows_to_be_ram_is_not_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1, ram=["frequency"]), ledger=ledger)
+    line, drive, _ = one(monkeypatch, ErmanERG220(1, ram=["frequency"]), ledger=ledger)
     for step in range(20):
         drive.set_frequency(10 + step)
-    assert ledger.wear(hall.seconds) == []
+    assert ledger.wear(line.seconds) == []
     with pytest.raises(ValueError, match="in EEPROM, as its document says"):
         DelixiModbus(1, ram=["frequency"])
     with pytest.raises(ValueError, match="no register 'frequenzy'"):
@@ -547,9 +547,9 @@ def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatc
         acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
     ledger = Ledger(tmp_path / "wear")
-    hall, drive, sim = one(monkeypatch, Mine(1), ledger=ledger)
-    hall.bus.write(drive, Mine.acceleration_time, 20.0)
-    assert hall.written == ["01 06 80 0C 00 C8 61 9F"]
+    line, drive, sim = one(monkeypatch, Mine(1), ledger=ledger)
+    line.bus.write(drive, Mine.acceleration_time, 20.0)
+    assert line.written == ["01 06 80 0C 00 C8 61 9F"]
     assert not sim.counters.eeprom_writes
     assert ledger.wear(0) == []
 
@@ -558,10 +558,10 @@ def test_a_ledger_that_cannot_be_kept_keeps_the_write_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")
-    hall, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "file" / "wear")
+    line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "file" / "wear")
     with pytest.raises(OSError, match="file"):
         drive.set_frequency(10)
-    assert hall.written == []
+    assert line.written == []
 
 
 # ---- broadcast, stop all ----
@@ -571,34 +571,34 @@ def test_a_broadcast_is_refused_on_a_mixed_line_and_for_all_but_stop_and_zero(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    hall = SimulatedBus(monkeypatch, *sims)
-    first, _ = (hall.attach(it.drive) for it in sims)
+    line = SimulatedBus(monkeypatch, *sims)
+    first, _ = (line.attach(sim.drive) for sim in sims)
     for value in set(CHEControl) - {CHEControl.STOP}:
         with pytest.raises(Refused, match="no harmless broadcast"):
-            hall.bus.broadcast(first.control, value)
+            line.bus.broadcast(first.control, value)
     with pytest.raises(Refused, match="no harmless broadcast"):
-        hall.bus.broadcast(first.setpoint, 50.0)
-    assert hall.written == []
-    found = hall.bus.broadcast(first.setpoint, 0.0)
-    assert hall.written == ["00 06 20 00 00 00 83 DB"]
-    assert {name: it.condition for name, it in found.items() if isinstance(it, State)} == {
+        line.bus.broadcast(first.setpoint, 50.0)
+    assert line.written == []
+    found = line.bus.broadcast(first.setpoint, 0.0)
+    assert line.written == ["00 06 20 00 00 00 83 DB"]
+    assert {name: each.condition for name, each in found.items() if isinstance(each, State)} == {
         "invt-che@1": Condition.STOPPED,
         "invt-che@2": Condition.STOPPED,
     }
-    hall.attach(InnovertIBD(3))
+    line.attach(InnovertIBD(3))
     with pytest.raises(Refused, match="differ in family"):
-        hall.bus.broadcast(first.control, CHEControl.STOP)
-    assert len(hall.written) == 1
+        line.bus.broadcast(first.control, CHEControl.STOP)
+    assert len(line.written) == 1
 
 
 def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    hall = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        hall.bus.check_identity(hall.attach(it.drive))
-    hall.deafens = lambda request: request.address == 2
-    found = hall.bus.broadcast(InvtCHE.control, CHEControl.STOP)
-    assert hall.written == ["00 06 10 00 00 05 4C D8"]
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        line.bus.check_identity(line.attach(sim.drive))
+    line.deafens = lambda request: request.address == 2
+    found = line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
+    assert line.written == ["00 06 10 00 00 05 4C D8"]
     (first, second) = found.values()
     assert isinstance(first, State)
     assert first.condition is Condition.STOPPED
@@ -606,56 +606,56 @@ def test_after_a_broadcast_who_cannot_be_looked_at_is_told_so(monkeypatch: pytes
     assert second.drive == "invt-che@2"
 
 
-def all_stopped(hall: SimulatedBus, sims: list[Any]) -> bool:
-    for it in sims:
-        it.pass_time(hall.seconds)
-    return not any(it.motor.energised for it in sims)
+def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
+    for sim in sims:
+        sim.pass_time(line.seconds)
+    return not any(sim.motor.energised for sim in sims)
 
 
 def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 ms at least, by the serial-line guide (V1.02, 2.4.1)."""
-    hall, _, _ = one(monkeypatch, InvtCHE(1))
+    """100 ms at least, by the serial-driver guide (V1.02, 2.4.1)."""
+    line, _, _ = one(monkeypatch, InvtCHE(1))
     made: list[Exchange] = []
 
     def keep(exchange: Exchange, **times: int) -> Completion:
         made.append(exchange)
-        return SimulatedBus.carry_out(hall, exchange, **times)
+        return SimulatedBus.carry_out(line, exchange, **times)
 
-    monkeypatch.setattr(hall, "carry_out", keep)
-    hall.bus.broadcast(InvtCHE.control, CHEControl.STOP)
+    monkeypatch.setattr(line, "carry_out", keep)
+    line.bus.broadcast(InvtCHE.control, CHEControl.STOP)
     stop, look = made[-2:]
     assert (stop.request.address, look.request.address) == (0, 1)
-    line = LineDriver()
-    line.begin(stop)
-    line.wait_until_write()
-    over = line.now + 8 * stop.c.character_ns
-    line.begin(look)
-    line.wait_until_write()
-    assert line.now == over + 100 * MS
+    driver = LineDriver()
+    driver.begin(stop)
+    driver.wait_until_write()
+    over = driver.now + 8 * stop.c.character_ns
+    driver.begin(look)
+    driver.wait_until_write()
+    assert driver.now == over + 100 * MS
 
 
 def test_stop_all_broadcasts_where_it_is_safe_and_looks_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = hall.attach(it.drive)
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
-    hall.sleep(1)
-    begun = len(hall.frames)
-    stopped = hall.bus.stop_all()
-    assert hall.frames[begun][1] == "00 06 10 00 00 05 4C D8"
-    assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
-    assert all(it.seconds < 11 for it in stopped.values())  # one ramp, not three after another
-    assert all_stopped(hall, sims)
+    line.sleep(1)
+    begun = len(line.frames)
+    stopped = line.bus.stop_all()
+    assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
+    assert all(each.seconds < 11 for each in stopped.values())  # one ramp, not three after another
+    assert all_stopped(line, sims)
 
 
 def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     """The port fails with it, and comes back."""
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = hall.attach(it.drive)
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
 
@@ -664,26 +664,26 @@ def test_each_is_stopped_where_the_broadcast_cannot_be_sent(monkeypatch: pytest.
             raise LineError("hall", "the port was lost (hung up)")
         return None
 
-    hall.answers = fails
-    stopped = hall.bus.stop_all()
-    assert {it.seen for it in stopped.values()} == {Seen.STOPPED}
-    assert {frame[:17] for frame in hall.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
-    assert all_stopped(hall, sims)
+    line.answers = fails
+    stopped = line.bus.stop_all()
+    assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
+    assert {frame[:17] for frame in line.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}
+    assert all_stopped(line, sims)
 
 
 def test_stop_all_on_a_line_of_every_family(monkeypatch: pytest.MonkeyPatch) -> None:
     sims = [simulated(make(address)) for address, make in enumerate(MAKE.values(), 1)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        drive = hall.attach(it.drive)
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
-    begun = hall.seconds
-    stopped = hall.bus.stop_all()
-    assert [it.seen for it in stopped.values()] == [Seen.STOPPED] * 6
-    assert hall.seconds - begun < 10  # the ramps went side by side
-    assert all_stopped(hall, sims)
-    assert not any(frame.startswith(("00 ", ":00")) for frame in hall.written)
+    begun = line.seconds
+    stopped = line.bus.stop_all()
+    assert [each.seen for each in stopped.values()] == [Seen.STOPPED] * 6
+    assert line.seconds - begun < 10  # the ramps went side by side
+    assert all_stopped(line, sims)
+    assert not any(frame.startswith(("00 ", ":00")) for frame in line.written)
 
 
 def test_stop_all_says_of_each_what_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -692,19 +692,19 @@ def test_stop_all_says_of_each_what_is_known(monkeypatch: pytest.MonkeyPatch) ->
         simulated(ErmanERG220(2)),
         simulated(InvtCHE(3)),
     ]
-    hall = SimulatedBus(monkeypatch, *sims)
-    for it in sims:
-        hall.attach(it.drive)
+    line = SimulatedBus(monkeypatch, *sims)
+    for sim in sims:
+        line.attach(sim.drive)
     sims[2]["device"] = 0x010A
-    hall.loses = lambda request: request.address == 2
-    stopped = hall.bus.stop_all()
-    assert {name: it.seen for name, it in stopped.items()} == {
+    line.loses = lambda request: request.address == 2
+    stopped = line.bus.stop_all()
+    assert {name: each.seen for name, each in stopped.items()} == {
         "invt-che@1": Seen.STOPPED,
         "erman-er-g-220@2": Seen.SENT,
         "invt-che@3": Seen.FAILED,
     }
     assert "010AH" in stopped["invt-che@3"].why
-    assert not any(frame.startswith("03 06") for frame in hall.written)
+    assert not any(frame.startswith("03 06") for frame in line.written)
     assert str(stopped["invt-che@1"]).startswith("invt-che@1: stopped after ")
 
 
@@ -715,29 +715,29 @@ def test_a_staggered_start_stops_what_it_started_at_the_first_failure(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    drives = [hall.attach(it.drive) for it in sims]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(20)
-    begun = hall.seconds
+    begun = line.seconds
     start_staggered(drives, 2.0, Direction.FORWARD)
-    assert 4 <= hall.seconds - begun < 6
-    assert all(it.motor.energised for it in sims)
-    hall.bus.stop_all()
+    assert 4 <= line.seconds - begun < 6
+    assert all(sim.motor.energised for sim in sims)
+    line.bus.stop_all()
     sims[1].trip(4)
-    hall.frames.clear()
+    line.frames.clear()
     with pytest.raises(Refused, match="OC1"):
         start_staggered(drives, 2.0)
-    assert [it[:17] for it in starts(hall, "invt-che")] == ["01 06 10 00 00 01"]
-    assert all_stopped(hall, sims)
+    assert [each[:17] for each in starts(line, "invt-che")] == ["01 06 10 00 00 01"]
+    assert all_stopped(line, sims)
 
 
 def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
+    line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
-    hall.frames.clear()
+    line.frames.clear()
     ramp(drive, 20.0)  # 80 Hz in 10 s: 4 Hz in half a second
-    setpoints = [int(it[12:17].replace(" ", ""), 16) / 100 for it in hall.written]
+    setpoints = [int(each[12:17].replace(" ", ""), 16) / 100 for each in line.written]
     assert setpoints == [14.0, 18.0, 20.0]
     with pytest.raises(ValueError, match=r"more than the drive's own, 8 Hz/s"):
         ramp(drive, 0.0, rate=9)
@@ -746,30 +746,30 @@ def test_a_ramp_goes_no_faster_than_the_drive(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(ValueError, match=r"every = 0 s is not above 0"):
         ramp(drive, 0.0, every=0)
     ramp(drive, 19.0, rate=1.0)
-    assert hall.written[-2][:17] == "01 06 10 01 07 9E"
+    assert line.written[-2][:17] == "01 06 10 01 07 9E"
 
 
 def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with pytest.raises(Refused, match="give a rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
-    assert [int(it[12:17].replace(" ", ""), 16) for it in hall.written] == [200, 400]  # 0.01 % of 50 Hz
+    assert [int(each[12:17].replace(" ", ""), 16) for each in line.written] == [200, 400]  # 0.01 % of 50 Hz
 
 
 def test_a_ramp_from_a_setpoint_that_nobody_knows_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = SimulatedBus(monkeypatch)
-    toy = hall.attach(Toy(1, name="toy"))
+    line = SimulatedBus(monkeypatch)
+    toy = line.attach(Toy(1, name="toy"))
     with pytest.raises(Refused, match=r"^toy cannot say its setpoint: call set_frequency before a ramp$"):
         ramp(toy, 20.0, rate=5.0)
-    assert hall.frames == []
+    assert line.frames == []
 
 
 def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, DelixiModbus(1))
+    line, drive, _ = one(monkeypatch, DelixiModbus(1))
     with pytest.raises(Refused, match="EEPROM"):
         ramp(drive, 20.0)
-    assert hall.written == []
+    assert line.written == []
 
 
 # ---- the log, the watchdog ----
@@ -777,14 +777,14 @@ def test_a_ramp_to_an_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
-    hall.loses = lambda request: request.function == 6
+    line.loses = lambda request: request.function == 6
     with pytest.raises(Unconfirmed):
         drive.start()
-    hall.bus.close()
+    line.bus.close()
     records = list(read_audit(log))
-    assert [(it["write"], it["sent"][:17], it["outcome"]) for it in records] == [
+    assert [(record["write"], record["sent"][:17], record["outcome"]) for record in records] == [
         ("setpoint = 40.00 %", "01 06 20 00 0F A0", "done"),
         ("control = FORWARD", "01 06 10 00 00 01", "unconfirmed"),
     ]
@@ -796,10 +796,10 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
 def test_a_log_that_cannot_be_written_does_not_hinder_a_stop(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
+    line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
     drive.stop()
-    hall.bus.close()
-    assert [it[:17] for it in hall.written] == ["01 06 10 00 00 05"]
+    line.bus.close()
+    assert [each[:17] for each in line.written] == ["01 06 10 00 00 05"]
     assert "the audit log cannot be written" in caplog.text
 
 
@@ -807,20 +807,20 @@ def test_a_port_that_fails_in_a_write_is_noted_as_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     log = tmp_path / "audit.jsonl"
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
-    carry_out = hall.carry_out
+    carry_out = line.carry_out
 
     def fail(exchange: Exchange, **times: int) -> Completion:
         if exchange.request.function == 6:
             raise LineError("hall", "the port was lost")
         return carry_out(exchange, **times)
 
-    monkeypatch.setattr(hall, "carry_out", fail)
+    monkeypatch.setattr(line, "carry_out", fail)
     with pytest.raises(LineError):
         drive.start()
-    hall.bus.close()
-    assert [(it["write"], it["outcome"]) for it in read_audit(log)][1:] == [
+    line.bus.close()
+    assert [(each["write"], each["outcome"]) for each in read_audit(log)][1:] == [
         ("control = FORWARD", "unconfirmed")
     ]
 
@@ -830,20 +830,20 @@ ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], objec
     "port lost at the reading back": (
         LOST,
         3,
-        lambda hall, drive: drive.set_frequency(30),
+        lambda line, drive: drive.set_frequency(30),
         "setpoint = 60.00 %",
     ),
-    "interrupted": (KeyboardInterrupt(), 6, lambda hall, drive: drive.start(), "control = FORWARD"),
+    "interrupted": (KeyboardInterrupt(), 6, lambda line, drive: drive.start(), "control = FORWARD"),
     "port lost in a raw request": (
         LOST,
         6,
-        lambda hall, drive: hall.bus.raw(drive, 6, 0x1000, b"\0\5"),
+        lambda line, drive: line.bus.raw(drive, 6, 0x1000, b"\0\5"),
         "raw request 01 06 10 00 00 05 4D 09",
     ),
     "port lost in a broadcast": (
         LOST,
         6,
-        lambda hall, drive: hall.bus.broadcast(drive.control, CHEControl.STOP),
+        lambda line, drive: line.bus.broadcast(drive.control, CHEControl.STOP),
         "control = STOP",
     ),
 }
@@ -855,20 +855,20 @@ def test_a_write_whose_outcome_never_came_is_noted_all_the_same(
 ) -> None:
     failure, function, act, what = ENDINGS[ending]
     log = tmp_path / "audit.jsonl"
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
-    before = len(hall.written)
-    carry_out = hall.carry_out
+    before = len(line.written)
+    carry_out = line.carry_out
 
     def fail(exchange: Exchange, **times: int) -> Completion:
-        if exchange.request.function == function and (function == 6 or len(hall.written) > before):
+        if exchange.request.function == function and (function == 6 or len(line.written) > before):
             raise failure
         return carry_out(exchange, **times)
 
-    monkeypatch.setattr(hall, "carry_out", fail)
+    monkeypatch.setattr(line, "carry_out", fail)
     with pytest.raises((type(failure), Unconfirmed)):
-        act(hall, drive)
-    hall.bus.close()
+        act(line, drive)
+    line.bus.close()
     (record,) = list(read_audit(log))[1:]
     assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
 
@@ -876,23 +876,23 @@ def test_a_write_whose_outcome_never_came_is_noted_all_the_same(
 def test_a_torn_tail_harms_no_other_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     log.write_text('{"write": "a"}\n{"write": "b')
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
-    hall.bus.close()
-    assert [it["write"] for it in read_audit(log)] == ["a", "setpoint = 40.00 %"]
+    line.bus.close()
+    assert [each["write"] for each in read_audit(log)] == ["a", "setpoint = 40.00 %"]
     assert json.loads(log.read_text().splitlines()[-1])["outcome"] == "done"
 
 
 def test_the_watchdog_is_read_where_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    assert hall.bus.watchdog(drive) == (
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert line.bus.watchdog(drive) == (
         "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     )
     sim["communication_timeout"] = 5
-    assert hall.bus.watchdog(drive) == "its watchdog (communication_timeout) acts 5 s after the last message"
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
-    assert "no watchdog" in hall.bus.watchdog(drive)
-    assert hall.written == []
+    assert line.bus.watchdog(drive) == "its watchdog (communication_timeout) acts 5 s after the last message"
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    assert "no watchdog" in line.bus.watchdog(drive)
+    assert line.written == []
 
 
 def test_coils_have_no_value_that_is_written_twice() -> None:
@@ -916,11 +916,11 @@ def test_a_family_of_one_s_own_is_looked_at_too(monkeypatch: pytest.MonkeyPatch)
 
         speed = setting(5, "rpm", kept=Kept.RAM)
 
-    hall = SimulatedBus(monkeypatch)
-    drive = hall.attach(Mine(1))
+    line = SimulatedBus(monkeypatch)
+    drive = line.attach(Mine(1))
     with pytest.raises(NoReply):
-        hall.bus.write(drive, Mine.speed, 10)
-    assert hall.written == []
+        line.bus.write(drive, Mine.speed, 10)
+    assert line.written == []
 
 
 def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -933,11 +933,11 @@ def test_a_look_at_an_identity_may_take_its_time(monkeypatch: pytest.MonkeyPatch
             yield from wait(3.0)
             yield from read(Toy.fault)
 
-    hall = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
-    begun = hall.seconds
-    hall.bus.check_identity(hall.attach(Sleepy(1)))
-    assert [(it.start, it.count) for it, _ in hall.frames] == [(5, 1), (4, 1)]
-    assert hall.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
+    line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
+    begun = line.seconds
+    line.bus.check_identity(line.attach(Sleepy(1)))
+    assert [(each.start, each.count) for each, _ in line.frames] == [(5, 1), (4, 1)]
+    assert line.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
 
 
 def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -948,11 +948,11 @@ def test_a_look_at_an_identity_that_would_write_is_refused(monkeypatch: pytest.M
         def identify(self) -> Script[None]:
             yield from write(Toy.frequency, 10.0)
 
-    hall = SimulatedBus(monkeypatch, simulated(Meddler(1)))
-    drive = hall.attach(Meddler(1, name="meddler"))
+    line = SimulatedBus(monkeypatch, simulated(Meddler(1)))
+    drive = line.attach(Meddler(1, name="meddler"))
     with pytest.raises(Refused, match=r"^meddler: a look at its identity must not write$"):
         drive.set_frequency(20.0)
-    assert hall.frames == []
+    assert line.frames == []
 
 
 def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rests(
@@ -964,20 +964,20 @@ def test_what_changes_only_at_rest_is_not_written_where_nobody_can_say_what_rest
         speed = reading(1, "rpm")
         ratio = setting(2, kept=Kept.RAM, while_running=False)
 
-    hall = SimulatedBus(monkeypatch, simulated(Mute(1)))
-    drive = hall.attach(Mute(1, name="mute"))
+    line = SimulatedBus(monkeypatch, simulated(Mute(1)))
+    drive = line.attach(Mute(1, name="mute"))
     with pytest.raises(Refused) as refusal:
-        hall.bus.write(drive, Mute.ratio, 3)
+        line.bus.write(drive, Mute.ratio, 3)
     assert str(refusal.value) == (
         "ratio of mute is not written: it changes only while the motor stands, which the family cannot say"
     )
-    assert hall.written == []
+    assert line.written == []
 
 
 def test_the_bus_needs_no_ledger_before_the_first_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "none" / "wear")
-    assert hall.bus.read(drive, drive.frequency) == 0
+    line, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "none" / "wear")
+    assert line.bus.read(drive, drive.frequency) == 0
     assert not (tmp_path / "none").exists()
-    assert isinstance(hall.bus, Bus)
+    assert isinstance(line.bus, Bus)

@@ -21,23 +21,23 @@ DRIVES = (
 )
 
 
-def dies_and_echoes(hall: SimulatedBus, drive: Drive) -> None:
+def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
     """From now on all that is heard of a write is what was sent, and of a read nothing."""
-    hall.deafens = lambda request: True
-    hall.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
+    line.deafens = lambda request: True
+    line.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
 
 
 @pytest.mark.parametrize("declared", DRIVES, ids=lambda drive: drive.model)
 def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, declared: Drive
 ) -> None:
-    hall, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
-    stop = next(it for it in drive.registers.values() if it.harmless)
+    line, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
+    stop = next(register for register in drive.registers.values() if register.harmless)
     value = stop.decode(stop.harmless[-1])
-    assert hall.bus.try_write(drive, stop, value).effect is Effect.DONE
-    dies_and_echoes(hall, drive)
+    assert line.bus.try_write(drive, stop, value).effect is Effect.DONE
+    dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
-        hall.bus.write(drive, stop, value)
+        line.bus.write(drive, stop, value)
 
 
 @pytest.mark.parametrize("family", [InnovertIBD, DelixiNative])
@@ -45,28 +45,28 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, family: type[Drive]
 ) -> None:
     """It cannot be read back."""
-    hall, drive, _ = one(monkeypatch, family(1))
+    line, drive, _ = one(monkeypatch, family(1))
     drive.set_frequency(20)
-    dies_and_echoes(hall, drive)
-    for write in (lambda: hall.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
+    dies_and_echoes(line, drive)
+    for write in (lambda: line.bus.write(drive, drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
 
 
 def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
-    hall.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
-    dies_and_echoes(hall, drive)
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+    dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
-        hall.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
+        line.bus.raw(drive, 6, 0x2001, b"\x07\xd0")
 
 
 def test_what_is_told_of_an_adapter_that_is_known_to_echo_is_believed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """There the core tells the drive's copy from the adapter's."""
-    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
-    hall.has_echo = True
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line.has_echo = True
     drive.set_frequency(20)
-    hall.loses = lambda request: not is_write(request)
-    assert hall.bus.try_write(drive, drive.frequency, 25.0).effect is Effect.DONE
+    line.loses = lambda request: not is_write(request)
+    assert line.bus.try_write(drive, drive.frequency, 25.0).effect is Effect.DONE

@@ -30,52 +30,57 @@ def word(request: Message) -> int:
     return int.from_bytes(request.data)
 
 
-def erman(it: Message) -> bool:
+def erman(message: Message) -> bool:
     """Coils 3 to 8 and 10 to 12 are reserved, and so are most registers; 0001H is never written."""
-    if it.function == 5:
-        return it.start in (0, 1, 2, 9)
-    return it.function == 6 and it.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
+    if message.function == 5:
+        return message.start in (0, 1, 2, 9)
+    return message.function == 6 and message.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
 
 
-def che(it: Message) -> bool:
-    return it.function == 6 and (
-        (it.start == 0x1000 and 1 <= word(it) <= 8) or (it.start == 0x2000 and word(it) <= 10_000)
+def che(message: Message) -> bool:
+    return message.function == 6 and (
+        (message.start == 0x1000 and 1 <= word(message) <= 8)
+        or (message.start == 0x2000 and word(message) <= 10_000)
     )
 
 
-def ibd(it: Message) -> bool:
+def ibd(message: Message) -> bool:
     """No direction without a word of its owner's, never the toggle; a reset without run."""
-    if it.start == 0x2000:
-        return it.function == 6 and word(it) in (0, 1, 2, 3, 0x10)
-    return it.function == 6 and (it.start in (107, 108) or (it.start == 0x2001 and word(it) <= 40_000))
+    if message.start == 0x2000:
+        return message.function == 6 and word(message) in (0, 1, 2, 3, 0x10)
+    return message.function == 6 and (
+        message.start in (107, 108) or (message.start == 0x2001 and word(message) <= 40_000)
+    )
 
 
-def delixi(it: Message) -> bool:
+def delixi(message: Message) -> bool:
     """Bits 2, 3 and 6 to 15 are reserved, bits 4 and 5 together are the toggle; run has its direction."""
-    if it.start == 0x2000:
-        return it.function == 6 and word(it) in (0, 1, 0x12, 0x22, 0x13, 0x23)
-    return it.function == 6 and it.start == 2
+    if message.start == 0x2000:
+        return message.function == 6 and word(message) in (0, 1, 0x12, 0x22, 0x13, 0x23)
+    return message.function == 6 and message.start == 2
 
 
-def native(it: Message) -> bool:
-    if it.function == 2:
-        return it.start in (1, 2, 3, 4) and word(it) == 0
-    return (it.function == 4 and it.start in (1, 7)) or (it.function == 6 and it.start == 2)
+def native(message: Message) -> bool:
+    if message.function == 2:
+        return message.start in (1, 2, 3, 4) and word(message) == 0
+    return (message.function == 4 and message.start in (1, 7)) or (
+        message.function == 6 and message.start == 2
+    )
 
 
-def yd(it: Message) -> bool:
+def yd(message: Message) -> bool:
     """Bits 5 and 4 are reserved; bit 15 stays; a reset goes alone; some parameters are the panel's."""
-    if it.start == 0x1000:
-        control = word(it)
+    if message.start == 0x1000:
+        control = word(message)
         resets = control & 0x2000 and control & 0x0500
-        return it.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
+        return message.function == 6 and not control & 0x0030 and bool(control & 0x8000) and not resets
     never = (1, 2, 3, 4, 6, 7, 8, 0x15, 0x16, 0x103, 0x104, *range(0x110, 0x116), 0x0800, 0x0801, 0x0802)
-    readings = it.start == 0x1100 or 0x1200 <= it.start <= 0x1214
+    readings = message.start == 0x1100 or 0x1200 <= message.start <= 0x1214
     return (
-        it.function == 6
-        and it.start not in never
+        message.function == 6
+        and message.start not in never
         and not readings
-        and not set("ABCDEF") & set(f"{it.start:X}")
+        and not set("ABCDEF") & set(f"{message.start:X}")
     )
 
 
@@ -127,26 +132,26 @@ def calls(draw: st.DrawFn, model: str) -> tuple[str, Callable[[SimulatedBus, Any
     )
     if name == "set_frequency":
         hz = draw(numbers)
-        return name, lambda hall, drive: drive.set_frequency(hz)
+        return name, lambda line, drive: drive.set_frequency(hz)
     if name in ("write", "broadcast"):
         registers = list(family.registers.values())
-        moving = [it for it in registers if it.harmless is not None]
+        moving = [each for each in registers if each.harmless is not None]
         register = draw(st.one_of(st.sampled_from(moving), st.sampled_from(registers)))
         value = draw(values(register))
         if name == "write":
-            return name, lambda hall, drive: hall.bus.write(drive, register, value)
-        return name, lambda hall, drive: hall.bus.broadcast(register, value)
+            return name, lambda line, drive: line.bus.write(drive, register, value)
+        return name, lambda line, drive: line.bus.broadcast(register, value)
     if name == "stop_all":
-        return name, lambda hall, drive: hall.bus.stop_all()
+        return name, lambda line, drive: line.bus.stop_all()
     if name == "ramp":
         hz = draw(st.floats(0, 60))
-        return name, lambda hall, drive: ramp(drive, hz, rate=5.0, every=1.0)
+        return name, lambda line, drive: ramp(drive, hz, rate=5.0, every=1.0)
     if name == "start_staggered":
-        return name, lambda hall, drive: start_staggered([drive], 1.0)
+        return name, lambda line, drive: start_staggered([drive], 1.0)
     if name in ("start", "jog"):
         direction = draw(directions)
-        return name, lambda hall, drive: getattr(drive, name)(direction)
-    return name, lambda hall, drive: getattr(drive, name)()
+        return name, lambda line, drive: getattr(drive, name)(direction)
+    return name, lambda line, drive: getattr(drive, name)()
 
 
 def values(register: Register[Any]) -> st.SearchStrategy[Any]:
@@ -171,28 +176,28 @@ def test_no_sequence_of_calls_sends_what_is_forbidden(
 ) -> None:
     sim: Any = simulated(MAKE[model](1))
     with TemporaryDirectory() as directory:
-        hall = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
-        play(hall, sim, model, data)
+        line = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
+        play(line, sim, model, data)
 
 
-def play(hall: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
+def play(line: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
     """A setpoint, and then any calls with any replies lost."""
-    drive = hall.attach(sim.drive)
+    drive = line.attach(sim.drive)
     drive.set_frequency(20)
-    hall.frames.clear()
+    line.frames.clear()
     loses = data.draw(st.sampled_from(["nothing", "writes", "some"]))
     some = data.draw(st.sets(st.integers(0, 60), max_size=12))
-    hall.loses = {
+    line.loses = {
         "nothing": lambda request: False,
         "writes": is_write,
-        "some": lambda request: len(hall.frames) in some,
+        "some": lambda request: len(line.frames) in some,
     }[loses]
     for name, call in data.draw(st.lists(calls(model), min_size=1, max_size=6)):
-        begun = len(hall.frames)
+        begun = len(line.frames)
         ran = sim.motor.energised
         with suppress(BusError, ValueError, TypeError):
-            call(hall, drive)
-        sent = [request for request, _ in hall.frames[begun:] if is_write(request)]
+            call(line, drive)
+        sent = [request for request, _ in line.frames[begun:] if is_write(request)]
         for request in sent:
             if request.address == 0:
                 assert (request.function, request.start, word(request)) in BROADCASTS
@@ -201,20 +206,20 @@ def play(hall: SimulatedBus, sim: Any, model: str, data: st.DataObject) -> None:
         turning = [request for request in sent if STARTS[model](request)]
         assert len(turning) <= (name in TURNING_VERBS), f"{name} sent {turning}"
         assert len([request for request in sent if resets(model, request)]) <= (name == "reset_fault")
-        sim.pass_time(hall.seconds)
+        sim.pass_time(line.seconds)
         if name not in TURNING_VERBS and not ran:
             assert not sim.motor.energised, f"{name} started the motor"
 
 
-def resets(model: str, it: Message) -> bool:
+def resets(model: str, message: Message) -> bool:
     """A reset is a pulse: once in a call."""
-    if it.address == 0:
+    if message.address == 0:
         return False
     return {
-        "erman-er-g-220": it.function == 5 and it.start == 9 and word(it) != 0,
-        "invt-che": it.start == 0x1000 and word(it) == 7,
-        "innovert-ibd": it.start == 0x2000 and bool(word(it) & 0x10),
+        "erman-er-g-220": message.function == 5 and message.start == 9 and word(message) != 0,
+        "invt-che": message.start == 0x1000 and word(message) == 7,
+        "innovert-ibd": message.start == 0x2000 and bool(word(message) & 0x10),
         "delixi-modbus": False,
-        "delixi-native": it.function == 2 and it.start == 4,
-        "yd1000": it.start == 0x1000 and bool(word(it) & 0x2000),
+        "delixi-native": message.function == 2 and message.start == 4,
+        "yd1000": message.start == 0x1000 and bool(word(message) & 0x2000),
     }[model]

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from examples import in_turn
 from lines import until
-from motors import MAKE, Heard
+from motors import MAKE, ReceivedRequests
 
 from multidrop.bus import Bus
 from multidrop.drive import Condition, Drive, read
@@ -32,25 +32,25 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorDrive, Heard]]:
+def line(drive: Drive, other: Drive | None = None) -> Iterator[tuple[Any, MotorDrive, ReceivedRequests]]:
     """The drive as its bus knows it; what is there in truth, `other` or the same; and what that hears."""
     drive.response_timeout = PATIENCE
     sim = simulated(other or drive)
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
-    heard = Heard(sim)
+    received = ReceivedRequests(sim)
     with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path, expiry=60) as bus:
-        yield bus.attach(drive), sim, heard
+        yield bus.attach(drive), sim, received
 
 
 @every_family
 def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
-    with line(MAKE[model](1)) as (drive, sim, heard):
+    with line(MAKE[model](1)) as (drive, sim, received):
         drive.set_frequency(20)
-        heard.loses = lambda request: request in heard.starts
+        received.loses = lambda request: request in received.starts
         with pytest.raises(Unconfirmed, match="no reply"):
             drive.start()
-        assert len(heard.starts) == 1
+        assert len(received.starts) == 1
         assert sim.motor.energised  # it did happen, and the caller was told that it may have
 
 
@@ -58,16 +58,16 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
 @pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
 def test_a_stop_whose_replies_are_lost(model: str, lost: int) -> None:
     """It is sent until it is confirmed."""
-    with line(MAKE[model](1)) as (drive, sim, heard):
+    with line(MAKE[model](1)) as (drive, sim, received):
         drive.set_frequency(20)
         drive.start()
-        begun = len(heard.writes)
-        heard.loses = lambda request: request in heard.writes and len(heard.writes) <= begun + lost
+        begun = len(received.writes)
+        received.loses = lambda request: request in received.writes and len(received.writes) <= begun + lost
         drive.stop()
-        stops = heard.writes[begun:]
+        stops = received.writes[begun:]
         assert len(stops) > lost
         assert all(stop == stops[0] for stop in stops[: lost + 1])
-        assert len(heard.starts) == 1
+        assert len(received.starts) == 1
         assert not sim.motor.energised
 
 
@@ -84,35 +84,35 @@ OTHERS: dict[str, tuple[Drive, Drive]] = {  # declared, and there: of one framin
 @pytest.mark.parametrize("pair", OTHERS)
 def test_a_drive_of_another_family_is_not_written_to(pair: str) -> None:
     declared, there = OTHERS[pair]
-    with line(declared, there) as (drive, sim, heard):
+    with line(declared, there) as (drive, sim, received):
         with pytest.raises((Refused, NoReply)):
             drive.start()
-        assert heard.requests
-        assert heard.writes == []
+        assert received.requests
+        assert received.writes == []
         assert not sim.motor.energised
 
 
 def test_a_goodrive_is_not_taken_for_a_che() -> None:
-    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, heard):
+    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, received):
         sim["device"] = GOODRIVE
         with pytest.raises(Refused, match="010AH"):
             drive.start()
-        assert heard.writes == []
+        assert received.writes == []
 
 
 def test_a_setpoint_that_is_clamped_is_told_with_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    with line(ErmanERG220(1)) as (drive, sim, heard):
+    with line(ErmanERG220(1)) as (drive, sim, received):
         accept = sim.accept
         monkeypatch.setattr(
             sim, "accept", lambda cell, raw: min(raw, 300) if cell.name == "frequency" else accept(cell, raw)
         )
         with pytest.raises(NotDone, match=r"45\.0 Hz did not take effect: the drive holds 30\.0 Hz"):
             drive.set_frequency(45)
-        assert len(heard.writes) == 1
+        assert len(received.writes) == 1
 
 
 def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
-    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, heard):
+    with line(InvtCHE(1, maximum_frequency=50)) as (drive, sim, received):
         drive.set_frequency(20)
         run = sim.motor.run
         monkeypatch.setattr(sim.motor, "run", lambda direction: sim.trip(4))
@@ -122,7 +122,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
             drive.start()
         monkeypatch.setattr(sim.motor, "run", run)
         drive.reset_fault()
-        assert len(heard.starts) == 1
+        assert len(received.starts) == 1
         assert drive.state().condition is Condition.STOPPED
         assert not sim.motor.energised
 
@@ -130,7 +130,7 @@ def test_a_trip_while_starting(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_a_power_cycle_in_mid_ramp() -> None:
     """The drive has forgotten its setpoint: it stays off, and the next start says so."""
-    with line(YD1000(1)) as (drive, sim, heard):
+    with line(YD1000(1)) as (drive, sim, received):
         drive.set_frequency(40)
         drive.start()
         sim.motor.acceleration_time = 60.0
@@ -138,18 +138,18 @@ def test_a_power_cycle_in_mid_ramp() -> None:
         assert 0 < sim.motor.frequency < 40
         sim._restart()  # all but the EEPROM is gone, and it is deaf for a while
         sim.deaf_until = float("inf")
-        sent = len(heard.writes)
+        sent = len(received.writes)
         with pytest.raises(NoReply):
             drive.state()
         sim.deaf_until = 0.0
         until(lambda: _condition(drive) is Condition.STOPPED)
         with pytest.raises(Refused, match="set_frequency"):
             drive.start()
-        assert len(heard.writes) == sent
+        assert len(received.writes) == sent
         assert not sim.motor.energised
         drive.set_frequency(40)
         drive.start()
-        assert len(heard.starts) == 2
+        assert len(received.starts) == 2
         assert sim.motor.energised
 
 

@@ -70,7 +70,7 @@ def test_leaving_stops_only_when_it_was_asked_for(ending: str, opted: str) -> No
                 client.send_signal(number)
             client.communicate()
         assert client.returncode in (status, -int(number or 0))
-        written = [it.raw for it in sim.counters.writes if it.name == "control"]
+        written = [write.raw for write in sim.counters.writes if write.name == "control"]
         assert written == ([1, 5] if opted == "stop" else [1])
         assert sim.motor.energised == (opted == "leave")
 
@@ -84,7 +84,7 @@ def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
             bus.stop_on_exit()
             assert signal.getsignal(signal.SIGTERM) != before[1]
         assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
-        assert [it.raw for it in sim.counters.writes] == [5]
+        assert [write.raw for write in sim.counters.writes] == [5]
 
 
 # ---- the ledger ----
@@ -104,7 +104,7 @@ def test_two_processes_share_one_budget(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     words = [sys.executable, "-c", ENTRANT, str(path)]
     both = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    assert sum(int(it.communicate()[0]) for it in both) == 100
+    assert sum(int(each.communicate()[0]) for each in both) == 100
     (wear,) = Ledger(path).wear(1e9 + 100)
     assert (wear.cell, wear.writes) == (CELL, 100)
 
@@ -118,11 +118,11 @@ def test_a_ledger_remembers(tmp_path: Path) -> None:
     assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""  # the clock was set back: counted all the same
     other = LedgerCell("/dev/ttyUSB0", 2, "delixi-modbus", "frequency")
     assert Ledger(path).enter(other, 1061.0, 60.0) == ""
-    assert [(it.cell.address, it.writes, it.this_year) for it in Ledger(path).wear(1061.0)] == [
+    assert [(each.cell.address, each.writes, each.this_year) for each in Ledger(path).wear(1061.0)] == [
         (1, 3, 3),
         (2, 1, 1),
     ]
-    assert [it.this_year for it in Ledger(path).wear(1061.0 + YEAR)] == [0, 0]
+    assert [each.this_year for each in Ledger(path).wear(1061.0 + YEAR)] == [0, 0]
 
 
 def test_the_budget_spends_10_000_cycles_in_ten_years() -> None:
@@ -150,10 +150,10 @@ for number in range(200):
 def test_processes_do_not_mix_their_lines(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in "ab"]
-    assert [it.wait() for it in writers] == [0, 0]
+    assert [writer.wait() for writer in writers] == [0, 0]
     records = list(read_audit(path))
     for name in "ab":
-        assert [it["number"] for it in records if it["writer"] == name] == list(range(200))
+        assert [record["number"] for record in records if record["writer"] == name] == list(range(200))
 
 
 @pytest.mark.parametrize("torn_at", range(0, 120, 7))
@@ -168,9 +168,9 @@ def test_wherever_a_line_was_torn_the_others_stay(tmp_path: Path, torn_at: int) 
     log = AuditLog(path)
     log.add(2, {"write": "third"})
     log.close()
-    found = [it["write"] for it in read_audit(path)]
+    found = [each["write"] for each in read_audit(path)]
     assert found[-1] == "third"
-    assert found == [it for it in ("first", "second") if it in found] + ["third"]
+    assert found == [name for name in ("first", "second") if name in found] + ["third"]
 
 
 # ---- an adapter that echoes ----

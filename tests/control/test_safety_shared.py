@@ -18,7 +18,7 @@ import pytest
 from checksums import rtu
 from examples import usually
 from lines import until
-from motors import MAKE, STARTS, Heard
+from motors import MAKE, STARTS, ReceivedRequests
 from shared_pair import SharedPair, shared
 
 from multidrop.bus import Bus
@@ -34,22 +34,22 @@ ROUNDS, MOST_ROUNDS = 3, 60  # as many as it takes until both have talked at onc
 
 
 @contextmanager
-def hall(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[Heard]]]:
+def shared_line(model: str, seed: int) -> Iterator[tuple[Any, SharedPair, list[ReceivedRequests]]]:
     """Our drive 1, the pair, and what the drives 1 and 2 hear."""
     ours = MAKE[model](1)
-    heard = []
+    received = []
     for drive in (ours, MAKE[model](2)):
         sim = simulated(drive)
         assert isinstance(sim, MotorDrive)
         sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
-        heard.append(Heard(sim))
-    wire = Wire([it.sim for it in heard], unpaced=True)
+        received.append(ReceivedRequests(sim))
+    wire = Wire([each.sim for each in received], unpaced=True)
     with (
         Simulator([wire]),
         shared(wire.path, ours.settings.baudrate, seed) as pair,
         Bus(pair.ours) as bus,
     ):
-        yield bus.attach(ours), pair, heard
+        yield bus.attach(ours), pair, received
 
 
 def requests(pair: SharedPair) -> list[Message]:
@@ -118,7 +118,7 @@ class Stranger:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*RTU_FAMILIES))
 def test_starts_and_stops_while_another_client_talks(model: str) -> None:
-    with hall(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
+    with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
         stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
         for done in range(MOST_ROUNDS):
@@ -140,7 +140,9 @@ def test_starts_and_stops_while_another_client_talks(model: str) -> None:
 
 
 def starts(pair: SharedPair, model: str) -> list[Message]:
-    return [it for it in requests(pair) if it.function in (5, 6, 15, 16) and STARTS[model](it)]
+    return [
+        request for request in requests(pair) if request.function in (5, 6, 15, 16) and STARTS[model](request)
+    ]
 
 
 # ---- at the worst moment: ours is lost, and this is heard within our time-out ----
@@ -173,10 +175,10 @@ FAILURES = {"ours with one bit turned": DriveRefused}  # a CHE answers it with e
 PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 
-def running(drive: Any, heard: Heard) -> None:
+def running(drive: Any, received: ReceivedRequests) -> None:
     """By the hand of whoever stands there."""
     set_frequency(drive, 20)
-    heard.sim.motor.run(1)
+    received.sim.motor.run(1)
 
 
 MOMENTS = [("start", says) for says in SAYS] + [
@@ -189,42 +191,42 @@ MOMENTS = [("start", says) for says in SAYS] + [
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
 def test_what_another_client_says_confirms_no_pulse(verb: str, says: str) -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard):
+    with shared_line("invt-che", seed=3) as (drive, pair, received):
         set_frequency(drive, 20)
         if verb == "reset_fault":
-            heard[0].sim.trip(4)
+            received[0].sim.trip(4)
         pair.says = SAYS[says]
         pair.holds = lambda said: said == rtu(PULSES[verb])
         with pytest.raises(FAILURES.get(says, Unconfirmed)):
             getattr(drive, verb)()
         assert pair.sent.count(rtu(PULSES[verb])) == 1
-        assert not any(it.starts or it.sim.motor.energised for it in heard)
-        assert heard[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
+        assert not any(each.starts or each.sim.motor.energised for each in received)
+        assert received[0].sim.motor.fault == (4 if verb == "reset_fault" else 0)
 
 
 @patient
 @pytest.mark.parametrize("says", usually(*SAYS))
 def test_what_another_client_says_confirms_no_stop(says: str) -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard):
-        running(drive, heard[0])
+    with shared_line("invt-che", seed=3) as (drive, pair, received):
+        running(drive, received[0])
         pair.says = SAYS[says]
         pair.holds = lambda said: said == rtu(STOP)
         with pytest.raises((Unconfirmed, FAILURES.get(says, Unconfirmed))):
             drive.stop(seconds=1)
         assert pair.sent.count(rtu(STOP)) >= 2
         assert rtu(START) not in pair.sent
-        assert heard[0].sim.motor.energised == (says != "a stop of all")
+        assert received[0].sim.motor.energised == (says != "a stop of all")
 
 
 @patient
 def test_the_same_stop_of_another_client_is_one_too() -> None:
     """It looks like the drive's confirmation of ours, and the motor stops all the same."""
-    with hall("invt-che", seed=3) as (drive, pair, heard):
-        running(drive, heard[0])
+    with shared_line("invt-che", seed=3) as (drive, pair, received):
+        running(drive, received[0])
         pair.says = rtu(STOP)
         pair.holds = lambda said: said == rtu(STOP)
         drive.stop()
-        assert not heard[0].sim.motor.energised
+        assert not received[0].sim.motor.energised
 
 
 @patient
@@ -232,23 +234,23 @@ def test_the_same_stop_of_another_client_is_one_too() -> None:
 def test_another_client_that_asks_the_same_is_not_our_echo_for_long(verb: str) -> None:
     """Ours is lost and theirs answered, as if an adapter echoed: the stop is confirmed all the same."""
     look = rtu("01 03 10 01 00 01")
-    with hall("invt-che", seed=3) as (drive, pair, heard):
-        running(drive, heard[0])
+    with shared_line("invt-che", seed=3) as (drive, pair, received):
+        running(drive, received[0])
         pair.says = look
         pair.holds = lambda said: said == look
         assert drive.state().condition is Condition.RUNNING
         pair.holds = lambda said: False
         getattr(drive, verb)()
-        commands = [request for request in heard[0].writes if request.start == 0x1000]
+        commands = [request for request in received[0].writes if request.start == 0x1000]
         assert len(commands) <= 8  # a stop is repeated until its motor stands: on a busy machine more often
-        assert not heard[0].sim.motor.energised
+        assert not received[0].sim.motor.energised
 
 
 @patient
 def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
-    with hall("invt-che", seed=3) as (drive, pair, heard), Bus(pair.theirs) as other:
+    with shared_line("invt-che", seed=3) as (drive, pair, received), Bus(pair.theirs) as other:
         set_frequency(drive, 20)
         set_frequency(other.attach(InvtCHE(1, maximum_frequency=50)), 50)
         with pytest.raises(Refused, match=r"holds 100\.00 % and not 40\.00 %"):
             drive.start()
-        assert not heard[0].starts
+        assert not received[0].starts

@@ -85,9 +85,12 @@ class Stops(RuleBasedStateMachine):
         """A client anew, that has written its setpoints, and a mark on the wire."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
-        self.drives = [family(it.address, name=f"drive-{it.address}", **options) for it in self.responders]
+        self.drives = [
+            family(responder.address, name=f"drive-{responder.address}", **options)
+            for responder in self.responders
+        ]
         if self.polling:
-            asked = [polled(it, it.readings()[:2]) for it in self.drives]
+            asked = [polled(each, each.readings()[:2]) for each in self.drives]
             self.poller: Poller | None = Poller(
                 plant(declared_line(self.far.ports[0], *asked)), ledger=self._ledger
             )
@@ -198,7 +201,7 @@ class Stops(RuleBasedStateMachine):
         """The second one comes when the first one's stops are on the wire."""
 
         def again() -> None:
-            while not self._heard("stops") and not over.is_set():
+            while not self._received("stops") and not over.is_set():
                 over.wait(0.001)
             for number in signals[1:]:
                 os.kill(os.getpid(), number)
@@ -245,7 +248,7 @@ class Stops(RuleBasedStateMachine):
         self.threads.clear()
         begun = self.begun
         self._mark(self.drives[1])
-        late = [at for at in self._heard("moves", 1 if detaches else None, begun) if at < self.begun]
+        late = [at for at in self._received("moves", 1 if detaches else None, begun) if at < self.begun]
         assert [str(self.line.log[at]) for at in late] == [], self._story()
         if detaches:
             self._close()
@@ -264,8 +267,8 @@ class Stops(RuleBasedStateMachine):
         self.far.bring_back(self.line)
         stopping.join()
         self._close()
-        back = [it for it in self.line.log if it.connection == self.line.connection]
-        assert [str(it) for it in back if it.what == "moves"] == []
+        back = [each for each in self.line.log if each.connection == self.line.connection]
+        assert [str(each) for each in back if each.what == "moves"] == []
         assert failures or not self.responders[0].runs
         for drive in self.responders:  # there may have been no way to stop them
             drive.switch_on()
@@ -299,21 +302,21 @@ class Stops(RuleBasedStateMachine):
             self.threads.append(thread)
         return thread
 
-    def _heard(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
+    def _received(self, what: str, address: int | None = None, begun: int | None = None) -> list[int]:
         """Return the places in the log of such frames of this episode, or from `begun` on."""
         begun = self.begun if begun is None else begun
         return [
             at
-            for at, it in enumerate(list(self.line.log))
+            for at, each in enumerate(list(self.line.log))
             if at >= begun
-            and it.what == what
-            and it.asked is not None
-            and (address is None or it.asked.address in (0, address))
+            and each.what == what
+            and each.asked is not None
+            and (address is None or each.asked.address in (0, address))
         ]
 
     def _judge_order(self, numbers: Any) -> None:
         for number in numbers:
-            stops, moves = (self._heard(what, number + 1) for what in ("stops", "moves"))
+            stops, moves = (self._received(what, number + 1) for what in ("stops", "moves"))
             if stops:
                 late = [str(self.line.log[at]) for at in moves if at > stops[0]]
                 assert not late, f"after {self.line.log[stops[0]]} came {late}\n{self._story()}"
@@ -321,16 +324,18 @@ class Stops(RuleBasedStateMachine):
     def judge(self, numbers: set[int], failures: list[BaseException]) -> None:
         self._judge_order(numbers)
         for number in numbers:
-            assert self._heard("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
+            assert self._received("stops", number + 1), f"no stop was sent: {failures}\n{self._story()}"
             if not failures:
                 assert not self.responders[number].runs, f"{number + 1} was left running\n{self._story()}"
 
     def _story(self) -> str:
-        return "\n".join(str(it) for it in self.line.log[self.begun :])
+        return "\n".join(str(each) for each in self.line.log[self.begun :])
 
     @invariant()
     def no_frame_of_ours_is_damaged(self) -> None:
-        assert [str(it) for it in getattr(self, "line", ResponderLine([])).log if it.what == "damaged"] == []
+        assert [
+            str(each) for each in getattr(self, "line", ResponderLine([])).log if each.what == "damaged"
+        ] == []
 
     def teardown(self) -> None:
         if not hasattr(self, "_stack"):

@@ -41,12 +41,12 @@ from multidrop.sim import simulated
 every_family = pytest.mark.parametrize("model", MAKE)
 
 STOPS: dict[str, Callable[[Message], bool]] = {  # in the documents' words
-    "erman-er-g-220": lambda it: it.function == 5 and it.start == 1 and it.data != b"\0\0",
-    "invt-che": lambda it: it.start == 0x1000 and it.data[-1] == 5,
-    "innovert-ibd": lambda it: it.start == 0x2000 and it.data[-1] == 1,
-    "delixi-modbus": lambda it: it.start == 0x2000 and it.data[-1] == 1,
-    "delixi-native": lambda it: it.function == 2 and it.start == 1,
-    "yd1000": lambda it: it.start == 0x1000 and it.data[0] == 0xC0,
+    "erman-er-g-220": lambda each: each.function == 5 and each.start == 1 and each.data != b"\0\0",
+    "invt-che": lambda each: each.start == 0x1000 and each.data[-1] == 5,
+    "innovert-ibd": lambda each: each.start == 0x2000 and each.data[-1] == 1,
+    "delixi-modbus": lambda each: each.start == 0x2000 and each.data[-1] == 1,
+    "delixi-native": lambda each: each.function == 2 and each.start == 1,
+    "yd1000": lambda each: each.start == 0x1000 and each.data[0] == 0xC0,
 }
 
 
@@ -77,26 +77,26 @@ class Own(Drive):
         return State(Condition.RUNNING if speed else Condition.STOPPED)
 
 
-def writes(hall: SimulatedBus, begun: int = 0) -> list[Message]:
-    return [request for request, _ in hall.frames[begun:] if is_write(request)]
+def writes(line: SimulatedBus, begun: int = 0) -> list[Message]:
+    return [request for request, _ in line.frames[begun:] if is_write(request)]
 
 
-def first(hall: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
+def first(line: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
     """Count the frames before the first write of this kind."""
-    wanted = (at for at, (it, _) in enumerate(hall.frames[begun:]) if is_write(it) and met(it))
+    wanted = (at for at, (each, _) in enumerate(line.frames[begun:]) if is_write(each) and met(each))
     return next(wanted, None)
 
 
 class Meanwhile:
     """Has another thread do something when so many more frames were sent, and waits for that thread."""
 
-    def __init__(self, hall: SimulatedBus, frames: int, act: Callable[[], object]) -> None:
+    def __init__(self, line: SimulatedBus, frames: int, act: Callable[[], object]) -> None:
         self.failure: BaseException | None = None
         self.has_come = False
         self._left = frames
         self._act = act
-        self._carry_out = hall.carry_out
-        vars(hall)["carry_out"] = self.carry_out
+        self._carry_out = line.carry_out
+        vars(line)["carry_out"] = self.carry_out
 
     def carry_out(self, exchange: Exchange, **times: int) -> Completion:
         completion = self._carry_out(exchange, **times)
@@ -127,25 +127,25 @@ def started_while(
     act: Callable[[SimulatedBus, Any], object],
 ) -> tuple[SimulatedBus, Any, Meanwhile, int, BaseException | None]:
     """A start, in which another thread acts after so many frames; and how the start ended."""
-    hall, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
+    line, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
     drive.set_frequency(20)
-    begun = len(hall.frames)
-    meanwhile = Meanwhile(hall, frames, lambda: act(hall, drive))
+    begun = len(line.frames)
+    meanwhile = Meanwhile(line, frames, lambda: act(line, drive))
     failure = None
     try:
         drive.start()
     except BusError as error:
         failure = error
-    return hall, drive, meanwhile, begun, failure
+    return line, drive, meanwhile, begun, failure
 
 
 ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
-    "stop": lambda hall, drive: drive.stop(),
-    "stop_all": lambda hall, drive: hall.bus.stop_all(),
-    "a plain stop": lambda hall, drive: hall.bus.write(drive, *plain_stop(drive)),
-    "leave": lambda hall, drive: hall.bus.leave(),
-    "close": lambda hall, drive: hall.bus.close(),
-    "detach": lambda hall, drive: hall.bus.detach(drive),
+    "stop": lambda line, drive: drive.stop(),
+    "stop_all": lambda line, drive: line.bus.stop_all(),
+    "a plain stop": lambda line, drive: line.bus.write(drive, *plain_stop(drive)),
+    "leave": lambda line, drive: line.bus.leave(),
+    "close": lambda line, drive: line.bus.close(),
+    "detach": lambda line, drive: line.bus.detach(drive),
 }
 
 
@@ -162,17 +162,17 @@ def test_nothing_moves_after_a_stop_wherever_it_came_in_a_start(
 ) -> None:
     """At every frame of it; what was sent before is followed by the stop, and never told as not sent."""
     for frames in range(1, 100):
-        hall, drive, meanwhile, begun, failure = started_while(
+        line, drive, meanwhile, begun, failure = started_while(
             monkeypatch, tmp_path, model, frames, ACTS[act]
         )
         if not meanwhile.has_come:
             break
         assert meanwhile.failure is None
-        start = first(hall, begun, STARTS[model])
+        start = first(line, begun, STARTS[model])
         assert start is None or start < frames
         assert isinstance(failure, Overtaken if start is None else Unconfirmed), (frames, failure)
         if act in ("stop", "stop_all"):
-            stop = first(hall, begun, STOPS[model])
+            stop = first(line, begun, STOPS[model])
             assert stop is not None
             assert start is None or start < stop
             assert drive.state().condition in (Condition.STOPPED, Condition.UNKNOWN)
@@ -187,21 +187,21 @@ def test_the_other_stops_win_too(
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
         return
 
-    def act(hall: SimulatedBus, drive: Any) -> None:
+    def act(line: SimulatedBus, drive: Any) -> None:
         getattr(drive, verb_name)()
 
-    hall, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
+    line, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
     assert isinstance(failure, Overtaken)
     assert "a stop was called; nothing more was sent" in str(failure)
-    assert first(hall, begun, STARTS[model]) is None
+    assert first(line, begun, STARTS[model]) is None
 
 
 def test_other_drives_are_not_held_up_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    one_of_them, other = (hall.attach(it.drive) for it in sims)
+    line = SimulatedBus(monkeypatch, *sims)
+    one_of_them, other = (line.attach(sim.drive) for sim in sims)
     other.set_frequency(20)
-    Meanwhile(hall, 2, one_of_them.stop)
+    Meanwhile(line, 2, one_of_them.stop)
     other.start()
     assert sims[1].motor.energised
 
@@ -215,65 +215,65 @@ def test_what_is_called_after_a_stop_goes(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_what_is_called_while_a_stop_is_under_way_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.start()
-    begun = len(hall.frames)
-    meanwhile = Meanwhile(hall, 2, drive.start)
+    begun = len(line.frames)
+    meanwhile = Meanwhile(line, 2, drive.start)
     drive.stop()
     assert isinstance(meanwhile.failure, Overtaken)
-    assert first(hall, begun, STARTS["invt-che"]) is None
+    assert first(line, begun, STARTS["invt-che"]) is None
     assert not sim.motor.energised
 
 
 def test_a_ramp_ends_with_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, YD1000(1))
+    line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
-    begun = len(hall.frames)
-    meanwhile = Meanwhile(hall, 8, drive.stop)
+    begun = len(line.frames)
+    meanwhile = Meanwhile(line, 8, drive.stop)
     with pytest.raises(Overtaken):
         ramp(drive, 60.0)
     assert meanwhile.has_come
-    stop = first(hall, begun, STOPS["yd1000"])
+    stop = first(line, begun, STOPS["yd1000"])
     assert stop is not None
-    after = [it for it in writes(hall, begun + stop) if it.start == 0x1001]
+    after = [write for write in writes(line, begun + stop) if write.start == 0x1001]
     assert after == []
 
 
 def test_a_staggered_start_ends_with_a_stop_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where it came between two starts: the second one is not called after it by anybody."""
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    hall = SimulatedBus(monkeypatch, *sims)
-    drives = [hall.attach(it.drive) for it in sims]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(20)
     perform = drives[1].perform
 
     def stop_meanwhile(script: Script[Any]) -> Any:
-        hall.bus.stop_all()
+        line.bus.stop_all()
         return perform(script)
 
     monkeypatch.setattr(drives[1], "perform", stop_meanwhile)
     with pytest.raises(Overtaken):
         start_staggered(drives, 1.0)
-    assert not any(it.motor.energised for it in sims)
+    assert not any(sim.motor.energised for sim in sims)
 
 
 def test_after_closing_nothing_that_moves_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
-    hall.bus.close()
-    begun = len(hall.frames)
+    line.bus.close()
+    begun = len(line.frames)
     for call in (
         drive.start,
         drive.jog,
         lambda: drive.set_frequency(30),
-        lambda: hall.bus.write(drive, drive.setpoint, 10.0),
-        lambda: hall.bus.raw(drive, 6, 0x1000, b"\0\1"),
+        lambda: line.bus.write(drive, drive.setpoint, 10.0),
+        lambda: line.bus.raw(drive, 6, 0x1000, b"\0\1"),
     ):
         with pytest.raises(Overtaken, match="the bus was left"):
             call()
-    assert writes(hall, begun) == []
+    assert writes(line, begun) == []
 
 
 # ---- looks ----
@@ -292,39 +292,39 @@ REFUSALS = [
 def test_an_exception_to_the_look_keeps_no_stop_back(
     monkeypatch: pytest.MonkeyPatch, model: str, code: int
 ) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     sim.motor.energised = True
 
     def refuse(request: Message) -> bytes | None:
-        if is_write(request) or writes(hall):
+        if is_write(request) or writes(line):
             return None
         return build_reply(
             drive.framing, Message(1, request.function, request.start, exception=code, data=bytes(4))
         )
 
-    hall.answers = refuse
-    begun = hall.seconds
+    line.answers = refuse
+    begun = line.seconds
     drive.stop()
-    stop = first(hall, 0, STOPS[model])
+    stop = first(line, 0, STOPS[model])
     assert stop is not None
-    assert hall.seconds - begun < 60
-    assert STOPS[model](writes(hall)[0])  # nothing else was written
+    assert line.seconds - begun < 60
+    assert STOPS[model](writes(line)[0])  # nothing else was written
 
 
 @every_family
 def test_the_first_look_of_a_stop_and_the_stop_itself_wait_for_no_late_answer(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
     insisted: list[bool] = []
-    carry_out = hall.carry_out
+    carry_out = line.carry_out
 
     def watched(exchange: Any, **times: int) -> Any:
-        if not writes(hall):
+        if not writes(line):
             insisted.append(bool(exchange.c.insists))
         return carry_out(exchange, **times)
 
-    monkeypatch.setattr(hall, "carry_out", watched)
+    monkeypatch.setattr(line, "carry_out", watched)
     drive.stop()
     assert len(insisted) >= 2
     assert all(insisted)
@@ -334,38 +334,38 @@ def test_the_first_look_of_a_stop_and_the_stop_itself_wait_for_no_late_answer(
 def test_a_look_that_is_lost_is_not_repeated_before_the_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    hall, drive, _ = one(monkeypatch, MAKE[model](1))
-    hall.loses = lambda request: not writes(hall)
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line.loses = lambda request: not writes(line)
     drive.stop()
-    assert first(hall, 0, STOPS[model]) == 1
+    assert first(line, 0, STOPS[model]) == 1
 
 
 def test_one_odd_answer_is_no_proof_of_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
-    hall.answers = lambda request: odd if len(hall.frames) == 1 else None
+    line.answers = lambda request: odd if len(line.frames) == 1 else None
     drive.stop()
-    assert first(hall, 0, STOPS["invt-che"]) is not None
+    assert first(line, 0, STOPS["invt-che"]) is not None
 
 
 def test_a_drive_that_ever_failed_to_answer_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its reply may be the answer to an earlier request."""
-    hall, drive, sim = one(monkeypatch, InvtCHE(1))
+    line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
-    hall.bus.peer(drive).c.history.ended[10] = 1
+    line.bus.peer(drive).c.history.ended[10] = 1
     drive.stop()
-    assert hall.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
+    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # without a look
 
 
 def test_a_stop_that_is_withheld_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1))
+    line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(Refused, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"):
         drive.stop()
-    assert hall.written == []
+    assert line.written == []
     sim["device"] = 0x0101
     drive.stop()  # it is looked at again
-    assert hall.written != []
+    assert line.written != []
 
 
 OTHERS: Sequence[tuple[Drive, Drive]] = (  # declared, and there: of one framing and baud rate
@@ -382,14 +382,14 @@ def test_the_stop_of_the_family_that_it_looks_like_is_offered(
 ) -> None:
     declared, there = pair
     sim = simulated(there)
-    hall = SimulatedBus(monkeypatch, sim)
-    drive = hall.attach(declared)
+    line = SimulatedBus(monkeypatch, sim)
+    drive = line.attach(declared)
     with pytest.raises(Refused, match=f"multidrop stop PORT {there.model} 1"):
         drive.stop()
-    assert hall.written == []
-    hall.bus.detach(drive)
-    hall.attach(type(there)(1, format=there.settings.format)).stop()
-    assert hall.written != []
+    assert line.written == []
+    line.bus.detach(drive)
+    line.attach(type(there)(1, format=there.settings.format)).stop()
+    assert line.written != []
 
 
 # ---- until it stands ----
@@ -397,11 +397,11 @@ def test_the_stop_of_the_family_that_it_looks_like_is_offered(
 
 @every_family
 def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    hall, drive, sim = one(monkeypatch, MAKE[model](1))
+    line, drive, sim = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
-    hears_at = hall.seconds + 20
-    hall.deafens = lambda request: hall.seconds < hears_at
+    hears_at = line.seconds + 20
+    line.deafens = lambda request: line.seconds < hears_at
     drive.stop()
     assert not sim.motor.energised
 
@@ -409,29 +409,29 @@ def test_a_stop_is_repeated_as_long_as_the_line_is_deaf(monkeypatch: pytest.Monk
 def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(50)
     drive.start()
-    hall.sleep(20)
-    begun = hall.seconds
+    line.sleep(20)
+    begun = line.seconds
     with pytest.raises(
         Unconfirmed, match=r"after 2 s, all that it was given, it is not seen to have stopped"
     ):
         drive.stop(seconds=2)
-    assert 2 <= hall.seconds - begun < 2.2
-    hall.deafens = lambda request: True
-    begun = hall.seconds
+    assert 2 <= line.seconds - begun < 2.2
+    line.deafens = lambda request: True
+    begun = line.seconds
     with pytest.raises(Unconfirmed, match=r"sent \d+ times, it was never confirmed: .*no reply"):
         drive.stop()
-    assert LEAST_S <= hall.seconds - begun < LEAST_S + 2
-    begun = hall.seconds
+    assert LEAST_S <= line.seconds - begun < LEAST_S + 2
+    begun = line.seconds
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=100)
-    assert 100 <= hall.seconds - begun < 102
-    sent = len(writes(hall))
+    assert 100 <= line.seconds - begun < 102
+    sent = len(writes(line))
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=0)  # once, and no more
-    assert len(writes(hall)) == sent + 1
+    assert len(writes(line)) == sent + 1
     for wrong in (-1, float("nan"), True):
         with pytest.raises(ValueError, match="no time that a stop may take"):
             drive.stop(seconds=wrong)
@@ -439,17 +439,17 @@ def test_a_stop_gives_up_when_its_caller_says_so_and_tells_what_is_known(
 
 def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
-    hall = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
-        drive = hall.attach(sim.drive)
+        drive = line.attach(sim.drive)
         drive.set_frequency(20)
         drive.start()
-    hall.sleep(10)
-    hall.deafens = lambda request: request.address == 2
-    begun = hall.seconds
-    found = hall.bus.stop_all(seconds=12)
-    assert 12 <= hall.seconds - begun < 13
-    assert {name: it.seen for name, it in found.items()} == {
+    line.sleep(10)
+    line.deafens = lambda request: request.address == 2
+    begun = line.seconds
+    found = line.bus.stop_all(seconds=12)
+    assert 12 <= line.seconds - begun < 13
+    assert {name: each.seen for name, each in found.items()} == {
         "invt-che@1": Seen.STOPPED,
         "erman-er-g-220@2": Seen.SENT,
     }
@@ -458,34 +458,34 @@ def test_stop_all_takes_seconds_too(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_stop_waits_for_a_second_look_at_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nor for the first one, of a drive that is known."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
-    hall = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
-    hall.attach(InvtCHE(1, maximum_frequency=50))
+    line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
+    line.attach(InvtCHE(1, maximum_frequency=50))
     for drive in others[1:]:
-        hall.attach(drive)
-    hall.bus.check_identity(others[2])
-    begun = len(hall.frames)
-    found = hall.bus.stop_all()
-    addresses = [request.address for request, _ in hall.frames[begun:]]
-    assert [request.address for request in writes(hall, begun)][:2] == [3, 2]
+        line.attach(drive)
+    line.bus.check_identity(others[2])
+    begun = len(line.frames)
+    found = line.bus.stop_all()
+    addresses = [request.address for request, _ in line.frames[begun:]]
+    assert [request.address for request in writes(line, begun)][:2] == [3, 2]
     assert addresses[0] == 3
-    before = first(hall, begun, lambda it: it.address == 2)
+    before = first(line, begun, lambda each: each.address == 2)
     assert before is not None
     assert addresses[:before].count(1) == 1
     assert found["invt-che@1"].seen is Seen.FAILED
-    assert all(it.address != 1 for it in writes(hall, begun))
+    assert all(write.address != 1 for write in writes(line, begun))
 
 
 def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(20)
     drive.start()
-    begun = len(hall.frames)
-    hears_at = hall.seconds + 10
-    hall.deafens = lambda request: hall.seconds < hears_at
+    begun = len(line.frames)
+    hears_at = line.seconds + 10
+    line.deafens = lambda request: line.seconds < hears_at
     drive.emergency_stop()
-    pulses = [it for it in writes(hall, begun) if it.start == 0x1000 and it.data[0] & 0x10]
+    pulses = [write for write in writes(line, begun) if write.start == 0x1000 and write.data[0] & 0x10]
     assert len(pulses) == 1
     assert not sim.motor.energised
 
@@ -494,29 +494,29 @@ def test_an_emergency_stop_that_is_a_pulse_is_sent_once_however_long_it_takes(
 def test_a_port_that_was_lost_is_waited_for_and_opened_where_nobody_else_does(
     monkeypatch: pytest.MonkeyPatch, tended: bool
 ) -> None:
-    hall, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.start()
-    back_at = hall.seconds + 5
+    back_at = line.seconds + 5
     opened: list[float] = []
 
     def regain() -> None:
-        opened.append(hall.seconds)
-        if hall.seconds < back_at:
+        opened.append(line.seconds)
+        if line.seconds < back_at:
             raise PortLost("hall", "there is no such port")
-        hall.is_lost = False
+        line.is_lost = False
 
     def lost(request: Message) -> bytes | None:
-        if tended and hall.seconds >= back_at:
-            hall.is_lost = False
-        if hall.is_lost:
+        if tended and line.seconds >= back_at:
+            line.is_lost = False
+        if line.is_lost:
             raise PortLost("hall", "the port was lost (hung up)")
         return None
 
-    hall.is_lost, hall.answers, vars(hall)["regain"] = True, lost, regain
-    hall.bus.tended(tended)
+    line.is_lost, line.answers, vars(line)["regain"] = True, lost, regain
+    line.bus.tended(tended)
     with pytest.raises(LineError):
-        hall.bus.read(drive, drive.status)
+        line.bus.read(drive, drive.status)
     assert opened == []  # only a stop does
     with pytest.raises(LineError):
         drive.stop(seconds=1)
@@ -527,16 +527,16 @@ def test_a_port_that_was_lost_is_waited_for_and_opened_where_nobody_else_does(
 
 
 def test_a_stop_on_a_port_that_was_closed_is_an_error_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
 
     def closed(request: Message) -> bytes | None:
         raise LineError("hall", "it is closed")
 
-    hall.answers = closed
-    begun = hall.seconds
+    line.answers = closed
+    begun = line.seconds
     with pytest.raises(LineError, match="it is closed"):
         drive.stop()
-    assert hall.seconds - begun < 0.1
+    assert line.seconds - begun < 0.1
 
 
 # ---- a user's own drive ----
@@ -546,12 +546,12 @@ def test_an_unwritable_ledger_keeps_no_stop_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
-    hall = SimulatedBus(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
-    drives = [hall.attach(Own(address)) for address in (1, 2)]
+    line = SimulatedBus(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
+    drives = [line.attach(Own(address)) for address in (1, 2)]
     drives[0].stop()
-    assert len(writes(hall)) == 1
-    found = hall.bus.stop_all()
-    assert [it.seen for it in found.values()] == [Seen.STOPPED] * 2
+    assert len(writes(line)) == 1
+    found = line.bus.stop_all()
+    assert [each.seen for each in found.values()] == [Seen.STOPPED] * 2
     assert "a stop was not counted" in caplog.text
 
 
@@ -559,13 +559,13 @@ def test_a_spent_budget_keeps_no_stop_back_and_it_is_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
-    hall = SimulatedBus(monkeypatch, simulated(Own(1)), ledger=ledger)
-    drive = hall.attach(Own(1, confirmed=1))
+    line = SimulatedBus(monkeypatch, simulated(Own(1)), ledger=ledger)
+    drive = line.attach(Own(1, confirmed=1))
     drive.start()
     for _ in range(3):
         drive.stop()
-    assert [it.data for it in writes(hall)] == [b"\0\1", b"\0\0", b"\0\0", b"\0\0"]
-    (wear,) = ledger.wear(1_700_000_000 + hall.seconds)
+    assert [write.data for write in writes(line)] == [b"\0\1", b"\0\0", b"\0\0", b"\0\0"]
+    (wear,) = ledger.wear(1_700_000_000 + line.seconds)
     assert wear.writes == 4
 
 
@@ -588,11 +588,11 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
             yield from write(self.run, 0)
             raise ZeroDivisionError("division by zero")
 
-    hall = SimulatedBus(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
+    line = SimulatedBus(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
     for drive in (Broken(1, name="broken"), Breaks(2, name="breaks"), Own(3, name="own")):
-        hall.attach(drive)
-    found = hall.bus.stop_all()
-    assert {name: it.seen for name, it in found.items()} == {
+        line.attach(drive)
+    found = line.bus.stop_all()
+    assert {name: each.seen for name, each in found.items()} == {
         "broken": Seen.FAILED,
         "breaks": Seen.SENT,
         "own": Seen.STOPPED,
@@ -602,11 +602,11 @@ def test_stop_all_goes_on_past_whatever_a_script_raises(monkeypatch: pytest.Monk
 
 
 def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = SimulatedBus(monkeypatch, simulated(Own(1)))
-    drive = hall.attach(Own(1))
-    hall.deafens = lambda request: hall.seconds < 1010
+    line = SimulatedBus(monkeypatch, simulated(Own(1)))
+    drive = line.attach(Own(1))
+    line.deafens = lambda request: line.seconds < 1010
     drive.stop()
-    assert len(writes(hall)) > 3
+    assert len(writes(line)) > 3
 
 
 # ---- expiry ----
@@ -618,10 +618,10 @@ def test_a_start_that_was_held_up_in_its_looks_is_not_sent(
 ) -> None:
     """The process is stopped by a signal, as Ctrl-Z does, at each of them."""
     for frames in range(1, 100):
-        hall, _, meanwhile, begun, failure = started_while(
-            monkeypatch, tmp_path, model, frames, lambda hall, drive: hall.sleep(5)
+        line, _, meanwhile, begun, failure = started_while(
+            monkeypatch, tmp_path, model, frames, lambda line, drive: line.sleep(5)
         )
-        start = first(hall, begun, STARTS[model])
+        start = first(line, begun, STARTS[model])
         if not meanwhile.has_come or (start is not None and start < frames):
             break
         assert start is None
@@ -641,9 +641,9 @@ def test_looks_that_take_their_time_are_no_delay(monkeypatch: pytest.MonkeyPatch
                 yield from read(self.speed)
             yield from write(self.ratio, 1)
 
-    hall = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
-    hall.attach(Sleepy(1, confirmed=1)).start()
-    assert len(writes(hall)) == 1
+    line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
+    line.attach(Sleepy(1, confirmed=1)).start()
+    assert len(writes(line)) == 1
 
 
 @pytest.mark.parametrize("expiry", [0, -1, float("nan"), float("inf"), True, "1"])
@@ -656,41 +656,41 @@ def test_an_expiry_that_is_none_is_refused(expiry: Any) -> None:
 
 
 def test_a_port_that_is_lost_after_a_confirmed_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
 
     def lost(request: Message) -> bytes | None:
-        if first(hall, 0, STARTS["invt-che"]) is not None and not is_write(request):
+        if first(line, 0, STARTS["invt-che"]) is not None and not is_write(request):
             raise LineError("hall", "the port was lost (hung up)")
         return None
 
-    hall.answers = lost
+    line.answers = lost
     with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*lost"):
         drive.start()
 
 
 def test_a_port_that_is_lost_when_a_write_is_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    hall.bus.check_identity(drive)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
 
     def lost(request: Message) -> bytes | None:
-        if writes(hall) and not is_write(request):
+        if writes(line) and not is_write(request):
             raise LineError("hall", "the port was lost (hung up)")
         return None
 
-    hall.answers = lost
-    outcome = hall.bus.try_write(drive, drive.setpoint, 10.0)
+    line.answers = lost
+    outcome = line.bus.try_write(drive, drive.setpoint, 10.0)
     assert outcome.effect is Effect.UNCONFIRMED
     with pytest.raises(Unconfirmed, match="confirmed, but not read back"):
         assert outcome.value
 
 
 def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    hall.bus.check_identity(drive)
-    Meanwhile(hall, 1, lambda: hall.bus.detach(drive))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
+    Meanwhile(line, 1, lambda: line.bus.detach(drive))
     with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
-        hall.bus.write(drive, drive.setpoint, 10.0)
+        line.bus.write(drive, drive.setpoint, 10.0)
 
 
 # ---- interruptions ----
@@ -701,22 +701,22 @@ def test_a_drive_that_is_taken_off_while_it_is_written_to(monkeypatch: pytest.Mo
 def test_a_stop_that_is_interrupted_is_sent_once_more(
     monkeypatch: pytest.MonkeyPatch, model: str, all_of_them: bool
 ) -> None:
-    hall, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(monkeypatch, MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
-    begun = len(hall.frames)
+    begun = len(line.frames)
     pressed: list[Message] = []
 
     def press(request: Message) -> bytes | None:
-        if len(hall.frames) > begun and not pressed:
+        if len(line.frames) > begun and not pressed:
             pressed.append(request)
             raise KeyboardInterrupt
         return None
 
-    hall.answers = press
+    line.answers = press
     with pytest.raises(KeyboardInterrupt) as interruption:
-        hall.bus.stop_all() if all_of_them else drive.stop()
-    stops = [it for it in writes(hall, begun) if STOPS[model](it)]
+        line.bus.stop_all() if all_of_them else drive.stop()
+    stops = [write for write in writes(line, begun) if STOPS[model](write)]
     assert len(stops) == 2
     assert interruption.value.__notes__ == [
         f"{drive.name}: the stop was sent {1 if model != 'erman-er-g-220' else 2} times; "
@@ -725,16 +725,16 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
 
 
 def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    hall.bus.check_identity(drive)
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.bus.check_identity(drive)
 
     def press(request: Message) -> bytes | None:
         raise KeyboardInterrupt
 
-    hall.answers = press
+    line.answers = press
     with pytest.raises(KeyboardInterrupt):
         drive.stop()
-    assert len(writes(hall)) == 2
+    assert len(writes(line)) == 2
 
 
 @pytest.mark.parametrize(
@@ -748,17 +748,17 @@ def test_a_second_interruption_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_start_that_is_interrupted_says_what_was_sent(
     monkeypatch: pytest.MonkeyPatch, moment: str, note: str
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
 
     def press(request: Message) -> bytes | None:
         is_start = is_write(request) and STARTS["invt-che"](request)
-        was_sent = first(hall, 0, STARTS["invt-che"]) is not None
+        was_sent = first(line, 0, STARTS["invt-che"]) is not None
         if {"look": True, "start": is_start, "after": was_sent and not is_start}[moment]:
             raise KeyboardInterrupt
         return None
 
-    hall.answers = press
+    line.answers = press
     with pytest.raises(KeyboardInterrupt) as interruption:
         drive.start()
     assert interruption.value.__notes__ == [f"{drive.name}: {note}"]
@@ -768,22 +768,22 @@ def test_a_start_that_is_interrupted_says_what_was_sent(
 
 
 def test_a_drive_is_on_one_bus_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
     other = SimulatedBus(monkeypatch)
     with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
         other.attach(drive)
     assert other.bus.drives == []
     drive.state()  # its verbs still go over the first
-    hall.bus.detach(drive)
+    line.bus.detach(drive)
     other.attach(drive)
     other.bus.close()
-    hall.attach(drive)  # the other one is closed
+    line.attach(drive)  # the other one is closed
 
 
 def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = SimulatedBus(monkeypatch)
+    line = SimulatedBus(monkeypatch)
     together = threading.Barrier(8)
-    add, inside, most = hall.bus._exchanges.add, set[str](), 0
+    add, inside, most = line.bus._exchanges.add, set[str](), 0
 
     def slow(drive: Drive) -> None:
         nonlocal most
@@ -793,13 +793,13 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         inside.discard(drive.name)
         add(drive)
 
-    monkeypatch.setattr(hall.bus._exchanges, "add", slow)
+    monkeypatch.setattr(line.bus._exchanges, "add", slow)
     outcomes: list[str] = []
 
     def attach(address: int) -> None:
         together.wait(120)
         try:
-            hall.attach(InvtCHE(address))
+            line.attach(InvtCHE(address))
             outcomes.append("attached")
         except ValueError:
             outcomes.append("taken")
@@ -812,20 +812,20 @@ def test_many_threads_attach_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         for thread in threads:
             thread.join(120)
         assert sorted(outcomes) == ["attached"] * 4 + ["taken"] * 4
-        assert sorted(drive.address for drive in hall.bus.drives) == [1, 2, 3, 4]
-        for drive in hall.bus.drives:
-            hall.bus.detach(drive)
+        assert sorted(drive.address for drive in line.bus.drives) == [1, 2, 3, 4]
+        for drive in line.bus.drives:
+            line.bus.detach(drive)
     assert most == 1
 
 
 def test_a_silent_drive_may_not_be_started_however_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    hall.deafens = lambda request: True
+    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line.deafens = lambda request: True
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=1)
     with pytest.raises(NoReply):
         drive.start()
-    assert first(hall, 0, STARTS["invt-che"]) is None
+    assert first(line, 0, STARTS["invt-che"]) is None
 
 
 class Watching(logging.Handler):
@@ -854,16 +854,18 @@ class Watching(logging.Handler):
 
 def test_a_log_that_hangs_keeps_no_stop_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Each stop was sent before the first record is written."""
-    hall = SimulatedBus(monkeypatch, *(simulated(InvtCHE(it)) for it in (1, 2)), audit=tmp_path / "audit")
+    line = SimulatedBus(
+        monkeypatch, *(simulated(InvtCHE(number)) for number in (1, 2)), audit=tmp_path / "audit"
+    )
     for address in (1, 2):
-        hall.attach(InvtCHE(address))
+        line.attach(InvtCHE(address))
     stopped: list[int] = []
-    audit = hall.bus._records.audit
+    audit = line.bus._records.audit
     assert audit is not None
-    monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(hall))))
-    logged = Watching(lambda: len(writes(hall)))
+    monkeypatch.setattr(audit, "add", lambda *record: stopped.append(len(writes(line))))
+    logged = Watching(lambda: len(writes(line)))
     with logged.on("multidrop"):
-        hall.bus.stop_all()
+        line.bus.stop_all()
     assert stopped == [2, 2]
     assert logged.seen == [2] * 4  # a record and a result of each: a handler's disk may hang too
-    hall.bus.close()
+    line.bus.close()

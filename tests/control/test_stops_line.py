@@ -12,7 +12,7 @@ import pytest
 from examples import usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
-from motors import MAKE, Heard
+from motors import MAKE, ReceivedRequests
 
 from multidrop.bus import Bus
 from multidrop.core import Message
@@ -37,29 +37,29 @@ class Delayed(LateWire):
 
 
 @contextmanager
-def line(model: str) -> Iterator[tuple[Bus, Any, Heard, Delayed]]:
+def line(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests, Delayed]]:
     drive = MAKE[model](1)
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
-    heard, wire = Heard(sim), Delayed([sim], unpaced=True)
+    received, wire = ReceivedRequests(sim), Delayed([sim], unpaced=True)
     with Simulator([wire]) as simulator, Bus(simulator.wires[0].path) as bus:
-        yield bus, bus.attach(drive), heard, wire
+        yield bus, bus.attach(drive), received, wire
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*MAKE))
 def test_a_constant_delay_keeps_no_stop_back(model: str) -> None:
     """Each answer comes after the next question: the look before the stop has another's."""
-    with line(model) as (bus, drive, heard, wire):
-        heard.sim.motor.run(1)
+    with line(model) as (bus, drive, received, wire):
+        received.sim.motor.run(1)
         wire.delay = 0.6
         with suppress(BusError):
-            bus.read(drive, next(it for it in drive.registers.values() if it.readable))
+            bus.read(drive, next(register for register in drive.registers.values() if register.readable))
         with suppress(Unconfirmed):  # whether the motor stands may never be seen
             drive.stop(seconds=1)
-        assert heard.writes
-        until(lambda: not heard.sim.motor.energised)
+        assert received.writes
+        until(lambda: not received.sim.motor.energised)
 
 
 def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
@@ -83,21 +83,21 @@ def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
 ) -> None:
     """Never as if nothing had been sent."""
     monkeypatch.setattr(exchanges, "READ_ATTEMPTS", 1)
-    with line("invt-che") as (bus, drive, heard, _):
+    with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)
         acts: dict[str, Callable[[], object]] = {
             "start": drive.start,
             "write": lambda: bus.write(drive, drive.setpoint, 50.0),
             "raw": lambda: bus.raw(drive, 6, 0x1000, b"\0\1"),
         }
-        begun, came = len(heard.writes), threading.Event()
+        begun, came = len(received.writes), threading.Event()
 
         def loses(request: Message) -> bool:
-            if len(heard.writes) > begun:
+            if len(received.writes) > begun:
                 came.set()
             return came.is_set()
 
-        heard.loses = loses
+        received.loses = loses
         if ending == "close":
             known = bus.peer(drive).c
             known.most_timeout_ns = known.least_timeout_ns = 60_000_000_000
@@ -106,45 +106,45 @@ def test_what_was_sent_is_unconfirmed_when_another_thread_closes(
         bus.close() if ending == "close" else bus.detach(drive)
         thread.join(PATIENCE)
         assert not thread.is_alive()
-        assert [type(it) for it in failures] == [Unconfirmed]
-        assert len(heard.writes) == begun + 1
+        assert [type(failure) for failure in failures] == [Unconfirmed]
+        assert len(received.writes) == begun + 1
 
 
 @every_family
 def test_a_stop_of_another_thread_ends_a_start_that_is_waiting_in_its_looks(model: str) -> None:
     """The start's look is not answered until the stop has been."""
-    with line(model) as (_, drive, heard, _):
+    with line(model) as (_, drive, received, _):
         drive.set_frequency(20)
         looked, stopped = threading.Event(), threading.Event()
 
         def loses(request: Message) -> bool:
-            if not stopped.is_set() and request not in heard.writes:
+            if not stopped.is_set() and request not in received.writes:
                 looked.set()
             return False
 
-        heard.loses = loses
+        received.loses = loses
         starting, failures = in_thread(drive.start)
         assert looked.wait(PATIENCE)
         drive.stop()
         stopped.set()
         starting.join(PATIENCE)
-        assert [type(it) for it in failures] in ([Overtaken], [Unconfirmed])
-        until(lambda: not heard.sim.motor.energised)
+        assert [type(failure) for failure in failures] in ([Overtaken], [Unconfirmed])
+        until(lambda: not received.sim.motor.energised)
 
 
 def test_closing_waits_for_a_stop_that_is_under_way() -> None:
-    with line("invt-che") as (bus, drive, heard, _):
+    with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)
         drive.start()
         deaf = threading.Event()
         sent = threading.Event()
 
         def loses(request: Message) -> bool:
-            if request in heard.writes:
+            if request in received.writes:
                 sent.set()
             return not deaf.is_set()
 
-        heard.loses = loses
+        received.loses = loses
         stopping, failures = in_thread(drive.stop)
         assert sent.wait(PATIENCE)
         closing, _ = in_thread(bus.close)
@@ -165,10 +165,10 @@ class Pulled:
         sim = simulated(self.drive)
         assert isinstance(sim, MotorDrive)
         sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
-        self.heard = Heard(sim)
+        self.received = ReceivedRequests(sim)
 
     def plugged_in(self) -> Simulator:
-        return Simulator([Wire([self.heard.sim], port=self.link, unpaced=True)])
+        return Simulator([Wire([self.received.sim], port=self.link, unpaced=True)])
 
     def starts(self, bus: Bus) -> None:
         drive: Any = self.drive
@@ -177,8 +177,8 @@ class Pulled:
 
     def until_lost(self, bus: Bus) -> None:
         until(lambda: bus.line.queue is None or bus.line.queue.lost)
-        assert self.heard.sim.motor.energised
-        self.heard.requests.clear()
+        assert self.received.sim.motor.energised
+        self.received.requests.clear()
 
 
 @pytest.mark.parametrize("ending", ["close", "stop", "stop_all", "write"])
@@ -206,9 +206,9 @@ def test_a_stop_opens_a_port_that_was_lost(tmp_path: Path, ending: str) -> None:
             else:
                 getattr(drive if ending == "stop" else bus, ending)()
             bus.close()
-            assert pulled.heard.writes
-            assert pulled.heard.starts == []
-            until(lambda: not pulled.heard.sim.motor.energised)
+            assert pulled.received.writes
+            assert pulled.received.starts == []
+            until(lambda: not pulled.received.sim.motor.energised)
     with pytest.raises(LineError, match="it is closed"):
         drive.stop()
 
@@ -232,9 +232,9 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
         pulled.until_lost(bus)
         with pulled.plugged_in():
             poller.close()
-            assert pulled.heard.writes
-            assert pulled.heard.starts == []
-            until(lambda: not pulled.heard.sim.motor.energised)
+            assert pulled.received.writes
+            assert pulled.received.starts == []
+            until(lambda: not pulled.received.sim.motor.energised)
             waits: list[float] = []
             monkeypatch.setattr(clock, "sleep", waits.append)
             with pytest.raises(LineError, match="it is closed"):
@@ -243,13 +243,13 @@ def test_leaving_a_poller_whose_port_was_lost_stops_its_motors(
 
 
 def test_nothing_is_sent_to_a_drive_while_its_stop_is_repeated() -> None:
-    with line("invt-che") as (_, drive, heard, _):
+    with line("invt-che") as (_, drive, received, _):
         drive.set_frequency(20)
-        heard.loses = lambda request: True
+        received.loses = lambda request: True
         stopping, _ = in_thread(lambda: drive.stop(seconds=1))
-        until(lambda: any(it.data == b"\0\5" for it in heard.writes))
+        until(lambda: any(write.data == b"\0\5" for write in received.writes))
         for call in (drive.start, lambda: drive.set_frequency(30)):
             with pytest.raises((Overtaken, NoReply)):
                 call()
         stopping.join(PATIENCE)
-        assert heard.starts == []
+        assert received.starts == []

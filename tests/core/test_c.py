@@ -10,14 +10,19 @@ from examples import usually
 
 @pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
-    line = ("line", "reply", "tcp", "echo", "late", "delay", "counters")
-    core = ("checksum", "frame", "reason", "tap", *line, "columns")
+    line = ("line", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
+    core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
 
 @pytest.mark.slow
+def test_rows(tmp_path: Path) -> None:
+    build_and_run(tmp_path / "test_rows", "columns", "tap", "body", "frame", "checksum", "reason")
+
+
+@pytest.mark.slow
 def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
-    build_and_run(tmp_path / "test_row_queue", "row_queue", "columns", "frame", "checksum", "reason")
+    build_and_run(tmp_path / "test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
 
 
 @pytest.mark.slow

@@ -268,7 +268,7 @@ def test_chunks_that_were_taken_can_all_be_given_back() -> None:
         for due in range(100):
             row_queue.add_miss(BLOCK, Status.NOT_ASKED, due * turn)
         taken = [row_queue.take() for _ in range(100)]
-        assert [[*it.array("sent")] for it in taken if it] == [[due * turn] * 3 for due in range(100)]
+        assert [[*each.array("sent")] for each in taken if each] == [[due * turn] * 3 for due in range(100)]
         del taken
     assert (row_queue.take(), row_queue.dropped) == (None, 0)
 

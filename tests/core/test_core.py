@@ -95,7 +95,7 @@ class Rows:
     def of(self, name: str, rows: int) -> list[int]:
         """A column, when there are so many rows."""
         wait_until(lambda: self._taken() >= rows)
-        return [it for columns in self._columns for it in columns.array(name)]
+        return [each for columns in self._columns for each in columns.array(name)]
 
     def _taken(self) -> int:
         while columns := self.row_queue.take():
@@ -199,8 +199,8 @@ def test_slots_that_the_line_was_too_late_for_are_not_made_up_for(drive: Drive) 
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows, now = Rows(port), now_ns()
         queued = [(fast, -50), (slow, -40), (fast, -30), (in_turn, -99), (fast, -20), (in_turn, 0)]
-        port.submit([it for it, _ in queued], [now + at * second for _, at in queued])
-        said = [STATUSES[it] for it in rows.of("status", len(queued))]
+        port.submit([each for each, _ in queued], [now + at * second for _, at in queued])
+        said = [STATUSES[each] for each in rows.of("status", len(queued))]
     over = "not sent: expired"
     assert said == [over, "ok", over, "ok", "ok", "ok"]
     assert fast.peer.counters().missed == {Status.EXPIRED: 2}
@@ -307,7 +307,7 @@ def test_rows_for_which_there_is_no_room_are_counted(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         assert (row_queue.chunks, row_queue.dropped) == (2, 20)
         kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
-        assert [it for columns in kept for it in columns.array("value")] == [*range(10), *range(30, 35)]
+        assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
 def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
@@ -354,10 +354,10 @@ def test_a_port_that_was_forgotten_is_let_go_of() -> None:
 
 @pytest.mark.parametrize("way", ["queued", "repeated", "urgent"])
 def test_a_echo_probe_goes_first_where_the_adapter_is_not_known(drive: Drive, way: str) -> None:
-    heard: list[int] = []
+    requested: list[int] = []
 
     def answer(request: Message) -> bytes:
-        heard.append(request.start)
+        requested.append(request.start)
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
@@ -367,14 +367,14 @@ def test_a_echo_probe_goes_first_where_the_adapter_is_not_known(drive: Drive, wa
         else:
             port.submit(asked * 2, [0, 0]) if way == "queued" else port.repeat(asked)
             assert rows.of("value", 2)[:2] == [7, 7]  # and no row of the echo_probe's
-        assert heard[:3] == [99, 7, 7]
+        assert requested[:3] == [99, 7, 7]
 
 
 def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None:
-    heard: list[int] = []
+    requested: list[int] = []
 
     def answer(request: Message) -> bytes:
-        heard.append(request.start)
+        requested.append(request.start)
         return b""
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
@@ -383,21 +383,21 @@ def test_a_echo_probe_that_learns_nothing_goes_first_again(drive: Drive) -> None
         asked.c.insists = asked.echo_probe.c.insists = 1
         for _ in range(2):
             assert port.carry_out(asked).result == Failure.NO_REPLY
-        until(lambda: heard == [99, 7, 99, 7])  # which the far end may do later
+        until(lambda: requested == [99, 7, 99, 7])  # which the far end may do later
 
 
 @pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
 def test_no_echo_probe_goes_first_where_the_echo_was_told(drive: Drive, echo: Echo) -> None:
-    heard: list[int] = []
+    requested: list[int] = []
 
     def answer(request: Message) -> bytes:
-        heard.append(request.start)
+        requested.append(request.start)
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
         port.tell_echo(echo)
         assert port.carry_out(read(7, echo_probe=read(99))).result == 7
-    assert heard == [7]
+    assert requested == [7]
 
 
 def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
@@ -410,17 +410,17 @@ def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
 
 
 def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
-    heard: list[int] = []
+    requested: list[int] = []
 
     def answer(request: Message) -> bytes:
-        heard.append(request.start)
+        requested.append(request.start)
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
         found = port.carry_out(read(3), expires_ns=now_ns() - 1)
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
         assert port.carry_out(read(4)).result == 7
-    assert heard == [4]
+    assert requested == [4]
 
 
 def written(
@@ -456,13 +456,13 @@ def test_an_urgent_exchange_that_expires_before_it_can_leave_is_not_sent(drive: 
 def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_its_drive(drive: Drive) -> None:
     """Sent after it, a start would undo it; sent before it, it would move the motor first."""
     latch, other = Latch(), Latch()
-    heard: list[int] = []
+    requested: list[int] = []
     found: dict[int, Completion] = {}
     go_on = threading.Event()
 
     def answer(request: Message) -> bytes:
-        heard.append(request.start)
-        if len(heard) == 1:
+        requested.append(request.start)
+        if len(requested) == 1:
             go_on.wait(120)
         return build_reply(Framing.RTU, request) if request.function == 6 else echo_start(request)
 
@@ -473,7 +473,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
 
         start, others = written(2, 50, permit=latch.permit()), written(3, 51, permit=other.permit())
         wanted = [read(0, timeout=30), read(1, timeout=30), start, others, written(2, 98, insists=True)]
-        threads = [threading.Thread(target=carry_out, args=[it]) for it in wanted]
+        threads = [threading.Thread(target=carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
             time.sleep(0.05)  # those that wait come in this order
@@ -486,7 +486,7 @@ def test_a_stop_goes_ahead_of_all_that_waits_and_ends_what_came_before_it_for_it
         go_on.set()
         for thread in threads:
             thread.join(120)
-    assert heard == [0, 98, 99, 1, 51, 52]
+    assert requested == [0, 98, 99, 1, 51, 52]
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
@@ -520,7 +520,7 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     def carry_out(exchange: Exchange) -> None:
         found.append(port.carry_out(exchange))
 
-    threads = [threading.Thread(target=carry_out, args=[it]) for it in exchanges]
+    threads = [threading.Thread(target=carry_out, args=[each]) for each in exchanges]
     threads[0].start()
     assert came.wait(120)
     threads[1].start()
@@ -529,8 +529,8 @@ def test_a_port_that_is_closed_tells_whether_what_was_under_way_had_left(drive: 
     for thread in threads:
         thread.join(120)
     port.close()
-    assert [it.result for it in found] == [Failure.LINE_LOST] * 2
-    assert sorted(it.sent_ns > 0 for it in found) == [False, True]
+    assert [each.result for each in found] == [Failure.LINE_LOST] * 2
+    assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
 def wait_until_it_sleeps(thread: threading.Thread) -> None:
@@ -557,8 +557,8 @@ def test_polling_keeps_a_share_beside_urgent_exchanges_but_none_of_a_stop(
         return echo_start(request)
 
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        wanted = [read(it, timeout=60.0, insists=insists) for it in (9, 1, 2, 3, 4)]
-        threads = [threading.Thread(target=port.carry_out, args=[it]) for it in wanted]
+        wanted = [read(number, timeout=60.0, insists=insists) for number in (9, 1, 2, 3, 4)]
+        threads = [threading.Thread(target=port.carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
             wait_until_it_sleeps(thread)
@@ -618,10 +618,10 @@ def test_nothing_that_a_late_answer_could_be_taken_for_is_sent(drive: Drive) -> 
 
 
 def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
-    heard: list[int] = []
+    requested: list[int] = []
 
     def answer(request: Message) -> bytes:
-        heard.append(request.address)
+        requested.append(request.address)
         return b"" if request.address == 0 else echo_start(request)
 
     stop = Exchange(
@@ -637,7 +637,7 @@ def test_broadcast_is_sent_and_nobody_waited_for(drive: Drive) -> None:
     with closing(Port(drive(answer), NO_SETTINGS)) as port:
         sent, read_back = port.carry_out(stop), port.carry_out(read(7))
     assert (status_of(sent), status_of(read_back)) == (0, 0)
-    assert heard == [0, 1]
+    assert requested == [0, 1]
     assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
 
 
@@ -709,17 +709,17 @@ def test_a_descriptor_that_is_none_is_refused() -> None:
 
 
 def test_whoever_waits_for_an_exchange_is_told_when_the_port_is_closed(drive: Drive) -> None:
-    heard = threading.Event()
+    requested = threading.Event()
 
     def answer(_: Message) -> bytes:
-        heard.set()
+        requested.set()
         return b""
 
     port = Port(drive(answer), NO_SETTINGS)
     found: list[int] = []
     waiting = threading.Thread(target=lambda: found.append(port.carry_out(read(0, timeout=60)).result))
     waiting.start()
-    heard.wait()
+    requested.wait()
     port.close()
     waiting.join()
     assert found == [Failure.LINE_LOST]

@@ -152,7 +152,7 @@ def test_a_child_of_a_child_too(port: str) -> None:
 def test_an_inherited_bus_says_that_it_is_its_parent_s(any_port: str) -> None:
     def use() -> list[str]:
         with bus:
-            stopped = [it.why for it in bus.stop_all().values()]
+            stopped = [each.why for each in bus.stop_all().values()]
             with pytest.raises(LineError) as failure:
                 current(bus)
         return [*stopped, str(failure.value)]
@@ -211,7 +211,7 @@ def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
     def look() -> list[Any]:
         found = [poller.take(), poller.summary()["lines"].keys(), poller.fileno() > 0]
         poller.close()
-        return [str(it) for it in found]
+        return [str(each) for each in found]
 
     def open_another() -> int:
         with Poller(plant(declared(other.wires[0].path, toy))) as another:
@@ -296,7 +296,7 @@ def test_a_child_stops_no_motor(end: str) -> None:
         with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
             assert parent.stdout is not None
             assert parent.stdout.readline() == f"{int(status)}\n"
-            assert [it.raw for it in sim.counters.writes if it.name == "control"] == [1]
+            assert [write.raw for write in sim.counters.writes if write.name == "control"] == [1]
             parent.communicate()
         assert parent.returncode == 0
-        assert [it.raw for it in sim.counters.writes if it.name == "control"] == [1, 5]
+        assert [write.raw for write in sim.counters.writes if write.name == "control"] == [1, 5]

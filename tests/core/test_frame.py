@@ -29,9 +29,9 @@ from multidrop.core import (
 
 RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 
-GOOD_REQUESTS = [it for it in PRINTED if it.direction == "request" and it.verdict != "bad checksum"]
-GOOD_REPLIES = [it for it in PRINTED if it.direction == "reply" and isinstance(it.says, Message)]
-REFUSED = [it for it in PRINTED if isinstance(it.says, FrameFault)]
+GOOD_REQUESTS = [each for each in PRINTED if each.direction == "request" and each.verdict != "bad checksum"]
+GOOD_REPLIES = [each for each in PRINTED if each.direction == "reply" and isinstance(each.says, Message)]
+REFUSED = [each for each in PRINTED if isinstance(each.says, FrameFault)]
 MISPRINTED = "01 89 01 86 50"  # E13: what a drive may say, but our simulators never do
 
 
@@ -71,7 +71,7 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
 
 def test_all_printed_frames_have_a_meaning() -> None:
     assert (
-        len({(it.framing, it.direction, it.frame) for it in PRINTED}) == 49 + 19
+        len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
     )  # 19 have a copy of themselves as the reply
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
@@ -87,7 +87,7 @@ def test_request_is_built_as_printed(printed: Printed) -> None:
     assert build_request(printed.framing, printed.says) == printed.frame
 
 
-@pytest.mark.parametrize("printed", [it for it in GOOD_REPLIES if it.text != MISPRINTED], ids=str)
+@pytest.mark.parametrize("printed", [reply for reply in GOOD_REPLIES if reply.text != MISPRINTED], ids=str)
 def test_reply_is_built_as_printed(printed: Printed) -> None:
     assert isinstance(printed.says, Message)
     assert build_reply(printed.framing, printed.says) == printed.frame
@@ -238,7 +238,9 @@ WRONG = [
 
 
 @pytest.mark.parametrize(
-    ("framing", "request_", "received", "reason"), [it[1:] for it in WRONG], ids=[it[0] for it in WRONG]
+    ("framing", "request_", "received", "reason"),
+    [each[1:] for each in WRONG],
+    ids=[each[0] for each in WRONG],
 )
 def test_wrong_reply_is_never_data(
     framing: Framing, request_: Message, received: bytes, reason: FrameFault

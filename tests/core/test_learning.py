@@ -65,7 +65,7 @@ def attend(line: LineDriver, drive: Peer, delay: int) -> int:
         line.wait_for_look()
         if line.now < times[seen]:
             line.now = times[seen]
-        come = sum(1 for it in times if it <= line.now)
+        come = sum(1 for time in times if time <= line.now)
         line.receive(reply()[seen:come])
         seen = come
     return line.now - times[-1]
@@ -460,12 +460,12 @@ def test_a_late_answer_within_another_drive_s_exchange_is_recognised(
 
 def test_all_who_owe_an_answer_are_recognised(line: LineDriver) -> None:
     drives = {address: peer() for address in (1, 2, 3)}
-    for address, it in drives.items():
-        time_out(line, it, Message(address, 3, 0, address))
+    for address, each in drives.items():
+        time_out(line, each, Message(address, 3, 0, address))
     ask(line, peer(), Message(9, 3, 0, 1))
     line.receive(answer_of(3, 1, 2, 3) + answer_of(1, 1))
-    assert [it.counters().late for it in drives.values()] == [1, 0, 1]
-    assert [bool(it.late_until_ns) for it in drives.values()] == [False, True, False]
+    assert [drive.counters().late for drive in drives.values()] == [1, 0, 1]
+    assert [bool(drive.late_until_ns) for drive in drives.values()] == [False, True, False]
     line.receive(answer_of(2, 1, 2) + answer_of(9, 4))
     assert line.completion.reply.data == words(4)
     assert drives[2].counters().late == 1

@@ -354,7 +354,9 @@ REASONS = [
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-@pytest.mark.parametrize(("received", "reason"), [it[1:] for it in REASONS], ids=[it[0] for it in REASONS])
+@pytest.mark.parametrize(
+    ("received", "reason"), [each[1:] for each in REASONS], ids=[each[0] for each in REASONS]
+)
 def test_time_out_tells_what_went_wrong(line: LineDriver, received: bytes, reason: int, piece: int) -> None:
     ask(line, READ_TWO)
     sent = line.now

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from multidrop.core import STREAM_ROOM, FrameSpan, Framing, Kind, Message, Side, Splitter, Stream
 
 Pair = tuple[Printed, Printed]
-REPLIES = [it for it in PRINTED if it.request is not None and isinstance(it.says, Message)]
+REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
 WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # confirmed by its own copy
 READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
 OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
@@ -49,7 +49,7 @@ def test_a_printed_exchange_is_a_request_and_its_reply(reply: Printed) -> None:
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
 def test_a_mixed_line_is_cut_alike_however_its_bytes_come(line: list[Printed], data: st.DataObject) -> None:
-    bytes_ = READ + ANSWER + b"".join(it.request_frame + it.frame for it in line)
+    bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
     stream, splitter, spans = Stream(), Splitter(), []
     at = 0
     while at < len(bytes_):
@@ -60,13 +60,15 @@ def test_a_mixed_line_is_cut_alike_however_its_bytes_come(line: list[Printed], d
     stream.end(True)
     spans += splitter.spans(stream)
     expected = [(Kind.REQUEST, READ), (Kind.REPLY, ANSWER)]
-    for it in line:
-        expected += [(Kind.REQUEST, it.request_frame), (Kind.REPLY, it.frame)]
+    for each in line:
+        expected += [(Kind.REQUEST, each.request_frame), (Kind.REPLY, each.frame)]
     assert raw(spans) == expected
 
 
 @given(
-    st.lists(st.binary(min_size=1, max_size=40) | st.sampled_from([it.frame for it in REPLIES]), max_size=30)
+    st.lists(
+        st.binary(min_size=1, max_size=40) | st.sampled_from([reply.frame for reply in REPLIES]), max_size=30
+    )
 )
 def test_no_byte_is_lost_or_told_twice(pieces: list[bytes]) -> None:
     assert b"".join(span.raw for span in split(*pieces)) == b"".join(pieces)
@@ -89,7 +91,7 @@ def test_a_copy_is_neither_where_its_order_is_lost() -> None:
 
 
 def test_an_answered_query_is_no_request_though_it_looks_like_one() -> None:
-    (query,) = {it for it in REPLIES if it.request_frame.startswith(b":0107")}
+    (query,) = {reply for reply in REPLIES if reply.request_frame.startswith(b":0107")}
     assert raw(split(query.request_frame[:-3], query.frame, query.request_frame, query.frame)) == [
         (Kind.JUNK, query.request_frame[:-3]),
         (Kind.STRAY, query.frame),
@@ -190,7 +192,7 @@ def damaged(frame: bytes, chance: random.Random) -> bytes:
 def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
     chance = random.Random(seed)
     line = chance.choices(REPLIES, k=2000)
-    sent = [frame for it in line for frame in (it.request_frame, it.frame)]
+    sent = [frame for each in line for frame in (each.request_frame, each.frame)]
     came = [damaged(frame, chance) for frame in sent]
     found = split(*came)
     spans = {(span.kind, span.time_ns, span.raw) for span in found}
@@ -208,9 +210,9 @@ def test_every_exchange_that_is_not_next_to_damage_is_seen(seed: int) -> None:
 
 
 def test_framings_may_change_from_frame_to_frame() -> None:
-    by_framing = {it.framing: it for it in REPLIES}
+    by_framing = {reply.framing: reply for reply in REPLIES}
     assert set(by_framing) == {*Framing} - {Framing.TCP}  # which has ports of its own
-    frames = [it.request_frame + it.frame for it in by_framing.values()]
+    frames = [each.request_frame + each.frame for each in by_framing.values()]
     assert [span.framing for span in split(*frames, *frames)] == [
         framing for framing in (*by_framing, *by_framing) for _ in range(2)
     ]

@@ -237,7 +237,7 @@ def test_all_mistakes_of_a_class_are_told_at_once() -> None:
         lost=reading("6", "V"),  # type: ignore[call-overload]
         run=command(7, "GO", number_format="u16", span=(5, 1)),  # type: ignore[arg-type]
     )
-    assert [it.partition(":")[0] for it in mistakes] == [
+    assert [mistake.partition(":")[0] for mistake in mistakes] == [
         *("speed", "level", "start", "registers", "address", "perform", "lost", "run", "run")
     ]
     assert mistakes[1] == "level: address FFFFH: its 2 words reach beyond FFFFH"
@@ -253,7 +253,7 @@ def test_any_mistakes_together_are_sentences(wrong: dict[str, Any]) -> None:
     register = setting(1, "V", **wrong)
     if wrong:
         assert told(v=register)
-        assert all(it.startswith("v: ") and "\n" not in it for it in told(v=register))
+        assert all(record.startswith("v: ") and "\n" not in record for record in told(v=register))
     else:
         declare(v=register)
 

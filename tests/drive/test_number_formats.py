@@ -61,7 +61,7 @@ FORMATS = [
     *(Meter.register(wire.name.lower()) for wire in PACKED),
     *(Meter.u32_swapped, Meter.i32_swapped, Meter.f32_swapped),
 ]
-formats = pytest.mark.parametrize("register", FORMATS, ids=lambda it: it.name)
+formats = pytest.mark.parametrize("register", FORMATS, ids=lambda each: each.name)
 
 
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
@@ -93,8 +93,8 @@ def test_a_number_is_packed_as_its_format_says(register: Register[float], data: 
 def attached() -> Any:
     with pytest.MonkeyPatch.context() as monkeypatch:
         sim = SimulatedDrive(Meter(1))
-        hall = SimulatedBus(monkeypatch, sim)
-        yield hall, hall.attach(Meter(1, confirmed=1)), sim
+        line = SimulatedBus(monkeypatch, sim)
+        yield line, line.attach(Meter(1, confirmed=1)), sim
 
 
 @formats
@@ -103,13 +103,13 @@ def attached() -> Any:
 def test_a_number_is_written_held_and_read_back(
     attached: Any, register: Register[float], data: st.DataObject
 ) -> None:
-    hall, meter, sim = attached
+    line, meter, sim = attached
     number = data.draw(numbers(register))
-    outcome = hall.bus.try_write(meter, register, number)
+    outcome = line.bus.try_write(meter, register, number)
     assert (outcome.effect, outcome.held) == (Effect.DONE, number)
-    assert hall.bus.read(meter, register) == number == sim[register.name]
+    assert line.bus.read(meter, register) == number == sim[register.name]
     sim[register.name] = number  # as from its keypad
-    assert hall.bus.read(meter, register) == number
+    assert line.bus.read(meter, register) == number
 
 
 @settings(max_examples=examples(50))
@@ -117,9 +117,9 @@ def test_a_number_is_written_held_and_read_back(
 @example(12.1)
 @example(16_777_217)
 def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> None:
-    hall, meter, sim = attached
+    line, meter, sim = attached
     (nearest,) = struct.unpack(">f", struct.pack(">f", value))
-    assert hall.bus.write(meter, Meter.f32, value) == nearest == sim["f32"]
+    assert line.bus.write(meter, Meter.f32, value) == nearest == sim["f32"]
     assert Meter.f32.encode(value) == nearest
 
 
@@ -128,16 +128,16 @@ def test_the_nearest_float32_is_what_was_taken(attached: Any, value: float) -> N
     "value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7)
 )
 def test_what_no_number_format_holds_is_refused(attached: Any, name: str, value: float) -> None:
-    hall, meter, _ = attached
-    before = len(hall.written)
+    line, meter, _ = attached
+    before = len(line.written)
     with pytest.raises(Refused, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
-        hall.bus.write(meter, meter.register(name), value)
-    assert len(hall.written) == before
+        line.bus.write(meter, meter.register(name), value)
+    assert len(line.written) == before
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
-@pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda it: it.name)
+@pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda each: each.name)
 def test_a_float_is_shown_as_what_it_holds(register: Register[float], raw: float) -> None:
     shown = register.format(register.decode(raw)).partition(" ")[0]
     assert register.encode(register.parse(shown)) == raw
@@ -157,10 +157,10 @@ def test_floats_read_well(value: float, text: str) -> None:
 
 
 def test_an_end_of_a_span_that_no_float32_is_can_be_written(attached: Any) -> None:
-    hall, meter, _ = attached
-    assert hall.bus.write(meter, Meter.narrow, 0.1) == pytest.approx(0.1)
+    line, meter, _ = attached
+    assert line.bus.write(meter, Meter.narrow, 0.1) == pytest.approx(0.1)
     with pytest.raises(Refused, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
-        hall.bus.write(meter, Meter.narrow, 0.10001)
+        line.bus.write(meter, Meter.narrow, 0.10001)
 
 
 def test_a_simulated_drive_keeps_to_the_span_of_a_float() -> None:
@@ -202,39 +202,39 @@ def test_a_number_without_a_scale_is_watched_with_all_its_digits(value: float, t
 
 
 def test_a_long_register_is_read_where_no_limit_is_stated(attached: Any) -> None:
-    hall, meter, sim = attached
+    line, meter, sim = attached
     sim["total"] = 0x12345
-    assert hall.bus.read(meter, Meter.total) == 0x12345
+    assert line.bus.read(meter, Meter.total) == 0x12345
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
     declared = [("status", reading(5)), ("control", command(5, span=(0, 7), moves=False))][::order]
     both = type("Both", (Drive,), dict(declared))
-    hall = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
-    drive = hall.attach(both(1, confirmed=1))
-    assert hall.bus.write(drive, drive.control, 3) == 3
-    assert hall.bus.read(drive, drive.status) == 3
-    reply = hall.sims[0].answer(Message(1, 6, 5, data=bytes([0, 8])), hall.seconds)
+    line = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
+    drive = line.attach(both(1, confirmed=1))
+    assert line.bus.write(drive, drive.control, 3) == 3
+    assert line.bus.read(drive, drive.status) == 3
+    reply = line.sims[0].answer(Message(1, 6, 5, data=bytes([0, 8])), line.seconds)
     assert reply is not None
     assert reply.exception == 3  # the command's span holds
 
 
 def test_a_single_register_of_a_table_that_is_written_several_at_once(attached: Any) -> None:
-    hall, meter, sim = attached
+    line, meter, sim = attached
     assert write_request(meter, Meter.alone, 7) == Message(1, 0x10, 22, 1, bytes([0, 7]))
-    assert hall.bus.write(meter, Meter.alone, 7) == 7
-    assert hall.bus.write(meter, Meter.lamp, 1) == 1
+    assert line.bus.write(meter, Meter.alone, 7) == 7
+    assert line.bus.write(meter, Meter.lamp, 1) == 1
     assert (sim["alone"], sim["lamp"]) == (7, 1)
-    assert hall.frames[-2][0].function == 0x0F
+    assert line.frames[-2][0].function == 0x0F
 
 
 def test_a_step_may_be_negative(attached: Any) -> None:
-    hall, meter, sim = attached
-    assert hall.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
+    line, meter, sim = attached
+    assert line.bus.write(meter, Meter.downwards, -5.0) == -5.0 == sim["downwards"]
     assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
     with pytest.raises(Refused, match=r"downwards = 5 does not fit: -6553\.5 to 0 V$"):
-        hall.bus.write(meter, Meter.downwards, 5)
+        line.bus.write(meter, Meter.downwards, 5)
 
 
 @pytest.mark.parametrize(

@@ -79,14 +79,14 @@ class Known(Pump):
 STOP, RUN = "01 06 00 30 00 00", "01 06 00 30 00 01"
 
 
-def written(hall: SimulatedBus) -> list[str]:
-    return [frame[:17] for frame in hall.written]
+def written(line: SimulatedBus) -> list[str]:
+    return [frame[:17] for frame in line.written]
 
 
 def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = SimulatedBus(monkeypatch, simulated(Fan(1)))
-    fan = hall.attach(Fan(1))
-    assert hall.bus.write(fan, fan.frequency, 25.0) == 25.0
+    line = SimulatedBus(monkeypatch, simulated(Fan(1)))
+    fan = line.attach(Fan(1))
+    assert line.bus.write(fan, fan.frequency, 25.0) == 25.0
     assert "confirmed" not in Fan.options
 
 
@@ -95,15 +95,15 @@ def test_an_ordinary_setting_needs_no_ceremony(monkeypatch: pytest.MonkeyPatch) 
 def test_a_command_of_which_nothing_is_said_is_not_plainly_written(
     monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
 ) -> None:
-    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    pump = hall.attach(Pump(1, name="pump", confirmed=confirmed))
+    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+    pump = line.attach(Pump(1, name="pump", confirmed=confirmed))
     with pytest.raises(Refused) as refusal:
-        hall.bus.write(pump, pump.control, word)
+        line.bus.write(pump, pump.control, word)
     assert str(refusal.value) == (
         f"control of pump is not written: {word.name} commands the motor, which verbs alone do: "
         "use start(), stop()"
     )
-    assert hall.frames == []
+    assert line.frames == []
 
 
 def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,13 +113,13 @@ def test_where_there_is_no_verb_its_author_is_told_what_to_say(monkeypatch: pyte
         level = reading(1)
         run = command(2)
 
-    hall = SimulatedBus(monkeypatch, simulated(Bare(1)))
-    bare = hall.attach(Bare(1, confirmed=1))
+    line = SimulatedBus(monkeypatch, simulated(Bare(1)))
+    bare = line.attach(Bare(1, confirmed=1))
     with pytest.raises(
         Refused, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
     ):
-        hall.bus.write(bare, bare.run, 1)
-    assert hall.frames == []
+        line.bus.write(bare, bare.run, 1)
+    assert line.frames == []
 
 
 def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,75 +128,75 @@ def test_what_is_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch)
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 
-    hall = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
-    pump = hall.attach(Stoppable(1))
-    hall.bus.write(pump, pump.control, Word.STOP)
+    line = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
+    pump = line.attach(Stoppable(1))
+    line.bus.write(pump, pump.control, Word.STOP)
     with pytest.raises(Refused, match="RUN commands the motor"):
-        hall.bus.write(pump, pump.control, Word.RUN)
-    assert written(hall) == [STOP]
+        line.bus.write(pump, pump.control, Word.RUN)
+    assert written(line) == [STOP]
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
 def test_what_may_move_the_motor_of_an_unknown_drive_needs_its_owner_s_word(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    def command_it(hall: SimulatedBus, pump: Pump) -> None:
+    def command_it(line: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
             "set_frequency": lambda: pump.set_frequency(20.0),
-            "target": lambda: hall.bus.write(pump, pump.target, 20.0),
+            "target": lambda: line.bus.write(pump, pump.target, 20.0),
         }
         acts[name]()
 
-    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    pump = hall.attach(Pump(1, name="pump"))
+    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+    pump = line.attach(Pump(1, name="pump"))
     with pytest.raises(Refused) as refusal:
-        command_it(hall, pump)
+        command_it(line, pump)
     assert str(refusal.value) == (
         f"{name} is not sent to pump: its class has no `identify` that could tell a Pump from another drive, "
         "to which the same may mean a start; look at its name plate, and declare confirmed = 1"
     )
-    assert hall.frames == []
-    hall.bus.detach(pump)
-    command_it(hall, hall.attach(Pump(1, confirmed=1)))
-    assert len(hall.written) == 1
+    assert line.frames == []
+    line.bus.detach(pump)
+    command_it(line, line.attach(Pump(1, confirmed=1)))
+    assert len(line.written) == 1
 
 
 @pytest.mark.parametrize("name", ["stop", "coast"])
 def test_a_stop_is_never_withheld_for_want_of_a_confirmation(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    getattr(hall.attach(Pump(1)), name)()
-    assert written(hall) == [STOP]
+    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+    getattr(line.attach(Pump(1)), name)()
+    assert written(line) == [STOP]
 
 
 def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    hall.attach(Pump(1))
-    hall.bus.stop_all()
-    assert written(hall) == [STOP]
+    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+    line.attach(Pump(1))
+    line.bus.stop_all()
+    assert written(line) == [STOP]
 
 
 def test_a_class_that_says_what_it_is_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "confirmed" in Pump.options
-    hall = SimulatedBus(monkeypatch, simulated(Known(1)))
-    hall.attach(Known(1)).start()
-    assert written(hall) == [RUN]
+    line = SimulatedBus(monkeypatch, simulated(Known(1)))
+    line.attach(Known(1)).start()
+    assert written(line) == [RUN]
 
 
 def test_what_is_still_under_way_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exception 05: the server has accepted the request and is processing it (V1.1b3, section 7)."""
-    hall = SimulatedBus(monkeypatch, simulated(Known(1)))
-    drive = hall.attach(Known(1))
+    line = SimulatedBus(monkeypatch, simulated(Known(1)))
+    drive = line.attach(Known(1))
 
     def acknowledged(request: Message) -> bytes | None:
         return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # the CRC by pymodbus
 
-    hall.answers = acknowledged
+    line.answers = acknowledged
     with pytest.raises(Unconfirmed, match="its reply is code 05H, acknowledged, still working"):
         drive.start()
-    assert written(hall) == [RUN]
+    assert written(line) == [RUN]
 
 
 def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,13 +206,13 @@ def test_a_setting_may_be_said_to_move_the_motor(monkeypatch: pytest.MonkeyPatch
         control = setting(1, Word, moves=True, harmless=(Word.STOP,), kept=Kept.RAM)
         mode = setting(2, moves=True, kept=Kept.RAM)
 
-    hall = SimulatedBus(monkeypatch, simulated(Readable(1)))
-    drive = hall.attach(Readable(1, confirmed=1))
+    line = SimulatedBus(monkeypatch, simulated(Readable(1)))
+    drive = line.attach(Readable(1, confirmed=1))
     for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
         with pytest.raises(Refused, match="commands the motor"):
-            hall.bus.write(drive, register, value)
-    hall.bus.write(drive, drive.control, Word.STOP)
-    assert len(hall.written) == 1
+            line.bus.write(drive, register, value)
+    line.bus.write(drive, drive.control, Word.STOP)
+    assert len(line.written) == 1
 
 
 def test_a_plant_file_and_a_command_confirm_it(tmp_path: Path) -> None:

@@ -60,11 +60,11 @@ def test_bytes_of_a_line_are_never_control_characters(data: bytes) -> None:
 def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         sim = SimulatedDrive(Meter(1))
-        hall = SimulatedBus(monkeypatch, sim)
-        drive = hall.attach(Meter(1))
+        line = SimulatedBus(monkeypatch, sim)
+        drive = line.attach(Meter(1))
         sim[declared.name] = value
-        assert hall.bus.read_text(drive, declared) == value == sim[declared.name]
-        counts = [request.count for request, _ in hall.frames]
+        assert line.bus.read_text(drive, declared) == value == sim[declared.name]
+        counts = [request.count for request, _ in line.frames]
         assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
 
 
@@ -84,14 +84,14 @@ class Known(Meter):
 def test_a_text_says_what_a_device_is(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
-    hall = SimulatedBus(monkeypatch, sim)
-    drive = hall.attach(Known(1, name="em-1"))
+    line = SimulatedBus(monkeypatch, sim)
+    drive = line.attach(Known(1, name="em-1"))
     if maker == "ABB":
-        assert hall.bus.write(drive, drive.limit, 3) == 3
+        assert line.bus.write(drive, drive.limit, 3) == 3
     else:
         with pytest.raises(Refused, match="em-1 is of ABC"):
-            hall.bus.write(drive, drive.limit, 3)
-    assert (hall.written != []) == (maker == "ABB")
+            line.bus.write(drive, drive.limit, 3)
+    assert (line.written != []) == (maker == "ABB")
 
 
 def test_a_text_of_another_family_is_asked_for_by_a_scan() -> None:
@@ -112,18 +112,18 @@ def test_a_text_is_never_polled_nor_another_s(monkeypatch: pytest.MonkeyPatch) -
 
         serial = text(20, 12)
 
-    hall = SimulatedBus(monkeypatch, SimulatedDrive(Meter(1)))
-    drive = hall.attach(Meter(1, name="em-1"))
+    line = SimulatedBus(monkeypatch, SimulatedDrive(Meter(1)))
+    drive = line.attach(Meter(1, name="em-1"))
     assert [register.name for register in Meter.readings()] == ["level"]
     assert list(Meter.texts) == ["serial", "maker"]
     with pytest.raises(ValueError, match=r"^this serial is no text of em-1"):
-        hall.bus.read_text(drive, Other.serial)
+        line.bus.read_text(drive, Other.serial)
     with pytest.raises(TypeError, match="is no text of em-1"):
-        hall.bus.read_text(drive, Meter.level)
+        line.bus.read_text(drive, Meter.level)
     with pytest.raises(AttributeError, match=r"serial is a text, which bus.read_text"):
         drive.serial = "x"
     with pytest.raises(ValueError, match="maker holds 6 characters, not 7"):
-        hall.sims[0]["maker"] = "1234567"
+        line.sims[0]["maker"] = "1234567"
 
 
 @pytest.mark.parametrize(

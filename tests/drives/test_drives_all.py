@@ -37,13 +37,18 @@ from multidrop.planning.blocks import blocks
 
 FAMILIES = list(MODELS.values())
 
-family = pytest.mark.parametrize("family", FAMILIES, ids=lambda it: it.model)
+family = pytest.mark.parametrize("family", FAMILIES, ids=lambda each: each.model)
 
 
-def registers(wanted: Callable[[Register[Any]], object] = lambda it: True) -> pytest.MarkDecorator:
+def registers(wanted: Callable[[Register[Any]], object] = lambda each: True) -> pytest.MarkDecorator:
     """Runs a test for each register of each family that is wanted."""
-    found = [(family, it) for family in FAMILIES for it in family.registers.values() if wanted(it)]
-    ids = [f"{family.model}-{it.name}" for family, it in found]
+    found = [
+        (family, register)
+        for family in FAMILIES
+        for register in family.registers.values()
+        if wanted(register)
+    ]
+    ids = [f"{family.model}-{each.name}" for family, each in found]
     return pytest.mark.parametrize(("family", "register"), found, ids=ids)
 
 
@@ -56,8 +61,8 @@ def test_the_models_by_name() -> None:
         "delixi-native",
         "yd1000",
     ]
-    assert all(name == it.model for name, it in MODELS.items())
-    assert len({it.title for it in FAMILIES}) == len(FAMILIES)
+    assert all(name == each.model for name, each in MODELS.items())
+    assert len({family.title for family in FAMILIES}) == len(FAMILIES)
 
 
 @family
@@ -109,9 +114,9 @@ def test_verbs_have_docstrings(family: type[Drive]) -> None:
 def test_no_two_registers_share_an_address(family: type[Drive]) -> None:
     """But for a command and the reading that shows it."""
     places = [
-        (it.table, it.address + at, it.access is Access.COMMAND)
-        for it in family.registers.values()
-        for at in range(it.words)
+        (register.table, register.address + at, register.access is Access.COMMAND)
+        for register in family.registers.values()
+        for at in range(register.words)
     ]
     assert len(places) == len(set(places))
 
@@ -128,7 +133,7 @@ def test_every_framing_has_its_formats(family: type[Drive]) -> None:
 
 @family
 def test_limits_hold_for_tables_that_the_family_has(family: type[Drive]) -> None:
-    tables = {it.table for it in family.registers.values()}
+    tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
 
@@ -139,7 +144,7 @@ def test_each_register_says_where_it_comes_from(family: type[Drive]) -> None:
         assert getattr(family, name) is register
 
 
-@registers(lambda it: it.span)
+@registers(lambda each: each.span)
 def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
     family: type[Drive], register: Register[Any]
 ) -> None:
@@ -153,12 +158,12 @@ def test_the_ends_of_the_span_can_be_encoded_and_nothing_beyond(
             register.encode(beyond)
 
 
-@registers(lambda it: it.span and it.default is not None)
+@registers(lambda each: each.span and each.default is not None)
 def test_the_default_is_inside_the_span(family: type[Drive], register: Register[Any]) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 
-@registers(lambda it: it.values)
+@registers(lambda each: each.values)
 def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[Any]) -> None:
     assert register.values
     for member in register.values:
@@ -173,15 +178,15 @@ def test_names_go_to_the_wire_and_back(family: type[Drive], register: Register[A
                     register.encode(register.values(1 << at))
     else:
         with pytest.raises(TypeError, match=register.name):
-            register.encode(max(it.value for it in register.values) + 1)
+            register.encode(max(value.value for value in register.values) + 1)
 
 
 @family
 def test_what_is_never_written_is_not_writable(family: type[Drive]) -> None:
-    assert not [it for it in family.registers.values() if it.never and it.writable]
+    assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
-@registers(lambda it: it.broadcast)
+@registers(lambda each: each.broadcast)
 def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], register: Register[Any]) -> None:
     for raw in register.broadcast:
         assert family.broadcasts
@@ -194,10 +199,12 @@ def test_a_broadcast_is_a_stop_or_a_setpoint_of_zero(family: type[Drive], regist
 
 @family
 def test_an_unknown_scale_is_not_written(family: type[Drive]) -> None:
-    assert not [it for it in family.registers.values() if it.step is None and it.writable]
+    assert not [
+        register for register in family.registers.values() if register.step is None and register.writable
+    ]
 
 
-@registers(lambda it: not it.values)
+@registers(lambda each: not each.values)
 @settings(max_examples=examples(20))
 @given(data=st.data())
 def test_a_raw_count_survives_its_value(
@@ -216,7 +223,7 @@ def test_a_raw_count_survives_its_value(
     assert register.format(value).startswith(f"{value:.{register.decimals}f}")
 
 
-@registers(lambda it: it.writable)
+@registers(lambda each: each.writable)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_a_value_survives_the_wire(family: type[Drive], register: Register[Any], data: st.DataObject) -> None:
@@ -248,7 +255,9 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
     """Values that may be written."""
     if register.values is not None:
         members = [
-            it for it in register.values if not any(it & mask == mask for mask in register.never_together)
+            value
+            for value in register.values
+            if not any(value & mask == mask for mask in register.never_together)
         ]
         return st.sampled_from(members)
     low, high = 0, (1 << 16 * register.words) - 1
@@ -261,7 +270,7 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
     return st.integers(low, high).map(register.decode)
 
 
-@registers(lambda it: it.values is None and it.writable)
+@registers(lambda each: each.values is None and each.writable)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_what_is_shown_can_be_typed(
@@ -276,7 +285,7 @@ def test_drives_import_what_they_may() -> None:
     for path in Path(multidrop.drives.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             assert not isinstance(node, ast.Import) or all(
-                not it.name.startswith("multidrop") for it in node.names
+                not name.name.startswith("multidrop") for name in node.names
             )
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("multidrop"):
                 room = node.module.split(".")[1]

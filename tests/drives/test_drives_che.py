@@ -77,13 +77,13 @@ TABLE = """
 
 def test_the_registers_are_those_of_the_che100() -> None:
     assert rows(InvtCHE) == typed(TABLE)
-    assert all(it.outside for it in InvtCHE.registers.values())
-    signed = {name for name, it in InvtCHE.registers.items() if it.number_format is NumberFormat.I16}
+    assert all(register.outside for register in InvtCHE.registers.values())
+    signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}
     assert signed == {"setpoint", "output_power", "output_torque"}
 
 
 def test_numbers() -> None:
-    assert [(it.value, it.name) for it in CHEControl] == [
+    assert [(each.value, each.name) for each in CHEControl] == [
         (1, "FORWARD"),
         (2, "REVERSE"),
         (3, "JOG_FORWARD"),
@@ -93,8 +93,8 @@ def test_numbers() -> None:
         (7, "RESET_FAULT"),
         (8, "STOP_JOG"),
     ]
-    assert [it.value for it in CHEFault] == list(range(24))
-    assert [it.value for it in CommunicationFault] == list(range(9))
+    assert [each.value for each in CHEFault] == list(range(24))
+    assert [each.value for each in CommunicationFault] == list(range(9))
     assert CHEFault(18) is CHEFault.CE_COMMUNICATION
     assert CHEFault(10) is CHEFault.UV_UNDERVOLTAGE
 
@@ -120,7 +120,7 @@ def test_start_without_a_direction_does_not_turn_a_running_motor_round() -> None
     wire = Wire(InvtCHE(1), {"status": CHEStatus.REVERSE, "setpoint": 40.0})
     wire.drive.start()
     wire.drive.jog()
-    assert [it[:17] for it in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
+    assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02", "01 06 10 00 00 04"]
 
 
 def test_stop_waits_for_standby() -> None:
@@ -135,7 +135,7 @@ def test_a_jog_that_does_not_stop_is_stopped_as_one() -> None:
     with pytest.raises(Unconfirmed, match="20 s"):
         wire.drive.stop()
     assert wire.sent[0] == STOP
-    assert [it[:17] for it in wire.sent[1:]] == ["01 06 10 00 00 08"]
+    assert [each[:17] for each in wire.sent[1:]] == ["01 06 10 00 00 08"]
 
 
 def test_a_stop_may_be_refused_by_a_drive_that_stands() -> None:
@@ -259,13 +259,13 @@ def test_a_parameter_may_be_declared_as_stored(monkeypatch: pytest.MonkeyPatch, 
     with pytest.raises(ValueError, match="0 to 511"):
         stored_parameter(512)
     ledger = Ledger(tmp_path / "wear", budget=100)
-    hall, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
-    hall.bus.write(drive, drive.ramp, 3.0)
-    assert ledger.wear(hall.seconds) == []
-    hall.bus.write(drive, drive.jump, 0x1388)
-    assert hall.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
+    line, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
+    line.bus.write(drive, drive.ramp, 3.0)
+    assert ledger.wear(line.seconds) == []
+    line.bus.write(drive, drive.jump, 0x1388)
+    assert line.written[-1] == "02 06 00 08 13 88 05 6D"  # worked out by hand from section 11.6.2
     with pytest.raises(Refused, match="less often"):
-        hall.bus.write(drive, drive.jump, 0x1389)
+        line.bus.write(drive, drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
 
 

@@ -26,8 +26,8 @@ STANDING = {
     "baudrate_setting": DelixiBaudrate.B9600,
 }
 TURNING = {"output_frequency": 12.0}
-TURNS = {it: TURNING for frames in (FORWARD, REVERSE) for it in frames.values()} | {
-    it: {"output_frequency": 0.0} for it in STOP.values()
+TURNS = {each: TURNING for frames in (FORWARD, REVERSE) for each in frames.values()} | {
+    each: {"output_frequency": 0.0} for each in STOP.values()
 }
 
 
@@ -55,7 +55,7 @@ def test_the_line_and_its_limits() -> None:
 
 
 def test_the_words_have_a_direction_and_no_toggle() -> None:
-    assert {it.value for it in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
+    assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
 def test_formats_are_named_as_the_manual_has_them() -> None:
@@ -77,7 +77,7 @@ def test_a_jog_that_a_start_may_not_end_is_stopped_first() -> None:
 
 
 def test_faults() -> None:
-    assert [it.value for it in DelixiFault] == list(range(15))
+    assert [each.value for each in DelixiFault] == list(range(15))
     assert DelixiModbus.fault.decode(14) is DelixiFault.FLT_MODULE
 
 
@@ -98,7 +98,7 @@ def test_jog_has_its_direction_too() -> None:
     wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING})
     wire.drive.jog()
     wire.drive.jog(Direction.REVERSE)
-    assert [it[:17] for it in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
+    assert [each[:17] for each in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
 
 
 def test_a_motor_that_turns_is_not_started_without_a_direction() -> None:

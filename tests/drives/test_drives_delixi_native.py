@@ -54,7 +54,10 @@ def test_the_registers_are_those_of_part_3() -> None:
 
 
 def test_what_carries_a_value() -> None:
-    carriers = {it.table.write or it.table.read: it.table.carrier for it in DelixiNative.registers.values()}
+    carriers = {
+        register.table.write or register.table.read: register.table.carrier
+        for register in DelixiNative.registers.values()
+    }
     assert carriers == {2: Carrier.NUMBER, 3: Carrier.NUMBER, 4: Carrier.LONG, 6: Carrier.LONG}
     assert (PARAMETER_RAM.read, PARAMETER_RAM.write) == (7, 5)
 
@@ -72,7 +75,7 @@ def test_formats_are_named_as_the_manual_has_them() -> None:
 
 
 def test_only_a_stop_is_broadcast_and_only_by_k_02() -> None:
-    broadcast = {name: it.broadcast for name, it in DelixiNative.registers.items() if it.broadcast}
+    broadcast = {name: each.broadcast for name, each in DelixiNative.registers.items() if each.broadcast}
     assert broadcast == {"control": (1,)}
 
 
@@ -203,7 +206,7 @@ class Owned(DelixiNative):
 
 def test_the_function_code_says_whether_a_parameter_is_stored() -> None:
     assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
-    kept = {name: it.kept for name, it in DelixiNative.registers.items() if it.writable}
+    kept = {name: each.kept for name, each in DelixiNative.registers.items() if each.writable}
     assert kept == {
         "control": Kept.RAM,
         "frequency": Kept.RAM,
@@ -218,14 +221,14 @@ def test_what_is_not_stored_is_not_counted_and_what_is_waits_its_minute(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
-    hall, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
+    line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
-        hall.bus.write(drive, drive.ramp, seconds)
-    assert ledger.wear(hall.seconds) == []
+        line.bus.write(drive, drive.ramp, seconds)
+    assert ledger.wear(line.seconds) == []
     assert not sim.counters.eeprom_writes
-    hall.bus.write(drive, drive.stored_ramp, 1.0)
+    line.bus.write(drive, drive.stored_ramp, 1.0)
     with pytest.raises(Refused, match="less often"):
-        hall.bus.write(drive, drive.stored_ramp, 2.0)
+        line.bus.write(drive, drive.stored_ramp, 2.0)
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
 

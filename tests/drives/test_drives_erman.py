@@ -85,7 +85,7 @@ def test_bits() -> None:
     assert ErmanERG220.status.number_format is ErmanERG220.last_fault.number_format is NumberFormat.U32_EITHER
     assert ErmanERG220.status.decode(0x22) is ErmanStatus.ACCELERATING_OVERLOADED
     assert ErmanERG220.heatsink_temperature.number_format is NumberFormat.I16
-    assert all(it.kept is Kept.UNKNOWN for it in ErmanERG220.registers.values())
+    assert all(register.kept is Kept.UNKNOWN for register in ErmanERG220.registers.values())
 
 
 def test_0001h_is_read_and_never_written() -> None:
@@ -269,32 +269,34 @@ def test_coils_are_read_one_byte_at_a_time_and_only_when_they_are_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The order of two bytes would be doubtful (section 6, the example of function 01)."""
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
-    held = hall.bus.read_many(drive, coils)
-    assert held == dict.fromkeys((it.name for it in coils), Coil.OFF)
-    asked = [frame for request, frame in hall.frames if request.function == 1]
-    assert asked == [checksums.rtu(it).hex(" ").upper() for it in ("01 01 00 00 00 03", "01 01 00 09 00 01")]
+    held = line.bus.read_many(drive, coils)
+    assert held == dict.fromkeys((coil.name for coil in coils), Coil.OFF)
+    asked = [frame for request, frame in line.frames if request.function == 1]
+    assert asked == [
+        checksums.rtu(name).hex(" ").upper() for name in ("01 01 00 00 00 03", "01 01 00 09 00 01")
+    ]
     drive.set_frequency(20)
     drive.start()
-    assert hall.bus.read(drive, drive.start_held) is Coil.ON
+    assert line.bus.read(drive, drive.start_held) is Coil.ON
     drive.stop()
-    assert hall.bus.read(drive, drive.start_held) is Coil.OFF
-    assert hall.bus.read(drive, drive.stop_held) is Coil.ON
+    assert line.bus.read(drive, drive.start_held) is Coil.OFF
+    assert line.bus.read(drive, drive.stop_held) is Coil.ON
     for register in coils:
         with pytest.raises(Refused, match="it is a reading"):
-            hall.bus.write(drive, register, Coil.ON)
+            line.bus.write(drive, register, Coil.ON)
 
 
 def test_diagnostics_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Function 08 by raw (section 8), its error reply as printed and as it should be."""
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
-    assert hall.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
-    asked, read = (frame for _, frame in hall.frames)
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    assert line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
+    asked, read = (frame for _, frame in line.frames)
     assert asked == "01 08 00 00 A5 37 DA 8D"
     assert read.startswith("01 04")  # that was a copy, as an adapter's echo is
     for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
-        hall.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
+        line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
         with pytest.raises(DriveRefused, match="unknown command"):
-            hall.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")
+            line.bus.raw(drive, 0x08, 0x0000, b"\xa5\x37")

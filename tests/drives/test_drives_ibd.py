@@ -35,8 +35,8 @@ PROGRAMMED = {
     "output_virtual": Output.FAULT,
 }
 
-TURNS = {it: {"output_current": 1.2} for it in RUN.values()} | {
-    it: {"output_current": 0.0} for it in STOP.values()
+TURNS = {each: {"output_current": 1.2} for each in RUN.values()} | {
+    each: {"output_current": 0.0} for each in STOP.values()
 }
 
 TABLE = """
@@ -84,7 +84,7 @@ def test_the_line_and_its_limits() -> None:
 
 
 def test_the_words_have_no_toggle_and_no_reserved_bit() -> None:
-    assert {it.value for it in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
+    assert {each.value for each in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
 
 
 def test_terminals() -> None:
@@ -120,13 +120,13 @@ def test_a_direction_is_refused(direction: Direction) -> None:
 def test_a_direction_that_was_tried_on_site(forward_bit: int, forward: str, reverse: str) -> None:
     says = {**STANDING, "terminals": Terminals(0)}
     drive = InnovertIBD(1, forward_bit=forward_bit)
-    words = [frame(drive, drive.control, IBDControl(int(it, 16))) for it in (forward, reverse, "02")]
-    wire = Wire(drive, says, turns=TURNS | {it: {"output_current": 0.4} for it in words})
+    words = [frame(drive, drive.control, IBDControl(int(each, 16))) for each in (forward, reverse, "02")]
+    wire = Wire(drive, says, turns=TURNS | {word: {"output_current": 0.4} for word in words})
     wire.drive.set_frequency(50)
     for direction in (Direction.FORWARD, Direction.REVERSE, None):
         wire.drive.start(direction)
         wire.drive.stop()
-    assert [it for it in wire.sent[1:] if it != STOP[Framing.RTU]] == words
+    assert [each for each in wire.sent[1:] if each != STOP[Framing.RTU]] == words
 
 
 JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
@@ -154,14 +154,14 @@ def test_a_motor_that_turns_may_jog_and_is_stopped_before_a_start(turning: dict[
 
 
 def test_a_start_after_a_jog_is_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, InnovertIBD(1))
+    line, drive, sim = one(monkeypatch, InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
     with pytest.raises(Refused, match=r"stop\(\) first"):
         drive.start()
     drive.stop()
     drive.start()
-    sim.pass_time(hall.seconds + 60)
+    sim.pass_time(line.seconds + 60)
     assert sim.motor.frequency == 50
 
 
@@ -252,8 +252,8 @@ def test_state_from_the_outputs(raw: int, condition: Condition) -> None:
 
 
 def test_what_is_never_written() -> None:
-    never = {name for name, it in InnovertIBD.registers.items() if it.never}
-    inferred = {name for name, it in InnovertIBD.registers.items() if 200 <= it.address < 0x2000}
+    never = {name for name, each in InnovertIBD.registers.items() if each.never}
+    inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never
     assert never - inferred == {"frequency_source", "run_source", "stored_frequency"}
 

@@ -118,7 +118,7 @@ def test_factory_settings_and_what_may_be_changed_while_running(row: tuple[str, 
 
 
 def test_spans() -> None:
-    spans = {name: it.span for name, it in YD1000.registers.items() if it.span}
+    spans = {name: each.span for name, each in YD1000.registers.items() if each.span}
     assert spans["acceleration_time"] == spans["deceleration_time"] == (0.1, 3600)
     assert spans["maximum_frequency"] == (30, 320)
     assert spans["base_frequency"] == (25, 320)
@@ -129,7 +129,7 @@ def test_spans() -> None:
 
 
 def test_ram_and_eeprom() -> None:
-    ram = {name for name, it in YD1000.registers.items() if it.kept is Kept.RAM}
+    ram = {name for name, each in YD1000.registers.items() if each.kept is Kept.RAM}
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
@@ -157,8 +157,8 @@ def test_what_is_never_written() -> None:
 
 def test_what_a_change_of_the_line_needs() -> None:
     """Section 7: 0800H and 0801H after a reset or power-on, 0802H and 0803H at once."""
-    later = {it.address for it in YD1000.registers.values() if "after a reset" in it.note}
-    at_once = {it.address for it in YD1000.registers.values() if "at once" in it.note}
+    later = {register.address for register in YD1000.registers.values() if "after a reset" in register.note}
+    at_once = {register.address for register in YD1000.registers.values() if "at once" in register.note}
     assert (later, at_once) == ({0x0800, 0x0801}, {0x0802, 0x0803})
     assert YD1000.address_setting.span == (0, 63)
     assert YD1000.communication_timeout.span == (0, 100)
@@ -290,7 +290,11 @@ def test_where_fnod_has_the_setpoint_1001h_is_not_looked_at() -> None:
             Wire(YD1000(1, **{option: 1})).drive.set_frequency(20)
 
 
-AT_PRESET = {**STANDING, "reference_frequency": 0.0, **{f"preset_speed_{it}": 5.0 * it for it in range(1, 8)}}
+AT_PRESET = {
+    **STANDING,
+    "reference_frequency": 0.0,
+    **{f"preset_speed_{each}": 5.0 * each for each in range(1, 8)},
+}
 
 
 @pytest.mark.parametrize(
@@ -331,7 +335,7 @@ def test_jog_leaves_the_run_bit_off() -> None:
     wire = Wire(YD1000(1), STANDING, turns=dict.fromkeys(jogs, TURNS[FORWARD]))
     wire.drive.jog()
     wire.drive.jog(Direction.REVERSE)
-    assert [it[:17] for it in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
+    assert [each[:17] for each in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
 
 
 def test_stop_keeps_bit_15_until_the_motor_stands_twice() -> None:
@@ -380,7 +384,7 @@ def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
 def test_coast() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
-    assert [it[:17] for it in wire.sent] == ["01 06 10 00 C8 00"]
+    assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
 
 
 def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
@@ -451,13 +455,13 @@ def test_a_trip_shows_in_what_it_froze() -> None:
 
 def test_a_start_after_an_emergency_stop_is_told_of_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     """From a new object too, as the command line has it each time."""
-    hall, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
     drive.start()
-    hall.sleep(3)
+    line.sleep(3)
     drive.emergency_stop()
-    hall.bus.detach(drive)
-    drive = hall.attach(YD1000(1))
+    line.bus.detach(drive)
+    drive = line.attach(YD1000(1))
     with pytest.raises(Refused, match=r"has a fault, code 11H: see to it, then call reset_fault\(\)$"):
         drive.start()
     drive.reset_fault()
@@ -478,24 +482,24 @@ def test_a_start_after_an_emergency_stop_at_rest_names_reset_fault_too(
 
 
 def test_the_watchdog_is_set_over_the_line_while_the_motor_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    assert hall.bus.write(drive, drive.communication_timeout, 5) == 5
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert line.bus.write(drive, drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
     for wrong in (-1, 101, 0.5):
         with pytest.raises(Refused, match="communication_timeout"):
-            hall.bus.write(drive, drive.communication_timeout, wrong)
+            line.bus.write(drive, drive.communication_timeout, wrong)
     drive.set_frequency(30)
     drive.start()
     with pytest.raises(Refused, match="only while the motor stands"):
-        hall.bus.write(drive, drive.communication_timeout, 2)
+        line.bus.write(drive, drive.communication_timeout, 2)
 
 
 @pytest.mark.parametrize("speed", range(1, 8))
 def test_a_preset_speed_on_a_simulated_drive(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
+    line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5
     drive.start()
-    hall.sleep(60)
-    sim.pass_time(hall.seconds)
+    line.sleep(60)
+    sim.pass_time(line.seconds)
     assert sim.motor.frequency == 12.5
     drive.stop()

@@ -55,7 +55,7 @@ def yd() -> Drive:
 
 @dataclass(frozen=True)
 class Hazard:
-    """`do(hall, drive, sim)` is what a user does; `shows` is set on the simulated drive before."""
+    """`do(line, drive, sim)` is what a user does; `shows` is set on the simulated drive before."""
 
     place: str
     drive: Callable[[], Drive]
@@ -68,37 +68,37 @@ class Hazard:
     turning: bool = False  # it was given a setpoint, started, and has run for a second
 
 
-def start(hall: SimulatedBus, drive: Any, sim: Any) -> None:
+def start(line: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.start()
 
 
-def run(hall: SimulatedBus, drive: Any, sim: Any) -> None:
+def run(line: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.set_frequency(20)
     drive.start()
 
 
-def stop(hall: SimulatedBus, drive: Any, sim: Any) -> None:
+def stop(line: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.stop()
 
 
-def reset(hall: SimulatedBus, drive: Any, sim: Any) -> None:
+def reset(line: SimulatedBus, drive: Any, sim: Any) -> None:
     drive.reset_fault()
 
 
 def direct(direction: Direction) -> Callable[[SimulatedBus, Any, Any], None]:
-    return lambda hall, drive, sim: drive.start(direction)
+    return lambda line, drive, sim: drive.start(direction)
 
 
 def frequency(hz: float) -> Callable[[SimulatedBus, Any, Any], None]:
-    return lambda hall, drive, sim: drive.set_frequency(hz)
+    return lambda line, drive, sim: drive.set_frequency(hz)
 
 
 def write(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
-    return lambda hall, drive, sim: hall.bus.write(drive, drive.register(name), value)
+    return lambda line, drive, sim: line.bus.write(drive, drive.register(name), value)
 
 
 def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], object]:
-    return lambda hall, drive, sim: hall.bus.broadcast(drive.register(name), value)
+    return lambda line, drive, sim: line.bus.broadcast(drive.register(name), value)
 
 
 HAZARDS = [
@@ -145,7 +145,7 @@ HAZARDS = [
     Hazard(
         "0.1: stop is 5 and coast 6 on a CHE, and elsewhere the other way round",
         che,
-        lambda hall, drive, sim: drive.coast(),
+        lambda line, drive, sim: drive.coast(),
         naive="01 06 10 00 00 05",
         sends=("01 06 10 00 00 06",),
         turning=True,
@@ -203,7 +203,7 @@ HAZARDS = [
     Hazard(
         "E5: the order of bytes in a reply to 01 is doubtful, so that one byte at most is asked for",
         erman,
-        lambda hall, drive, sim: hall.bus.read_many(drive, [drive.start_held, drive.fault_reset_held]),
+        lambda line, drive, sim: line.bus.read_many(drive, [drive.start_held, drive.fault_reset_held]),
         naive="01 01 00 00 00 0C",
     ),
     Hazard(
@@ -256,7 +256,7 @@ HAZARDS = [
     Hazard(
         "I1: no ordinal is computed: P0.07 has no address here",
         che,
-        lambda hall, drive, sim: drive.register("acceleration_time"),
+        lambda line, drive, sim: drive.register("acceleration_time"),
         naive="01 06 80 0C 00 C8",
         refuses="no register",
         error=ValueError,
@@ -323,7 +323,7 @@ HAZARDS = [
     Hazard(
         "N8: 2000H and 2001H may only be written",
         ibd,
-        lambda hall, drive, sim: hall.bus.read(drive, drive.control),
+        lambda line, drive, sim: line.bus.read(drive, drive.control),
         naive="01 03 20 00 00 01",
         refuses="cannot be read",
         error=ValueError,
@@ -339,7 +339,7 @@ HAZARDS = [
     Hazard(
         "D4, D5: the only setpoint is in EEPROM: on change, and once a minute",
         delixi,
-        lambda hall, drive, sim: [drive.set_frequency(50), drive.set_frequency(50), drive.set_frequency(49)],
+        lambda line, drive, sim: [drive.set_frequency(50), drive.set_frequency(50), drive.set_frequency(49)],
         naive="01 06 00 02 13 24",
         sends=("01 06 00 02 13 88",),
         refuses="once in 60 s",
@@ -474,22 +474,22 @@ class Mine(InvtCHE):
     acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
 
-@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda it: it.place)
+@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
 def test_the_safe_thing_is_sent_or_nothing(monkeypatch: pytest.MonkeyPatch, hazard: Hazard) -> None:
-    hall, drive, sim = one(monkeypatch, hazard.drive())
+    line, drive, sim = one(monkeypatch, hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value
     if hazard.turning:
-        run(hall, drive, sim)
-        hall.sleep(1)
-        hall.frames.clear()
+        run(line, drive, sim)
+        line.sleep(1)
+        line.frames.clear()
     if hazard.refuses:
         with pytest.raises(hazard.error, match=hazard.refuses):
-            hazard.do(hall, drive, sim)
+            hazard.do(line, drive, sim)
     else:
-        hazard.do(hall, drive, sim)
-    assert tuple(map(body, hall.written)) == hazard.sends
-    assert hazard.naive not in [body(frame) for _, frame in hall.frames]
+        hazard.do(line, drive, sim)
+    assert tuple(map(body, line.written)) == hazard.sends
+    assert hazard.naive not in [body(frame) for _, frame in line.frames]
 
 
 def body(frame: str) -> str:
@@ -498,9 +498,9 @@ def body(frame: str) -> str:
 
 
 def test_y2_the_low_byte_of_the_checksum_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    run(hall, drive, sim)
-    assert hall.written[-1] == "01 06 10 00 C4 00 DF CA"
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    run(line, drive, sim)
+    assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
 
 
 # ---- errata of what is read ----
@@ -511,17 +511,17 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
 
 
 def test_e1_the_checksum_is_computed_and_not_copied(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
-    hall.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
-    assert [frame for _, frame in hall.frames] == ["01 04 00 01 00 05 61 C9"]
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+    assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
 def test_e2_a_reply_with_another_byte_count_is_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
-    hall.answers = lambda request: bytes.fromhex(printed)
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line.answers = lambda request: bytes.fromhex(printed)
     with pytest.raises(BadReply):
-        hall.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
+        line.bus.read_many(drive, [drive.output_frequency, drive.output_current, drive.dc_bus_voltage])
 
 
 @pytest.mark.parametrize("code", [2, 3, 4])
@@ -532,31 +532,33 @@ def test_e12_no_bad_address_is_a_device_failure(code: int) -> None:
 
 def test_e9_e10_the_state_is_one_number_in_either_word() -> None:
     assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
-    assert [ErmanERG220.status.decode(it) for it in range(4)] == list(ErmanStatus)[:4]
+    assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
 def test_e13_e16_no_diagnostics_and_nothing_beyond_the_tables() -> None:
-    assert {it.table.read for it in ErmanERG220.registers.values()} <= {1, 3, 4}
-    assert max(it.address for it in ErmanERG220.registers.values()) == 0x0402
-    assert all(it.address <= 0x58 for it in ErmanERG220.registers.values() if it.table.read == 3)
+    assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
+    assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
+    assert all(
+        register.address <= 0x58 for register in ErmanERG220.registers.values() if register.table.read == 3
+    )
 
 
 def test_i4_a_fault_frame_for_a_damaged_request_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
-    hall.answers = lambda request: damaged if len(hall.frames) == 1 else None
-    assert hall.bus.read(drive, drive.output_frequency) == 0
-    assert len(hall.frames) == 2
+    line.answers = lambda request: damaged if len(line.frames) == 1 else None
+    assert line.bus.read(drive, drive.output_frequency) == 0
+    assert len(line.frames) == 2
 
 
 def test_i2_e_identity_of_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
     """Function 04 does not exist on them; its exception is an identity that is refused."""
-    hall, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(monkeypatch, ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
-    hall.answers = lambda request: refusal if request.function == 4 else None
+    line.answers = lambda request: refusal if request.function == 4 else None
     with pytest.raises(Refused, match="not an ER-G-220"):
         drive.set_frequency(20)
-    assert hall.written == []
+    assert line.written == []
 
 
 def test_e7_a_byte_count_of_coils_is_rounded_up() -> None:
@@ -566,7 +568,7 @@ def test_e7_a_byte_count_of_coils_is_rounded_up() -> None:
 
 
 def test_e8_the_state_s_reserved_registers_are_no_readings() -> None:
-    state = {it.address for it in ErmanERG220.registers.values() if it.table.read == 4}
+    state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
     assert not state & set(range(0x0007, 0x000C))
 
 
@@ -581,13 +583,13 @@ def test_i3_parity_and_stop_bits_are_the_user_s_to_say() -> None:
 
 
 def test_i6_the_example_without_a_meaning_cannot_be_said() -> None:
-    assert not [it for it in InvtCHE.registers.values() if it.address == 0x0008]
+    assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
 def test_n3_n6_at_most_four_registers_of_an_ibd(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _ = one(monkeypatch, InnovertIBD(1))
-    hall.bus.read_many(drive, [it for it in drive.registers.values() if it.readable])
-    assert max(request.count for request, _ in hall.frames) <= 4
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line.bus.read_many(drive, [register for register in drive.registers.values() if register.readable])
+    assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
@@ -624,11 +626,11 @@ def test_d8_04_is_ou_which_the_standard_section_lost() -> None:
 @pytest.mark.parametrize("code", [1, 2, 0x42])
 def test_d13_y15_any_exception_is_a_refusal(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     for make in (delixi, yd):
-        hall, drive, _ = one(monkeypatch, make())
+        line, drive, _ = one(monkeypatch, make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
-        hall.answers = lambda request, refusal=refusal: refusal
+        line.answers = lambda request, refusal=refusal: refusal
         with pytest.raises(DriveRefused) as told:
-            hall.bus.read(drive, drive.output_frequency)
+            line.bus.read(drive, drive.output_frequency)
         assert told.value.code == code
 
 
@@ -639,7 +641,7 @@ def test_d7_the_faults_10_to_14_in_both_spellings() -> None:
 
 
 def test_y5_y6_only_two_functions_and_no_address_0() -> None:
-    assert {(it.table.read, it.table.write) for it in YD1000.registers.values()} == {(3, 6)}
+    assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
     assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
@@ -653,13 +655,13 @@ def test_y3_y4_frames_have_the_lengths_that_their_fields_make() -> None:
 
 
 def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    run(hall, drive, sim)
-    hall.sleep(2)
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    run(line, drive, sim)
+    line.sleep(2)
     drive.state()
-    sim.pass_time(hall.seconds)
+    sim.pass_time(line.seconds)
     sim.trip(5)
-    assert hall.bus.read(drive, drive.status)  # still says that it runs
+    assert line.bus.read(drive, drive.status)  # still says that it runs
     assert drive.state().condition is Condition.FAULT
     drive.stop()
 
@@ -667,10 +669,10 @@ def test_y8_a_frozen_state_is_not_taken_for_running(monkeypatch: pytest.MonkeyPa
 def test_y12_what_the_watchdog_does_is_read_for_no_factory_setting_is_stated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hall, drive, sim = one(monkeypatch, YD1000(1))
-    assert "off" in hall.bus.watchdog(drive)
+    line, drive, sim = one(monkeypatch, YD1000(1))
+    assert "off" in line.bus.watchdog(drive)
     sim["communication_timeout"] = 7
-    assert "7 s" in hall.bus.watchdog(drive)
+    assert "7 s" in line.bus.watchdog(drive)
     assert "from the factory is not stated" in YD1000.watchdog
     assert drive.communication_timeout.default is None
 
@@ -686,13 +688,13 @@ def test_0_8_what_wears_an_eeprom_is_declared() -> None:
 
 def test_0_3_an_adapter_s_echo_is_no_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing but the request's copy ever comes: no write leaves, because no read is answered."""
-    hall = SimulatedBus(monkeypatch)
-    drives = [hall.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
+    line = SimulatedBus(monkeypatch)
+    drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
         for script in (drive.set_frequency.script(20), drive.start.script(), drive.reset_fault.script()):
             with pytest.raises(NoReply):
                 drive.perform(script)
-    assert hall.written == []
+    assert line.written == []
 
 
 # ---- none is left out ----
@@ -710,9 +712,11 @@ OF_PRINT_ALONE = {
 
 
 def test_every_erratum_has_its_row_or_a_reason_for_none() -> None:
-    told = [it.place for it in HAZARDS] + [name.upper() for name in globals() if name.startswith("test_")]
+    told = [hazard.place for hazard in HAZARDS] + [
+        name.upper() for name in globals() if name.startswith("test_")
+    ]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):
             erratum = f"{family}{number}"
-            shown = [it for it in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", it)]
+            shown = [record for record in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", record)]
             assert bool(shown) != (erratum in OF_PRINT_ALONE), erratum

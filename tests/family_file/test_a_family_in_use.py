@@ -162,14 +162,14 @@ def test_an_unconfirmed_file_broadcasts_nothing(tmp_path: Path, monkeypatch: pyt
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
     path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")
     fan = load_family(path)
-    hall = SimulatedBus(monkeypatch, simulated(fan(1)), simulated(fan(2)))
-    first, second = hall.attach(fan(1)), hall.attach(fan(2))
+    line = SimulatedBus(monkeypatch, simulated(fan(1)), simulated(fan(2)))
+    first, second = line.attach(fan(1)), line.attach(fan(2))
     with pytest.raises(Refused, match="declare confirmed = 1"):
-        hall.bus.broadcast(first.control, 0x047F)
+        line.bus.broadcast(first.control, 0x047F)
     for drive in (first, second):
-        hall.bus.check_identity(drive)
-    hall.bus.stop_all(seconds=1)
-    assert hall.written == []
+        line.bus.check_identity(drive)
+    line.bus.stop_all(seconds=1)
+    assert line.written == []
 
 
 def test_a_confirmed_one_is_written_to(pump: type[Drive]) -> None:

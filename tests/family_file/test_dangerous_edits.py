@@ -332,9 +332,9 @@ class Trial:
         sim.judge(name)
         self.name = name
         self.sim = sim
-        self.hall = SimulatedBus(monkeypatch, sim)
-        sim.motor.now = self.hall.seconds
-        self.drive = self.hall.attach(family(ADDRESS, name="pump", **_options(family)))
+        self.line = SimulatedBus(monkeypatch, sim)
+        sim.motor.now = self.line.seconds
+        self.drive = self.line.attach(family(ADDRESS, name="pump", **_options(family)))
 
     def call(self, verb: str, *arguments: Any) -> Exception | None:
         """Call a verb; return the reason where it says that it was not done."""
@@ -416,7 +416,7 @@ def starts_fail(begin: Begin, family: type[Drive]) -> Iterator[str]:
             yield f"a {verb} is sent more than once, or resets"
         trial = begin()
         trial.call("set_frequency", 20)
-        trial.hall.loses = lambda request, trial=trial: bool(trial.sim.started) and request.function in (5, 6)
+        trial.line.loses = lambda request, trial=trial: bool(trial.sim.started) and request.function in (5, 6)
         trial.call(verb)
         if len(trial.sim.started) > 1:
             yield f"a {verb} whose reply is lost is sent again"
@@ -434,8 +434,8 @@ def plain_writes_start(begin: Begin, family: type[Drive]) -> Iterator[str]:
     for register in family.registers.values():
         for raw in (1, 2, 3, 4, 0x0477, 0x047C, 0x047F, 0x053C, 0x847C, 7, 0x04BC, 0x04F6, 0x04FF):
             for send in (
-                lambda value, register=register: trial.hall.bus.write(trial.drive, register, value),
-                lambda value, register=register: trial.hall.bus.broadcast(register, value),
+                lambda value, register=register: trial.line.bus.write(trial.drive, register, value),
+                lambda value, register=register: trial.line.bus.broadcast(register, value),
             ):
                 try:
                     send(register.decode(raw))
@@ -470,7 +470,7 @@ def states_lie(begin: Begin, family: type[Drive]) -> Iterator[str]:
         if state.condition is Condition.STOPPED and trial.sim.motor.energised:
             yield "a motor that turns is said to stand"
         trial.sim.motor.stop()
-        trial.hall.sleep(0.1)
+        trial.line.sleep(0.1)
 
 
 DANGERS = (stops_fail, resets_start, starts_fail, plain_writes_start, setpoints_start, states_lie)

@@ -139,13 +139,13 @@ def test_a_dangerous_file_is_not_loaded(tmp_path: Path, old: str, new: str, said
 def test_looks_are_at_parts_of_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
     """A status word in parts, a swapped control word that is written by 10H, a frequency with an offset."""
     family = load_family(FAMILIES / "parts.toml")
-    hall, drive, sim = one(monkeypatch, family(1, confirmed=1))
+    line, drive, sim = one(monkeypatch, family(1, confirmed=1))
     sim.motor.acceleration_time = sim.motor.deceleration_time = 1.0
     drive.set_frequency(20)
     drive.start(Direction.REVERSE)
-    hall.sleep(3)
+    line.sleep(3)
     assert drive.state().condition is Condition.RUNNING
-    assert hall.bus.read(drive, drive.output_frequency) == 20
+    assert line.bus.read(drive, drive.output_frequency) == 20
     with pytest.raises(Refused, match="it runs"):
         drive.reset_fault()
     drive.stop()
@@ -155,7 +155,7 @@ def test_looks_are_at_parts_of_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
         drive.start()
     drive.reset_fault()
     assert drive.state().condition is Condition.STOPPED
-    assert [frame[9:11] + frame[20:26] for frame in hall.written] == [
+    assert [frame[9:11] + frame[20:26] for frame in line.written] == [
         *("21 07 D0", "20 07 00"),
         *("20 01 00", "20 09 00", "20 01 00"),
     ]
@@ -163,8 +163,8 @@ def test_looks_are_at_parts_of_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_frequency_that_says_nothing_is_no_standstill(monkeypatch: pytest.MonkeyPatch) -> None:
     family = load_family(FAMILIES / "parts.toml")
-    hall, drive, sim = one(monkeypatch, family(1, confirmed=1))
+    line, drive, sim = one(monkeypatch, family(1, confirmed=1))
     sim["output_frequency"] = None
     with pytest.raises(Unconfirmed):
         drive.stop(seconds=5)
-    assert len(hall.written) > 1  # it was repeated
+    assert len(line.written) > 1  # it was repeated

@@ -22,21 +22,21 @@ def made(name: str, **changes: Any) -> Drive:
 
 
 def on_a_bus(monkeypatch: pytest.MonkeyPatch, name: str, **changes: Any) -> tuple[SimulatedBus, Any, Any]:
-    hall, drive, sim = one(monkeypatch, made(name, **changes))
+    line, drive, sim = one(monkeypatch, made(name, **changes))
     assert isinstance(sim, SimulatedDeclared)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 2.0
-    return hall, drive, sim
+    return line, drive, sim
 
 
-def pass_time(hall: SimulatedBus, seconds: float) -> None:
-    hall.sleep(seconds)
-    for sim in hall.sims:
-        sim.pass_time(hall.seconds)
+def pass_time(line: SimulatedBus, seconds: float) -> None:
+    line.sleep(seconds)
+    for sim in line.sims:
+        sim.pass_time(line.seconds)
 
 
-def words(hall: SimulatedBus) -> list[str]:
+def words(line: SimulatedBus) -> list[str]:
     """Return what was written, as address and value in hex."""
-    return ["".join(frame.split()[2:4]) + " " + "".join(frame.split()[4:6]) for frame in hall.written]
+    return ["".join(frame.split()[2:4]) + " " + "".join(frame.split()[4:6]) for frame in line.written]
 
 
 # Words by the documents: of a start at 20 Hz, a stop, a coast and a reset.
@@ -70,18 +70,18 @@ SENT: dict[str, dict[str, list[str]]] = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_start_and_stop_send_the_documents_words(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     assert drive.state().condition is Condition.STOPPED
     drive.set_frequency(20)
     drive.start()
-    assert words(hall) == SENT[name]["start"]
-    pass_time(hall, 5)
+    assert words(line) == SENT[name]["start"]
+    pass_time(line, 5)
     assert drive.state().condition is Condition.RUNNING
     assert sim.motor.energised
     assert sim.motor.frequency == pytest.approx(20, abs=0.01)
-    hall.frames.clear()
+    line.frames.clear()
     drive.stop()
-    assert words(hall) == SENT[name]["stop"]
+    assert words(line) == SENT[name]["stop"]
     assert drive.state().condition is Condition.STOPPED
     assert sim.motor.frequency == 0
     assert sim.unknown_words == 0
@@ -90,108 +90,108 @@ def test_start_and_stop_send_the_documents_words(name: str, monkeypatch: pytest.
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("verb", ["coast", "emergency_stop"])
 def test_other_stops_send_the_documents_words(name: str, verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
-    hall.frames.clear()
+    pass_time(line, 5)
+    line.frames.clear()
     if verb not in SENT[name]:
         with pytest.raises(Unsupported):
             getattr(drive, verb)()
         return
     getattr(drive, verb)()
-    assert words(hall) == SENT[name][verb]
+    assert words(line) == SENT[name][verb]
     assert not sim.motor.energised
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_trip_is_seen_and_reset_before_the_next_start(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
+    pass_time(line, 5)
     sim.trip(1)
     assert drive.state().condition is Condition.FAULT
-    hall.frames.clear()
+    line.frames.clear()
     with pytest.raises(Refused, match="fault"):
         drive.start()
-    assert words(hall) == []
+    assert words(line) == []
     drive.reset_fault()
-    assert words(hall) == SENT[name]["reset_fault"]
+    assert words(line) == SENT[name]["reset_fault"]
     assert not sim.motor.energised
-    pass_time(hall, 15)  # the shaft runs out
+    pass_time(line, 15)  # the shaft runs out
     assert drive.state().condition is Condition.STOPPED
     drive.start()
-    pass_time(hall, 5)
+    pass_time(line, 5)
     assert sim.motor.frequency == pytest.approx(20, abs=0.01)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_reset_is_refused_while_it_runs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
-    hall.frames.clear()
+    pass_time(line, 5)
+    line.frames.clear()
     with pytest.raises(Refused, match=r"runs|turns"):
         drive.reset_fault()
-    assert words(hall) == []
+    assert words(line) == []
     assert sim.motor.energised
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_start_without_a_setpoint_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     with pytest.raises(Refused, match="set_frequency before start"):
         drive.start()
-    assert words(hall) == []
+    assert words(line) == []
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("hz", [-1.0, 50.5, 1e9, float("nan"), float("inf")])
 def test_a_setpoint_outside_is_refused(name: str, hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     with pytest.raises(Refused):
         drive.set_frequency(hz)
-    assert words(hall) == []
+    assert words(line) == []
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_unconfirmed_drive_is_moved_by_nothing_and_stopped(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name, confirmed=0)
+    line, drive, sim = on_a_bus(monkeypatch, name, confirmed=0)
     moves = [lambda: drive.set_frequency(20), drive.start, drive.reset_fault]
     for move in moves:
         with pytest.raises(Refused, match="confirmed = 1"):
             move()
-    assert words(hall) == []
+    assert words(line) == []
     sim.motor.target = 20
     sim.motor.run(1)
     drive.stop()
-    assert words(hall)[-1:] == SENT[name]["stop"]
+    assert words(line)[-1:] == SENT[name]["stop"]
     assert not sim.motor.energised
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_start_whose_reply_is_lost_is_sent_once(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     last = SENT[name]["start"][-1]
-    hall.loses = lambda request: words(hall)[-1:] == [last] and request.function in (5, 6)
-    hall.frames.clear()
+    line.loses = lambda request: words(line)[-1:] == [last] and request.function in (5, 6)
+    line.frames.clear()
     with pytest.raises(Unconfirmed):
         drive.start()
-    assert words(hall).count(last) == 1
+    assert words(line).count(last) == 1
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_stop_whose_reply_is_lost_thrice_is_sent_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
-    hall.frames.clear()
+    pass_time(line, 5)
+    line.frames.clear()
     lost: list[object] = []
 
     def loses(request: Any) -> bool:
@@ -200,22 +200,22 @@ def test_a_stop_whose_reply_is_lost_thrice_is_sent_again(name: str, monkeypatch:
             return True
         return False
 
-    hall.loses = loses
+    line.loses = loses
     drive.stop()
-    assert words(hall) == SENT[name]["stop"] * 4
+    assert words(line) == SENT[name]["stop"] * 4
     assert not sim.motor.energised
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_trip_while_it_starts_is_told(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     last = SENT[name]["start"][-1]
     answer = sim.answer
 
     def trips(request: Any, now: float) -> Any:
         reply = answer(request, now)
-        if request.function in (5, 6) and words(hall)[-1:] == [last]:
+        if request.function in (5, 6) and words(line)[-1:] == [last]:
             sim.trip(1)
         return reply
 
@@ -229,13 +229,13 @@ def test_a_trip_while_it_starts_is_told(name: str, monkeypatch: pytest.MonkeyPat
 def test_after_a_power_cycle_nothing_turns_and_a_start_asks_for_the_setpoint(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
+    pass_time(line, 5)
     fresh = SimulatedDeclared(drive)
-    fresh.motor.now = hall.seconds
-    hall.sims = (fresh,)
+    fresh.motor.now = line.seconds
+    line.sims = (fresh,)
     assert drive.state().condition is Condition.STOPPED
     assert not fresh.motor.energised
     setpoint = drive.register(drive.setpoint_name)
@@ -246,117 +246,117 @@ def test_after_a_power_cycle_nothing_turns_and_a_start_asks_for_the_setpoint(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_another_make_at_its_address_is_not_started(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, name)
+    line, drive, sim = on_a_bus(monkeypatch, name)
     identity = type(drive).declared_verbs.identity
     for criterion in identity.criteria:
         sim[criterion.register] = 0
     with pytest.raises(Refused, match="it is no "):
         drive.set_frequency(20)
-    assert words(hall) == []
+    assert words(line) == []
     drive.stop()  # a file's `identify` keeps no stop back
-    assert words(hall) == SENT[name]["stop"]
+    assert words(line) == SENT[name]["stop"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_start_words_are_not_plainly_written(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     last = SENT[name]["start"][-1]
     control = next(register for register in drive.registers.values() if register.harmless)
     raw = 1 if name == "coil" else int(last.split()[1], 16)
     with pytest.raises(Refused, match="verbs alone"):
-        hall.bus.write(drive, control, control.decode(raw))
-    assert words(hall) == []
+        line.bus.write(drive, control, control.decode(raw))
+    assert words(line) == []
 
 
 @pytest.mark.parametrize("name", ["abb", "coil"])
 def test_a_direction_without_words_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, name)
+    line, drive, _sim = on_a_bus(monkeypatch, name)
     drive.set_frequency(20)
-    hall.frames.clear()
+    line.frames.clear()
     with pytest.raises(Refused, match="no words for directions"):
         drive.start(Direction.REVERSE)
-    assert words(hall) == []
+    assert words(line) == []
 
 
 def test_directions_have_their_words(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "fc")
+    line, drive, sim = on_a_bus(monkeypatch, "fc")
     drive.set_frequency(20)
-    hall.frames.clear()
+    line.frames.clear()
     drive.start(Direction.REVERSE)
-    assert words(hall) == ["C34F 847C"]
-    pass_time(hall, 5)
+    assert words(line) == ["C34F 847C"]
+    pass_time(line, 5)
     assert sim.motor.frequency == pytest.approx(-20, abs=0.01)
     with pytest.raises(Refused, match="which way it turns"):
         drive.start()
-    assert words(hall) == ["C34F 847C"]
+    assert words(line) == ["C34F 847C"]
 
 
 def test_without_a_direction_it_goes_on_as_it_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, _sim = on_a_bus(monkeypatch, "enum")
+    line, drive, _sim = on_a_bus(monkeypatch, "enum")
     drive.set_frequency(20)
     drive.start(Direction.REVERSE)
-    pass_time(hall, 5)
+    pass_time(line, 5)
     assert drive.state().direction is Direction.REVERSE
-    hall.frames.clear()
+    line.frames.clear()
     drive.start()
-    assert words(hall) == ["2000 0002"]
+    assert words(line) == ["2000 0002"]
     drive.stop()
     drive.start()
-    assert words(hall)[-1] == "2000 0001"
+    assert words(line)[-1] == "2000 0001"
 
 
 def test_a_jog_names_its_direction_and_ends_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "enum")
+    line, drive, sim = on_a_bus(monkeypatch, "enum")
     drive.set_frequency(20)
     with pytest.raises(Refused, match="name it"):
         drive.jog()
     drive.jog(Direction.FORWARD)
-    pass_time(hall, 2)
+    pass_time(line, 2)
     assert sim.motor.frequency == pytest.approx(5, abs=0.01)
-    hall.frames.clear()
+    line.frames.clear()
     with pytest.raises(Refused, match="may still jog"):
         drive.start()
     with pytest.raises(Refused, match="call stop"):
         drive.jog(Direction.FORWARD)
-    assert words(hall) == []
+    assert words(line) == []
     drive.stop()
     drive.start()
-    assert words(hall)[-1] == "2000 0001"
+    assert words(line)[-1] == "2000 0001"
 
 
 def test_an_else_of_a_stop_is_sent_when_the_motor_turns_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "enum")
+    line, drive, sim = on_a_bus(monkeypatch, "enum")
     sim.motor.target = 20
     sim.motor.run(1)
-    pass_time(hall, 5)
+    pass_time(line, 5)
     sim.motor.stop = lambda: None  # deaf to 5, and not to 8
-    hall.loses = lambda request: False
+    line.loses = lambda request: False
     answer = sim.answer
 
     def obeys_the_second(request: Any, now: float) -> Any:
-        if words(hall)[-1:] == ["2000 0008"] and request.function == 6:
+        if words(line)[-1:] == ["2000 0008"] and request.function == 6:
             sim.motor.coast()
         return answer(request, now)
 
     sim.answer = obeys_the_second
     drive.stop()
-    assert words(hall) == ["2000 0005", "2000 0008"]
+    assert words(line) == ["2000 0005", "2000 0008"]
     assert not sim.motor.energised
 
 
 def test_a_start_that_stalls_half_way_takes_its_word_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "abb")
+    line, drive, sim = on_a_bus(monkeypatch, "abb")
     drive.set_frequency(20)
     sim["status"] = drive.status.decode(0x0231)  # ready, never ready to run
-    hall.frames.clear()
+    line.frames.clear()
     with pytest.raises(Unconfirmed, match="ready_run"):
         drive.start()
-    assert words(hall) == ["0000 0476", "0000 0477", "0000 0476"]
+    assert words(line) == ["0000 0476", "0000 0477", "0000 0476"]
     assert not sim.motor.energised
 
 
 def test_a_stop_that_is_refused_in_a_fault_has_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "enum")
+    line, drive, sim = on_a_bus(monkeypatch, "enum")
     sim.trip(4)
     answer = sim.answer
 
@@ -370,32 +370,32 @@ def test_a_stop_that_is_refused_in_a_fault_has_stopped(monkeypatch: pytest.Monke
     sim.motor.fault = 0
     sim.motor.target = 20
     sim.motor.run(1)
-    pass_time(hall, 3)
+    pass_time(line, 3)
     with pytest.raises((DriveRefused, Unconfirmed)):
         drive.stop(seconds=2)
 
 
 def test_a_fault_that_stands_after_a_reset_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "enum")
+    line, drive, sim = on_a_bus(monkeypatch, "enum")
     sim.trip(4)
     sim.motor.reset = lambda: None
     with pytest.raises(NotDone, match="oc1"):
         drive.reset_fault()
-    assert words(hall) == ["2000 0007"]
+    assert words(line) == ["2000 0007"]
 
 
 def test_a_setpoint_in_percent_needs_its_hundred(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = class_of(document_of("abb"))(ADDRESS, name="pump", confirmed=1)
-    hall, drive, _sim = one(monkeypatch, drive)
+    line, drive, _sim = one(monkeypatch, drive)
     with pytest.raises(Refused, match="declare reference_maximum = HZ"):
         drive.set_frequency(20)
-    assert words(hall) == []
+    assert words(line) == []
 
 
 def test_all_are_stopped_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    hall, drive, sim = on_a_bus(monkeypatch, "fc")
+    line, drive, sim = on_a_bus(monkeypatch, "fc")
     drive.set_frequency(20)
     drive.start()
-    pass_time(hall, 5)
-    assert [str(stopped.seen) for stopped in hall.bus.stop_all().values()] != []
+    pass_time(line, 5)
+    assert [str(stopped.seen) for stopped in line.bus.stop_all().values()] != []
     assert not sim.motor.energised

@@ -5,7 +5,7 @@
 #ifndef FUZZ_H
 #define FUZZ_H
 
-#include "internal.h"
+#include "line.h"
 
 #include <stdint.h>
 #include <stdio.h>

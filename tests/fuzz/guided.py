@@ -45,7 +45,7 @@ MODULES = (
 
 def instrument(module: types.ModuleType) -> None:
     """Let the fuzzer see which lines of this module's functions are run."""
-    owners = [module, *(it for it in vars(module).values() if isinstance(it, type))]
+    owners = [module, *(each for each in vars(module).values() if isinstance(each, type))]
     for owner in owners:
         for function in list(vars(owner).values()):
             if isinstance(function, types.FunctionType) and function.__module__ == module.__name__:

@@ -11,7 +11,7 @@ SYSTEM = ("engine", "port", "waiter", "wakeup", "row_queue")  # parts of the cor
 
 def command(name: str, program: Path, companion: str, *compiler: str) -> list[str]:
     """Return the command that compiles harness, companion (mutator.c, replay.c) and the pure core."""
-    core = [str(it) for it in sorted((ROOT / "csrc").glob("*.c")) if not it.stem.startswith(SYSTEM)]
+    core = [str(path) for path in sorted((ROOT / "csrc").glob("*.c")) if not path.stem.startswith(SYSTEM)]
     sources = [str(HERE / f"fuzz_{name}.c"), str(HERE / companion), *core]
     options = ["-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}"]
     return [*compiler, *options, *sources, "-lm", "-o", str(program)]

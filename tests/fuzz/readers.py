@@ -154,17 +154,19 @@ def _pair(capture: Capture) -> None:
     splitters: list[Splitter] = []
     junk = exchanges = 0
     for _ in capture:
-        for at, heard in enumerate(capture.streams):
+        for at, stream in enumerate(capture.streams):
             if at == len(pairings):
                 pairings.append(Pairing())
                 splitters.append(Splitter())
-            told = list(pairings[at].pair(splitters[at].spans(heard)))
-            junk += sum(len(it.raw) for it in told if isinstance(it, Junk))
-            exchanges += sum(1 for it in told if not isinstance(it, Junk) and it.request and it.reply)
+            told = list(pairings[at].pair(splitters[at].spans(stream)))
+            junk += sum(len(record.raw) for record in told if isinstance(record, Junk))
+            exchanges += sum(
+                1 for record in told if not isinstance(record, Junk) and record.request and record.reply
+            )
     for pairing in pairings:
-        junk += sum(len(it.raw) for it in pairing.flush() if isinstance(it, Junk))
-    assert junk == sum(it.counts()["unknown_bytes"] for it in pairings)
-    assert exchanges == sum(it.counts()["exchanges"] for it in pairings)
+        junk += sum(len(each.raw) for each in pairing.flush() if isinstance(each, Junk))
+    assert junk == sum(each.counts()["unknown_bytes"] for each in pairings)
+    assert exchanges == sum(each.counts()["exchanges"] for each in pairings)
 
 
 def _comparable(batches: Iterable[Rows]) -> list[Row]:

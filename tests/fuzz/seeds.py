@@ -23,73 +23,76 @@ from multidrop.capture import CaptureWriter, Side
 from multidrop.core import Framing, Message
 from multidrop.recording import open_writer
 
-EXCHANGES = [it for it in PRINTED if it.request is not None]
-RTU = [it for it in EXCHANGES if it.framing is Framing.RTU]
+EXCHANGES = [each for each in PRINTED if each.request is not None]
+RTU = [exchange for exchange in EXCHANGES if exchange.framing is Framing.RTU]
 TCP = 15  # as fuzz.h has a framing in a byte
 WAKE, TAKE, NOISE = 2, 3, 4  # steps of fuzz_line.c
 TIME = 1_700_000_000
 
 
-def asked(it: Printed) -> bytes:
+def asked(printed: Printed) -> bytes:
     """The request as a harness has it."""
-    message = it.request or it.says
+    message = printed.request or printed.says
     assert isinstance(message, Message)
     data = (message.data + bytes(2))[:2]
     return struct.pack(
-        ">BBBHH2s", it.framing, message.address, message.function, message.start, message.count, data
+        ">BBBHH2s", printed.framing, message.address, message.function, message.start, message.count, data
     )
 
 
-def over_tcp(it: Printed, transaction: int) -> Iterator[bytes]:
+def over_tcp(printed: Printed, transaction: int) -> Iterator[bytes]:
     """The request as a harness has it, and both frames."""
-    yield bytes([TCP]) + asked(it)[1:]
-    for frame in (it.request_frame, it.frame):
+    yield bytes([TCP]) + asked(printed)[1:]
+    for frame in (printed.request_frame, printed.frame):
         yield struct.pack(">HHH", transaction, 0, len(frame) - 2) + frame[:-2]
 
 
 def frame() -> Iterator[bytes]:
-    for it in EXCHANGES:
-        yield asked(it) * 2 + it.frame
-        yield asked(it) * 2 + it.request_frame
-    for it in RTU:
-        request, sent, answered = over_tcp(it, 7)
+    for exchange in EXCHANGES:
+        yield asked(exchange) * 2 + exchange.frame
+        yield asked(exchange) * 2 + exchange.request_frame
+    for each in RTU:
+        request, sent, answered = over_tcp(each, 7)
         yield request * 2 + answered
         yield request * 2 + sent
 
 
 def tcp() -> Iterator[bytes]:
     for header in (bytes([0, 20]), bytes([1, 20])):
-        for it in RTU:
-            request, _, answered = over_tcp(it, 1)
+        for each in RTU:
+            request, _, answered = over_tcp(each, 1)
             yield header + b"\0" + request + bytes([3, len(answered)]) + answered
             yield header + b"\0" + request + bytes([2, 2, 0]) + request + bytes([3, len(answered)]) + answered
 
 
 def line() -> Iterator[bytes]:
     header = bytes([0, 20, 20, 0])
-    for it in EXCHANGES:
-        begun = bytes([0, 4, 40]) + asked(it) + bytes([WAKE, TAKE, 255])
-        yield header + begun + bytes([WAKE, NOISE, len(it.frame)]) + it.frame
-        yield header + begun + bytes([WAKE, WAKE, NOISE, len(it.frame)]) + it.frame + begun
+    for exchange in EXCHANGES:
+        begun = bytes([0, 4, 40]) + asked(exchange) + bytes([WAKE, TAKE, 255])
+        yield header + begun + bytes([WAKE, NOISE, len(exchange.frame)]) + exchange.frame
+        yield header + begun + bytes([WAKE, WAKE, NOISE, len(exchange.frame)]) + exchange.frame + begun
 
 
 def split() -> Iterator[bytes]:
     pieces = [
-        bytes([0, len(it.request_frame)]) + it.request_frame + bytes([8, len(it.frame)]) + it.frame
-        for it in EXCHANGES
+        bytes([0, len(exchange.request_frame)])
+        + exchange.request_frame
+        + bytes([8, len(exchange.frame)])
+        + exchange.frame
+        for exchange in EXCHANGES
     ]
     yield from pieces
     yield b"".join(pieces)[:2000]
 
 
-def rtac(it: Printed) -> Iterator[bytes]:
+def rtac(printed: Printed) -> Iterator[bytes]:
     """Packets with the header of RTAC serial (link type 250)."""
-    for event, raw in ((1, it.request_frame), (2, it.frame)):
+    for event, raw in ((1, printed.request_frame), (2, printed.frame)):
         yield struct.pack(">IIBBH", TIME, 5000 * event, event, 0, 0) + raw
 
 
 def pcap(packets: list[bytes]) -> bytes:
-    return b"".join(struct.pack("<4I", TIME, 0, len(it), len(it)) + it for it in packets)
+    return b"".join(struct.pack("<4I", TIME, 0, len(packet), len(packet)) + packet for packet in packets)
 
 
 def ours() -> tuple[bytes, int]:
@@ -97,10 +100,10 @@ def ours() -> tuple[bytes, int]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.pcapng"
         with CaptureWriter(path) as capture:
-            for number, it in enumerate(EXCHANGES):
-                capture.write(it.request_frame, Side.ASKING, TIME * 10**9 + number, "hall-1")
+            for number, each in enumerate(EXCHANGES):
+                capture.write(each.request_frame, Side.ASKING, TIME * 10**9 + number, "hall-1")
                 begin = 0 if number else path.stat().st_size
-                capture.write(it.frame, Side.ANSWERING, TIME * 10**9 + number, "hall-1")
+                capture.write(each.frame, Side.ANSWERING, TIME * 10**9 + number, "hall-1")
                 if number == 0:
                     first = begin
         whole = path.read_bytes()
@@ -108,9 +111,9 @@ def ours() -> tuple[bytes, int]:
 
 
 def capture() -> Iterator[bytes]:
-    packets = [packet for it in EXCHANGES for packet in rtac(it)]
+    packets = [packet for exchange in EXCHANGES for packet in rtac(exchange)]
     yield bytes([0b0000, 9]) + pcap(packets)
-    yield bytes([0b1000, 0]) + pcap([it.request_frame + it.frame for it in EXCHANGES])
+    yield bytes([0b1000, 0]) + pcap([exchange.request_frame + exchange.frame for exchange in EXCHANGES])
     whole, first = ours()
     yield bytes([0b10101, 1]) + whole[first:][:4000]
 
@@ -155,7 +158,7 @@ def recorded(suffix: str) -> Iterator[bytes]:
 def captures() -> Iterator[bytes]:
     yield ours()[0][:1500]
     magic = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 250)
-    yield magic + pcap([packet for it in EXCHANGES[:6] for packet in rtac(it)])
+    yield magic + pcap([packet for exchange in EXCHANGES[:6] for packet in rtac(exchange)])
 
 
 def requests() -> Iterator[bytes]:

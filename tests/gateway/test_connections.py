@@ -17,7 +17,7 @@ from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE
 
-from multidrop.gateway import web
+from multidrop.gateway import request_fields
 from multidrop.gateway.connections import AGAIN_S, FIRST_S, MOST_OPEN, Connections
 from multidrop.gateway.listener import BACKLOG
 from multidrop.gateway.rights import digest
@@ -73,7 +73,7 @@ def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way
 
 
 def test_a_slow_body_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web, "BODY_S", 0.1)
+    monkeypatch.setattr(request_fields, "BODY_S", 0.1)
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
         socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE) as client,

@@ -160,7 +160,7 @@ def test_what_was_asked_for_before_a_stop_is_not_sent_after_it(tmp_path: Path) -
             target=lambda: told.append(gateway.post("/api/act", body, **writer).json["text"])
         )
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.gateway.commands.threading", SimpleNamespace(Thread=Late))
+            patch.setattr("multidrop.gateway.command_threads.threading", SimpleNamespace(Thread=Late))
             asked.start()
             until(lambda: len(begun) == 1)
         assert gateway.post("/api/stop").json["pump-1"]["done"] is True
@@ -179,7 +179,7 @@ def test_a_stop_is_sent_where_the_system_gives_no_thread(tmp_path: Path) -> None
     with served(tmp_path, MAY) as gateway:
         start(gateway, "pump-1")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.gateway.commands.threading", SimpleNamespace(Thread=NoThread))
+            patch.setattr("multidrop.gateway.command_threads.threading", SimpleNamespace(Thread=NoThread))
             writer = {"authorization": gateway.bearer(Right.WRITE)}
             body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
             told = gateway.post("/api/write", body, **writer).json

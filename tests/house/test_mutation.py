@@ -64,19 +64,21 @@ OF_PYTHON = {
 @pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
 def test_mistakes_that_are_made(path: str, source: str, made: set[str]) -> None:
     found = mutants(path, source)
-    assert {it.after for it in found} == made
-    assert len({it.text for it in found}) == len(found)
-    assert {it.function for it in found} == {"clamp" if path == "a.c" else "most"}
+    assert {each.after for each in found} == made
+    assert len({each.text for each in found}) == len(found)
+    assert {each.function for each in found} == {"clamp" if path == "a.c" else "most"}
 
 
 def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
-    (negated,) = (it.after for it in mutants("a.c", "    if (a\n        || b)\n") if "!(" in it.after)
+    (negated,) = (
+        mutant.after for mutant in mutants("a.c", "    if (a\n        || b)\n") if "!(" in mutant.after
+    )
     assert negated == "if (!(a || b))"
 
 
 def test_explained_mutants_can_be_made() -> None:
-    files = {it["file"] for it in EXPLAINED}
-    names = {it.name for path in files for it in mutants(path, (ROOT / path).read_text("utf-8"))}
+    files = {each["file"] for each in EXPLAINED}
+    names = {mutant.name for path in files for mutant in mutants(path, (ROOT / path).read_text("utf-8"))}
     for row in EXPLAINED:
         assert row["why"]
         assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Heard, Listener, Running, inside, mosquitto, nats, publish, without_fan
+from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, nats, publish, without_fan
 from gateways import served
 from lines import until
 from peers import require_module
@@ -54,12 +54,12 @@ def start(broker: Broker, tmp_path: Path) -> Iterator[Start]:
         one.close()
 
 
-def has(topic: str, payload: bytes | None = None) -> Callable[[Heard], bool]:
-    return lambda heard: heard.topic == topic and payload in (None, heard.payload)
+def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
+    return lambda received: received.topic == topic and payload in (None, received.payload)
 
 
-def json_of(heard: Heard) -> Any:
-    return json.loads(heard.payload)
+def json_of(received: Published) -> Any:
+    return json.loads(received.payload)
 
 
 def now_ms() -> int:
@@ -93,7 +93,7 @@ def test_a_value_that_is_not_fresh_is_null_and_a_silent_drive_is_offline(
     known.hub.states["pump-1"] = "silent"
     running.step()
     listener.wait_for(has("multidrop/pump-1/available", b"offline"))
-    said = [heard for heard in listener.all if heard.topic == "multidrop/pump-1"][-1]
+    said = [received for received in listener.all if received.topic == "multidrop/pump-1"][-1]
     assert json_of(said)["values"]["output_frequency"] is None
 
 
@@ -127,8 +127,8 @@ def test_a_broker_that_stands_still_holds_up_nothing(
     assert len(connection.outbox._waiting) <= 4
     broker.signal(signal.SIGCONT)
     listener.wait_for(
-        lambda heard: (
-            heard.topic == "multidrop/pump-1" and json_of(heard)["values"]["output_frequency"] == 499.0
+        lambda received: (
+            received.topic == "multidrop/pump-1" and json_of(received)["values"]["output_frequency"] == 499.0
         )
     )
     assert running._part.figures()["dropped_total"] > 0
@@ -295,7 +295,10 @@ def test_its_command_template_makes_a_fresh_write(broker: Broker, listener: List
 
 def test_a_name_is_an_id_that_no_other_name_has(listener: Listener, start: Start) -> None:
     start(home_assistant=True)
-    ids = {listener.wait_for(lambda heard: heard.topic.startswith("homeassistant/")).topic for _ in range(2)}
+    ids = {
+        listener.wait_for(lambda received: received.topic.startswith("homeassistant/")).topic
+        for _ in range(2)
+    }
     assert len(ids) == 2
     assert all(topic.isascii() for topic in ids)
 
@@ -362,6 +365,6 @@ def test_what_is_kept_of_a_drive_that_left_is_taken_back(
     later = Listener(broker)
     later.wait_for(has("multidrop/pump-1"))
     running.step()
-    told = later.wait_for(lambda heard: heard.topic in ("multidrop/pump-1", *topics))
+    told = later.wait_for(lambda received: received.topic in ("multidrop/pump-1", *topics))
     assert told.topic == "multidrop/pump-1"
     later.close()

@@ -41,10 +41,10 @@ def value_of(metric: Any) -> object:
 
 @given(st.integers(0, 2**63), st.lists(metrics, max_size=5), st.none() | st.integers(0, 255))
 def test_a_host_reads_what_was_said(time_ms: int, said: list[Metric], seq: int | None) -> None:
-    heard = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))
-    assert heard.timestamp == time_ms
-    assert (heard.seq if heard.HasField("seq") else None) == seq
-    for one, metric in zip(heard.metrics, said, strict=True):
+    received = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))
+    assert received.timestamp == time_ms
+    assert (received.seq if received.HasField("seq") else None) == seq
+    for one, metric in zip(received.metrics, said, strict=True):
         assert (one.name, one.timestamp, one.datatype) == (metric.name, metric.time_ms, metric.datatype)
         assert (one.alias if one.HasField("alias") else None) == metric.alias
         found = value_of(one)

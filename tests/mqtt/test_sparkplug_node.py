@@ -11,8 +11,8 @@ import pytest
 from brokers import (
     FAN,
     Broker,
-    Heard,
     Listener,
+    Published,
     Running,
     inside,
     mosquitto,
@@ -39,17 +39,17 @@ class Host:
 
     def wait_for(self, kind: str, device: str = "") -> Any:
         wanted = ROOT.format(kind) + (f"/{device}" if device else "")
-        return self._decoded(self._listener.wait_for(lambda heard: self._take(heard) == wanted))
+        return self._decoded(self._listener.wait_for(lambda received: self._take(received) == wanted))
 
-    def _decoded(self, heard: Heard) -> Any:
-        return self._messages.Payload.FromString(heard.payload)
+    def _decoded(self, received: Published) -> Any:
+        return self._messages.Payload.FromString(received.payload)
 
-    def _take(self, heard: Heard) -> str:
-        kind = heard.topic.split("/")[2]
+    def _take(self, received: Published) -> str:
+        kind = received.topic.split("/")[2]
         if kind.endswith("CMD"):
-            return heard.topic
+            return received.topic
         self.kinds.append(kind)
-        found = self._decoded(heard)
+        found = self._decoded(received)
         if kind == "NBIRTH":
             self.seq = 0
             assert found.seq == 0
@@ -59,7 +59,7 @@ class Host:
             assert found.seq == self.seq
         if kind == "DBIRTH":
             self.aliases |= {metric.alias: metric.name for metric in found.metrics}
-        return heard.topic
+        return received.topic
 
     def values(self, found: Any) -> dict[str, Any]:
         return {

@@ -93,7 +93,7 @@ def _read(source: str, start: int, end: int, mutated: str) -> tuple[str, str, st
     first = source.rfind("\n", 0, start) + 1
     last = source.find("\n", end)
     before, after = source[first:last], mutated[first : last + len(mutated) - len(source)]
-    names = [it[1] or it[2] for it in FUNCTION.finditer(source, 0, start)]
+    names = [match[1] or match[2] for match in FUNCTION.finditer(source, 0, start)]
     return names[-1] if names else "", " ".join(before.split()), " ".join(after.split())
 
 
@@ -128,7 +128,7 @@ def _blank(source: str, spans: list[tuple[int, int]]) -> str:
 def _c(source: str) -> tuple[str, list[Edit]]:
     """The source without what is not mutated, and the edits that take more than a look at one word."""
     outside = r'/\*.*?\*/|"(?:\\.|[^"])*"|^#[^\n]*'
-    bare = _blank(source, [it.span() for it in re.finditer(outside, source, re.DOTALL | re.MULTILINE)])
+    bare = _blank(source, [match.span() for match in re.finditer(outside, source, re.DOTALL | re.MULTILINE)])
     return bare, [*_c_conditions(bare), *_c_statements(bare)]
 
 
@@ -181,24 +181,26 @@ def _python(source: str) -> tuple[str, list[Edit]]:
         starts.append(starts[-1] + len(line) + 1)
 
     def span(node: ast.AST) -> tuple[int, int]:
-        at = [getattr(node, it) for it in ("lineno", "col_offset", "end_lineno", "end_col_offset")]
+        at = [getattr(node, name) for name in ("lineno", "col_offset", "end_lineno", "end_col_offset")]
         return starts[at[0] - 1] + at[1], starts[at[2] - 1] + at[3]
 
     tree = ast.parse(source)
-    constants = [it for it in ast.walk(tree) if isinstance(it, ast.Constant)]
-    outside = [span(it) for it in constants if isinstance(it.value, str)]
+    constants = [each for each in ast.walk(tree) if isinstance(each, ast.Constant)]
+    outside = [span(constant) for constant in constants if isinstance(constant.value, str)]
     for node in ast.walk(tree):
         notes = [getattr(node, "annotation", None), getattr(node, "returns", None)]
-        outside += [span(it) for it in notes if it is not None]
+        outside += [span(note) for note in notes if note is not None]
     bare = _blank(source, outside)
-    bare = _blank(bare, [it.span() for it in re.finditer(r"#.*", bare)])
+    bare = _blank(bare, [match.span() for match in re.finditer(r"#.*", bare)])
     edits: list[Edit] = []
     for node in ast.walk(tree):
         tests = [node.test] if isinstance(node, ast.If | ast.While | ast.IfExp) else getattr(node, "ifs", [])
         for start, end in map(span, tests):
             edits.append((start, end, f"(not ({source[start:end]}))"))
         if isinstance(node, ast.FunctionDef):
-            edits += [(*span(it), text) for it in _statements(node) for text in _instead(it)]
+            edits += [
+                (*span(statement), text) for statement in _statements(node) for text in _instead(statement)
+            ]
     return bare, edits
 
 

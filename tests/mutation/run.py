@@ -26,7 +26,8 @@ def explained() -> dict[Name, str]:
     """The reason why a mutant survives, by its name."""
     rows = tomllib.loads(EXPLAINED.read_text("utf-8"))["mutant"]
     return {
-        (it["file"], it["function"], it["line"], it["becomes"], it.get("nth", 1)): it["why"] for it in rows
+        (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)): row["why"]
+        for row in rows
     }
 
 
@@ -49,7 +50,7 @@ def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
             trees.put(stack.enter_context(scratch()))
         if end(source) not in {None, "same code"}:
             sys.exit(f"the tests of {path} fail without a mistake, too")
-        tried = stack.enter_context(ThreadPoolExecutor(jobs)).map(end, (it.text for it in found))
+        tried = stack.enter_context(ThreadPoolExecutor(jobs)).map(end, (each.text for each in found))
         yield from zip(found, tried, strict=True)
 
 

@@ -31,41 +31,43 @@ MODULE = [*FLAGS, "-O2", "-fPIC", "-DPy_LIMITED_API=0x030b0000"]
 # An editable installation would find its own modules before those of the copy, as workers of xdist do.
 PYTEST = """
 import sys
-sys.meta_path = [it for it in sys.meta_path if isinstance(it, type)]
+sys.meta_path = [finder for finder in sys.meta_path if isinstance(finder, type)]
 sys.path.insert(0, "src")
 import pytest
 sys.exit(pytest.main(sys.argv[1:]))
 """
 
-Trial = Callable[[Path], str | None]  # the end of a mutant in this tree; None: it survives
+Trial = Callable[[Path, str], str | None]  # the end of a mutant of this file in a tree; None: it survives
 
 
-def by_test_core(tree: Path) -> str | None:
+def by_test_core(tree: Path, path: str) -> str | None:
     """The C core's own test program, with its sanitizers."""
-    if _status(tree, CC, *SANITIZED, "-c", "csrc/frame.c", "-o", "checked/frame.o"):
+    if _status(tree, CC, *SANITIZED, "-c", path, "-o", f"checked/{Path(path).stem}.o"):
         return "no program"
     _must(tree, CC, *SANITIZED, *_objects(tree, "checked", "test_core"), "-lm", "-o", "test_core")
     return _end(_status(tree, "./test_core", "tests/data/frames.csv"))
 
 
-def by_compiler(tree: Path) -> str | None:
+def by_compiler(tree: Path, path: str) -> str | None:
     """Nothing to find: the optimiser makes the same code of it."""
-    _must(tree, CC, *MODULE, "-c", "csrc/frame.c", "-o", "module/frame.o")
-    same = (tree / "module" / "frame.o").read_bytes() == (tree / "module" / "original.o").read_bytes()
+    compiled = f"{Path(path).stem}.o"
+    _must(tree, CC, *MODULE, "-c", path, "-o", f"module/{compiled}")
+    same = (tree / "module" / compiled).read_bytes() == (tree / "original" / compiled).read_bytes()
     return "same code" if same else None
 
 
-def by_test_frame(tree: Path) -> str | None:
+def by_test_frame(tree: Path, path: str) -> str | None:
     """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
     return _pytest(tree, *(f"tests/core/test_{name}.py" for name in ("frame", "split", "learning", "line")))
 
 
-def by_test_schedule(tree: Path) -> str | None:
+def by_test_schedule(tree: Path, path: str) -> str | None:
     return _pytest(tree, "tests/planning/test_schedule.py")
 
 
 TRIALS: dict[str, tuple[Trial, ...]] = {
+    "csrc/body.c": (by_test_core, by_compiler, by_test_frame),
     "csrc/frame.c": (by_test_core, by_compiler, by_test_frame),
     "src/multidrop/planning/back_off.py": (by_test_schedule,),
     "src/multidrop/planning/schedule.py": (by_test_schedule,),
@@ -75,7 +77,7 @@ TRIALS: dict[str, tuple[Trial, ...]] = {
 def _core(tree: Path) -> list[str]:
     """The names of the core's files."""
     (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", (tree / "csrc" / "CMakeLists.txt").read_text())
-    return [Path(it).stem for it in sources.replace("${WAITER}", "epoll").split()]
+    return [Path(part).stem for part in sources.replace("${WAITER}", "epoll").split()]
 
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:
@@ -124,7 +126,7 @@ def scratch() -> Iterator[Path]:
             _must(tree, CC, *SANITIZED, "-c", source, "-o", f"checked/{name}.o")
         for name, source in {"_core": "module/_core.c", **sources}.items():
             _must(tree, CC, *MODULE, headers, "-c", source, "-o", f"module/{name}.o")
-        shutil.copy(tree / "module" / "frame.o", tree / "module" / "original.o")
+        shutil.copytree(tree / "module", tree / "original")
         yield tree
 
 
@@ -133,6 +135,6 @@ def attempt(tree: Path, path: str, text: str) -> str | None:
     original = (tree / path).read_text()
     (tree / path).write_text(text)
     try:
-        return next((end for trial in TRIALS[path] if (end := trial(tree))), None)
+        return next((end for trial in TRIALS[path] if (end := trial(tree, path))), None)
     finally:
         (tree / path).write_text(original)

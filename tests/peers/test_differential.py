@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from damage import BITS, Said, frames
 from differences import LIBMODBUS, PYMODBUS_ASCII, PYMODBUS_RTU, REPLIES, REQUESTS, compare, explain
-from judges import UNKNOWN_CODE, Heard, Libmodbus, Pymodbus, Verdict, expected
+from judges import UNKNOWN_CODE, Libmodbus, Pymodbus, Understood, Verdict, expected
 
 from multidrop.core import (
     FrameFault,
@@ -27,7 +27,7 @@ framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 # ---- what we say ----
 
 
-def heard(said: Said) -> tuple[int, Verdict]:
+def received(said: Said) -> tuple[int, Verdict]:
     used, message = parse_request(said.framing, said.frame)
     return used, FrameFault(used).name if message is None else trimmed(message)
 
@@ -65,9 +65,9 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
     differences = []
     answers = 0
     for said, theirs in zip(requests, libmodbus.hear(requests), strict=True):
-        used, message = heard(said)
+        used, message = received(said)
         ours = message if isinstance(message, str) else expected(used, message)
-        if isinstance(theirs, Heard) and isinstance(message, Message) and theirs.reply:
+        if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
             assert used == len(theirs.reply), said  # what it encodes, we take
             theirs = replace(theirs, reply=theirs.reply[1:-2])
@@ -78,7 +78,7 @@ def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -
 
 
 def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbus) -> None:
-    replies = [it for it in frames(2, RTU, NUMBER, replies=True) if it.request.function != 0x08]
+    replies = [frame for frame in frames(2, RTU, NUMBER, replies=True) if frame.request.function != 0x08]
     differences = []
     values = 0
     for said, (request, theirs) in zip(replies, libmodbus.ask(replies), strict=True):
@@ -87,7 +87,7 @@ def test_requests_and_replies_as_libmodbus_s_client_has_them(libmodbus: Libmodbu
         values += isinstance(theirs, Message)
     explain(differences, REPLIES, LIBMODBUS)
     assert values > NUMBER / 3
-    assert any(it.theirs == UNKNOWN_CODE for it in differences)
+    assert any(difference.theirs == UNKNOWN_CODE for difference in differences)
 
 
 # ---- pymodbus ----
@@ -103,7 +103,7 @@ def test_requests_as_pymodbus_s_server_understands_them(framing: Framing) -> Non
     differences = []
     for said in frames(3, framing, NUMBER, replies=False):
         assert pymodbus.build_request(said.request) == build_request(framing, said.request)
-        differences += compare(said, heard(said)[1], trim(pymodbus.hear(said)))
+        differences += compare(said, received(said)[1], trim(pymodbus.hear(said)))
     explain(differences, REQUESTS, name(framing))
 
 
@@ -119,7 +119,7 @@ def test_replies_as_pymodbus_s_client_understands_them(framing: Framing) -> None
 @framings
 def test_replies_that_pymodbus_encodes_are_ours_byte_by_byte(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
-    whole = [it for it in frames(5, framing, NUMBER, replies=True) if not it.damage]
+    whole = [frame for frame in frames(5, framing, NUMBER, replies=True) if not frame.damage]
     for said in whole:
         used, reply = parse_reply(framing, said.frame, said.request)
         assert reply is not None, said

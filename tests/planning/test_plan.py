@@ -46,7 +46,7 @@ def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
 
 
 def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
-    return [(it.start, it.count) for it in blocks(drive, [drive.register(name) for name in names])]
+    return [(block.start, block.count) for block in blocks(drive, [drive.register(name) for name in names])]
 
 
 def test_neighbours_are_read_together_up_to_the_limit() -> None:
@@ -108,7 +108,7 @@ def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
 def test_each_rate_has_blocks_of_its_own() -> None:
     drive = Example(1)
     found = planned(drive, [(Example.a, 0.1), (Example.b, None), (Example.c, 0.1)])
-    assert [(it.block.start, it.block.count, it.every) for it in found] == [(1, 4, 0.1), (2, 1, None)]
+    assert [(each.block.start, each.block.count, each.every) for each in found] == [(1, 4, 0.1), (2, 1, None)]
 
 
 # ---- against all other plans ----
@@ -126,12 +126,17 @@ def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float
     """By trying every way to cut the sorted registers of one table into requests."""
     table = registers[0].table
     limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
-    readable = {at for it in drive.registers.values() if it.table == table and it.readable for at in span(it)}
+    readable = {
+        at
+        for register in drive.registers.values()
+        if register.table == table and register.readable
+        for at in span(register)
+    }
     best = float("inf")
-    for cut in partitions(sorted(registers, key=lambda it: it.address)):
+    for cut in partitions(sorted(registers, key=lambda each: each.address)):
         total = 0.0
         for group in cut:
-            start, end = group[0].address, max(it.address + it.words for it in group)
+            start, end = group[0].address, max(each.address + each.words for each in group)
             legal = all(at in readable or at in gaps for at in range(start, end))
             if len(group) > 1 and (end - start > limit or not legal):
                 break
@@ -170,10 +175,12 @@ def test_no_other_plan_is_cheaper(pairs: dict[int, bool], baudrate: int, framing
     )
     drive = kind(1, baudrate=baudrate)
     found = blocks(drive, registers.values())
-    assert sorted(it.name for block in found for it in block.registers) == sorted(registers)
-    assert all(block.start <= it.address for block in found for it in block.registers)
+    assert sorted(register.name for block in found for register in block.registers) == sorted(registers)
+    assert all(block.start <= register.address for block in found for register in block.registers)
     assert all(
-        it.address + it.words <= block.start + block.count for block in found for it in block.registers
+        register.address + register.words <= block.start + block.count
+        for block in found
+        for register in block.registers
     )
     total = sum(duration(drive, block) for block in found)
     assert total == pytest.approx(cheapest_of_all(drive, list(registers.values())))
@@ -222,8 +229,12 @@ def test_a_plan_is_the_best_at_the_delays_that_it_suits_and_at_no_others(
 def test_a_plan_of_several_rates_suits_the_delays_that_suit_each() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
-    apart = [plan(drive, [(it, every) for it in registers], 0.02) for every, registers in rates.items()]
-    together = plan(drive, [(it, every) for every, registers in rates.items() for it in registers], 0.02)
+    apart = [
+        plan(drive, [(register, every) for register in registers], 0.02) for every, registers in rates.items()
+    ]
+    together = plan(
+        drive, [(register, every) for every, registers in rates.items() for register in registers], 0.02
+    )
     assert len({(one.least, one.most) for one in apart}) == 2
     assert together.least == max(one.least for one in apart)
     assert together.most == min(one.most for one in apart)
@@ -270,8 +281,8 @@ def test_no_other_plan_of_a_family_is_cheaper(data: st.DataObject) -> None:
         baudrate=data.draw(st.sampled_from(family.baudrates)),
     )
     found = blocks(drive, wanted)
-    assert {it.name for block in found for it in block.registers} == {it.name for it in wanted}
-    assert sum(duration(drive, it) for it in found) == pytest.approx(cheapest_of_all(drive, wanted))
+    assert {each.name for block in found for each in block.registers} == {each.name for each in wanted}
+    assert sum(duration(drive, each) for each in found) == pytest.approx(cheapest_of_all(drive, wanted))
     for block in found:
         bounds = FORBIDDEN.get(model, {}).get(block.table.name, ())
         forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
@@ -306,7 +317,7 @@ def companies(draw: st.DrawFn) -> list[Drive]:
 @given(companies())
 def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
     order = in_order(drives)
-    assert sorted(it.address for it in order) == [it.address for it in drives]
+    assert sorted(each.address for each in order) == [drive.address for drive in drives]
     least = min(silences([drives[0], *rest]) for rest in permutations(drives[1:]))
     assert silences(order) == pytest.approx(least, abs=1e-8)
 
@@ -320,8 +331,8 @@ def test_where_switching_takes_time_it_is_done_seldom() -> None:
         )
     ]
     order = in_order(drives, switching=0.05)
-    switches = [it.settings != order[at - 1].settings for at, it in enumerate(order)]
-    assert sum(switches) == len({it.settings for it in drives})
+    switches = [each.settings != order[at - 1].settings for at, each in enumerate(order)]
+    assert sum(switches) == len({drive.settings for drive in drives})
     assert silences(order, 0.05) < silences(drives, 0.05)
 
 

@@ -53,32 +53,32 @@ def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned
 
 def test_a_cycle_is_characters_delays_and_silences() -> None:
     drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
-    found = predict([it for drive in drives for it in asked(drive)])
+    found = predict([each for drive in drives for each in asked(drive)])
     assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
     assert found.utilisation == 1
-    assert [(it.requests, len(it.registers)) for it in found.rates] == [(2, 4), (2, 4)]
-    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 2)
+    assert [(rate.requests, len(rate.registers)) for rate in found.rates] == [(2, 4), (2, 4)]
+    assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 2)
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
 
 
 def test_a_shorter_silence_is_reckoned_with() -> None:
     usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
-    cycles = [predict(asked(it, None, "output_current")).cycle for it in (usual, short)]
+    cycles = [predict(asked(each, None, "output_current")).cycle for each in (usual, short)]
     assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
 
 
 def test_ten_ms_stand_on_both_sides_of_an_ibd() -> None:
     """Two of three gaps are the IBD's, whatever t3.5 is at the other drives' baud rate."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
-    exchanges = [asked(it, None, "output_current") for it in (che, other, ibd)]
-    found = predict([it for each in exchanges for it in each])
+    exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
+    found = predict([one for each in exchanges for one in each])
     own = 3 * (8 + 7) * 10 * BIT + 2 * che.response_delay + ibd.response_delay
     assert found.cycle == pytest.approx(own + 2 * (10e-3 + BIT) + SILENCE)
 
 
 def test_each_switch_of_settings_adds_its_time() -> None:
     drives = [ErmanERG220(1), YD1000(2), ErmanERG220(3)]
-    exchanges = [it for drive in drives for it in asked(drive, None, "output_frequency")]
+    exchanges = [each for drive in drives for each in asked(drive, None, "output_frequency")]
     free, dear = predict(exchanges), predict(exchanges, switching=0.01)
     assert dear.cycle - free.cycle == pytest.approx(2 * 0.01)
     assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
@@ -95,12 +95,12 @@ def test_a_network_port_has_nothing_to_switch() -> None:
 
 def test_a_suggestion_reckons_with_the_switching() -> None:
     drives = [ErmanERG220(1), YD1000(2)]
-    exchanges = [it for drive in drives for it in asked(drive, 0.06, "output_frequency")]
+    exchanges = [each for drive in drives for each in asked(drive, 0.06, "output_frequency")]
     periods = []
     for switching in (0.0, 0.05):
         found = suggest(exchanges, predict(exchanges, switching=switching), switching)
         periods.append(found.every[0][1])
-        changed = [it for drive in drives for it in asked(drive, periods[-1], "output_frequency")]
+        changed = [each for drive in drives for each in asked(drive, periods[-1], "output_frequency")]
         assert predict(changed, switching=switching).fits
     assert periods[1] > periods[0]
 
@@ -115,23 +115,23 @@ def test_slow_rates_leave_the_rest_of_the_line_to_the_others() -> None:
     timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
     found = predict([*asked(timed, 0.1), *asked(eager)])
     load = 2 * (OWN + SILENCE) / 0.1
-    assert [it.reached for it in found.rates] == pytest.approx([10, (1 - load) / (2 * (OWN + SILENCE))])
+    assert [rate.reached for rate in found.rates] == pytest.approx([10, (1 - load) / (2 * (OWN + SILENCE))])
     assert found.fits
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
 def test_what_is_asked_too_often_gets_what_the_line_gives() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
-    found = predict([it for drive in drives for it in asked(drive, 0.05)])
+    found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
     assert not found.fits
-    assert [it.reached for it in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
+    assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
 
 
 def test_a_drive_that_is_polled_in_turn_keeps_its_share_of_a_crowded_line() -> None:
     hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
     found = predict([*asked(hasty, 0.02), *asked(eager)])
-    assert [(it.drive.name, it.fits) for it in found.rates] == [("hasty", False), ("eager", True)]
+    assert [(rate.drive.name, rate.fits) for rate in found.rates] == [("hasty", False), ("eager", True)]
     assert found.rates[1].reached == pytest.approx(TURN_SHARE / (2 * (OWN + SILENCE)))
     assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
 
@@ -146,11 +146,11 @@ def test_a_host_is_late_in_each_exchange() -> None:
 
 def carried_out(exchanges: Sequence[Planned]) -> float:
     """Seconds of a bus cycle in which every drive answers after its document's delay."""
-    drives = in_order(dict.fromkeys(it.drive for it in exchanges))
-    order = [it for drive in drives for it in exchanges if it.drive is drive]
-    peers = {it: Peer(least_timeout=0.02, most_timeout=it.response_timeout) for it in drives}
-    made = [make_exchange(it.drive, it.block.request, peers[it.drive]) for it in order]
-    answers = [EncodedDrive(it.drive).answer(it.block.request, 0) for it in order]
+    drives = in_order(dict.fromkeys(exchange.drive for exchange in exchanges))
+    order = [exchange for drive in drives for exchange in exchanges if exchange.drive is drive]
+    peers = {each: Peer(least_timeout=0.02, most_timeout=each.response_timeout) for each in drives}
+    made = [make_exchange(each.drive, each.block.request, peers[each.drive]) for each in order]
+    answers = [EncodedDrive(each.drive).answer(each.block.request, 0) for each in order]
     line = LineDriver()
     begun = []
     for _ in range(3):
@@ -183,7 +183,7 @@ def test_the_core_s_line_takes_what_was_predicted(wanted: list[tuple[str, int, i
     for address, (model, framing, count) in enumerate(wanted, 1):
         family = MODELS[model]
         drive = family(address, framing=family.framings[framing % len(family.framings)])
-        exchanges += planned(drive, [(it, None) for it in drive.readings()[:count]])
+        exchanges += planned(drive, [(reading, None) for reading in drive.readings()[:count]])
     assert carried_out(exchanges) == pytest.approx(predict(exchanges).cycle, rel=1e-5)
 
 
@@ -199,9 +199,12 @@ def test_no_line_is_promised_more_than_its_time(wanted: list[tuple[str, float | 
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
         drive = MODELS[model](address)
-        exchanges += planned(drive, [(it, every) for it in drive.readings()[:4]])
+        exchanges += planned(drive, [(reading, every) for reading in drive.readings()[:4]])
     found = predict(exchanges)
-    alone = {rate: predict([it for it in exchanges if it.drive is rate.drive]).cycle for rate in found.rates}
+    alone = {
+        rate: predict([exchange for exchange in exchanges if exchange.drive is rate.drive]).cycle
+        for rate in found.rates
+    }
     assert sum(rate.reached * cycle for rate, cycle in alone.items()) <= 1.01
     for rate in found.rates:
         assert rate.every is None or rate.reached * rate.every <= 1.01
@@ -214,22 +217,22 @@ def with_suggestion(drives: list[Drive], found: Suggestions, every: float, which
     if which == "every":
         ((old, new),) = found.every
         assert old == every < new
-        return [it for drive in drives for it in asked(drive, new)]
+        return [each for drive in drives for each in asked(drive, new)]
     if which == "baudrate":
         assert found.baudrate is not None
         baudrate, these = found.baudrate
         assert list(these) == drives
-        faster = [type(it)(it.address, baudrate=baudrate) for it in drives]
-        return [it for drive in faster for it in asked(drive, every)]
+        faster = [type(each)(each.address, baudrate=baudrate) for each in drives]
+        return [each for drive in faster for each in asked(drive, every)]
     assert found.registers is not None
-    kept = [it.name for it in drives[0].readings()[: found.registers]]
-    return [it for drive in drives for it in asked(drive, every, *kept)]
+    kept = [reading.name for reading in drives[0].readings()[: found.registers]]
+    return [each for drive in drives for each in asked(drive, every, *kept)]
 
 
 @pytest.mark.parametrize("which", ["every", "baudrate", "registers"])
 def test_each_suggestion_makes_it_fit(which: str) -> None:
     drives: list[Drive] = [Simple(address, name=f"drive-{address}") for address in range(1, 5)]
-    exchanges = [it for drive in drives for it in asked(drive, 0.15)]
+    exchanges = [each for drive in drives for each in asked(drive, 0.15)]
     prediction = predict(exchanges)
     assert not prediction.fits
     found = suggest(exchanges, prediction)
@@ -257,7 +260,7 @@ def test_where_nothing_helps_that_is_said() -> None:
 
 
 def test_a_duration_is_told_as_a_plant_file_has_it() -> None:
-    assert [duration_text(it) for it in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
+    assert [duration_text(each) for each in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
 
 
 def test_framing_counts() -> None:

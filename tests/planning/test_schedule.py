@@ -24,25 +24,27 @@ def job(drive: int = 1, period_ms: int | None = None, duration_ms: int = 5, kind
 
 def schedule(*jobs: Job) -> Schedule[Job]:
     made: Schedule[Job] = Schedule()
-    for it in jobs:
-        made.add(it, 0)
+    for job in jobs:
+        made.add(job, 0)
     return made
 
 
 def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> list[tuple[Job, int]]:
     """From an idle line: the jobs, each with the ms before which it is not to be sent."""
     now = now_ms * MS
-    return [(it, not_before // MS) for it, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)]
+    return [
+        (each, not_before // MS) for each, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)
+    ]
 
 
 def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, int]]:
     """On a line that takes what it is given, one job at a time: each with its slot and when it was sent."""
     at, done = 0, []
     while at < seconds * 1000 * MS:
-        ((it, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
+        ((chosen, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
         sent = max(at, not_before)
-        done.append((it, due, sent))
-        at = sent + it.duration_ns
+        done.append((chosen, due, sent))
+        at = sent + chosen.duration_ns
     return done
 
 
@@ -76,19 +78,19 @@ def test_the_slot_that_ends_first_goes_first_and_the_others_fill_in_turn() -> No
     timed, late = job(1, 40), job(2, 60)
     first, second, third = job(3), job(4), job(5)
     made = schedule(first, late, second, timed, third)
-    planned = [it for it, _ in take(made, 0, 40)]
+    planned = [each for each, _ in take(made, 0, 40)]
     assert planned == [timed, late, first, second, third, first, second, third]
-    assert [it for it, _ in take(made, 40, 10)] == [timed, first]
+    assert [each for each, _ in take(made, 40, 10)] == [timed, first]
 
 
 def test_slow_jobs_that_are_due_together_do_not_block_a_fast_one() -> None:
     slow = [job(drive, 1000, duration_ms=20) for drive in range(2, 32)]
     made = schedule(*slow, fast := job(1, 50, duration_ms=10))
     done = carry_out(made, 10)
-    waited = [sent - due for it, due, sent in done if it is fast]
+    waited = [sent - due for each, due, sent in done if each is fast]
     assert len(waited) == pytest.approx(200, abs=1)
     assert max(waited) <= 20 * MS  # until the one that is on the line is over
-    assert [it.skipped for it in made.jobs] == [0] * 31
+    assert [each.skipped for each in made.jobs] == [0] * 31
 
 
 def test_of_a_line_that_is_asked_for_too_much_everybody_gets_a_part() -> None:
@@ -97,14 +99,16 @@ def test_of_a_line_that_is_asked_for_too_much_everybody_gets_a_part() -> None:
     turn = [job(drive, duration_ms=10) for drive in (6, 7)]
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
-    counts = {it: sum(1 for other, _, _ in done if other is it) for it in made.jobs}
-    assert [counts[it] for it in slow] == pytest.approx([100, 100], abs=1)  # those that are asked for little
-    assert max(counts[it] for it in fast) - min(counts[it] for it in fast) <= 2
-    assert sum(counts[it] for it in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
+    counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
+    assert [counts[each] for each in slow] == pytest.approx(
+        [100, 100], abs=1
+    )  # those that are asked for little
+    assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
+    assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
-    for it in (*fast, *slow):  # every slot was asked for, or is counted
-        slots = 100_000 * MS // (it.period_ns or 1)
-        assert counts[it] + it.skipped == pytest.approx(slots, abs=1)
+    for each in (*fast, *slow):  # every slot was asked for, or is counted
+        slots = 100_000 * MS // (each.period_ns or 1)
+        assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
 
 def test_jobs_in_turn_have_their_share_from_the_start_of_an_overload() -> None:
@@ -112,7 +116,7 @@ def test_jobs_in_turn_have_their_share_from_the_start_of_an_overload() -> None:
     take(made, 0, 10_000)  # it had the line for itself
     for drive in (2, 3):
         made.add(job(drive, 10, duration_ms=10), 10_000 * MS)
-    taken = [it for it, _ in take(made, 10_000, 3_000)]
+    taken = [each for each, _ in take(made, 10_000, 3_000)]
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
@@ -120,7 +124,7 @@ def test_a_share_that_nobody_wanted_is_not_saved_up() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
-    assert [it for it, _ in take(made, 10_000, 100)].count(turn) <= 1
+    assert [each for each, _ in take(made, 10_000, 100)].count(turn) <= 1
 
 
 def test_where_deadlines_allow_it_jobs_of_one_kind_go_together() -> None:
@@ -128,13 +132,13 @@ def test_where_deadlines_allow_it_jobs_of_one_kind_go_together() -> None:
     done = carry_out(schedule(*jobs), 20)
     switches = sum(one.kind != other.kind for (one, _, _), (other, _, _) in pairwise(done))
     assert switches < len(done) / 5  # about two in each round of twenty
-    assert [it.skipped for it in jobs] == [0] * 20
+    assert [each.skipped for each in jobs] == [0] * 20
 
 
 def test_a_slot_that_is_about_to_end_goes_before_its_kind() -> None:
     made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
     made.take(0, 0, 1, 1)
-    waited = [sent - due for it, due, sent in carry_out(made, 1) if it is one]
+    waited = [sent - due for each, due, sent in carry_out(made, 1) if each is one]
     assert max(waited) < 30 * MS
     assert one.skipped == 0
 
@@ -142,8 +146,8 @@ def test_a_slot_that_is_about_to_end_goes_before_its_kind() -> None:
 def test_a_job_in_turn_is_not_begun_twice_while_others_wait() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
-    assert [it for it, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
-    assert [it for it, _ in take(made, 0, 10)] == jobs[2:4]
+    assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
+    assert [each for each, _ in take(made, 0, 10)] == jobs[2:4]
 
 
 def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
@@ -154,7 +158,7 @@ def test_a_cycle_that_is_interrupted_goes_on_where_it_was() -> None:
     made.go_on(jobs[3])
     fail(made, 0, 1, now_ms=0)
     assert made.cycle(0) == []
-    assert [it for it, _ in take(made, 0, 15)] == [jobs[3], jobs[4], jobs[0]]
+    assert [each for each, _ in take(made, 0, 15)] == [jobs[3], jobs[4], jobs[0]]
     fail(made, 0, 0, now_ms=15)
     assert made.cycle(15 * MS) == [*jobs[1:], jobs[0]]
     made.remove(jobs[2])
@@ -182,11 +186,11 @@ def test_a_silent_drive_rests_longer_and_longer_and_the_others_go_on() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
     fail(made, 1, 2, now_ms=0)
-    assert {it for it, _ in take(made, 1, 100)} == {alive}
+    assert {each for each, _ in take(made, 1, 100)} == {alive}
     now, rests = 0, []
     for failures in range(3, 11):
         woken = next(
-            at for at in range(now + 1, now + 20_000, 50) if dead in (it for it, _ in take(made, at, 10))
+            at for at in range(now + 1, now + 20_000, 50) if dead in (each for each, _ in take(made, at, 10))
         )
         rests.append(woken - now)
         now = woken
@@ -203,7 +207,7 @@ def test_a_rest_is_over_to_the_nanosecond() -> None:
         fail(made, 1, failures, at // MS)
         at += rest_ms * MS
         assert made.take(at - 1, at - 1, at, 9) == []
-        assert [it for it, _, _ in made.take(at, at, at + 1, 9)] == [dead]
+        assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
 def test_all_silent_drives_together_cost_their_share() -> None:
@@ -214,12 +218,12 @@ def test_all_silent_drives_together_cost_their_share() -> None:
     for drive in range(10):
         made.back_off.observe(drive, 2, 0, late_until_ns=0, cost_ns=cost_ms * MS)
     for now in range(0, 3_600_000, 1000):
-        for it, _ in take(made, now, 5):
-            if it.drive < 10:
+        for each, _ in take(made, now, 5):
+            if each.drive < 10:
                 asked += 1
-                failures[it.drive] += 1
+                failures[each.drive] += 1
                 made.back_off.observe(
-                    it.drive, failures[it.drive], now * MS, late_until_ns=0, cost_ns=cost_ms * MS
+                    each.drive, failures[each.drive], now * MS, late_until_ns=0, cost_ns=cost_ms * MS
                 )
     assert 0.01 < asked * cost_ms / 3_600_000 <= 0.02
 
@@ -235,12 +239,14 @@ def test_dead_drives_cost_the_others_next_to_nothing(dead: int, period_ms: int |
         failures = dict.fromkeys(range(31 - dead, 31), 0)
         at, good = 0, 0
         while at < 200_000 * MS:
-            ((it, not_before, _),) = made.take(at, at, at + 10_000 * MS, 1)
-            at = max(at, not_before) + it.duration_ns
-            if it.drive in failures:
+            ((chosen, not_before, _),) = made.take(at, at, at + 10_000 * MS, 1)
+            at = max(at, not_before) + chosen.duration_ns
+            if chosen.drive in failures:
                 at += 300 * MS
-                failures[it.drive] += 1
-                made.back_off.observe(it.drive, failures[it.drive], at, late_until_ns=at, cost_ns=300 * MS)
+                failures[chosen.drive] += 1
+                made.back_off.observe(
+                    chosen.drive, failures[chosen.drive], at, late_until_ns=at, cost_ns=300 * MS
+                )
             elif at > 20_000 * MS:
                 good += 1
         answered.append(good)
@@ -251,9 +257,9 @@ def test_a_drive_that_wakes_is_asked_one_thing_and_is_back_with_its_first_answer
     made = schedule(job(1), job(1), other := job(2))
     fail(made, 1, 2, now_ms=0)
     woken = take(made, 501, 50)
-    assert len([it for it, _ in woken if it is not other]) == 1
+    assert len([each for each, _ in woken if each is not other]) == 1
     fail(made, 1, 0, now_ms=520)
-    assert len({it for it, _ in take(made, 520, 50)}) == 3
+    assert len({each for each, _ in take(made, 520, 50)}) == 3
 
 
 def test_a_silent_drive_is_asked_its_shortest_question_whatever_its_rate() -> None:
@@ -270,36 +276,36 @@ def test_a_silent_drive_is_asked_in_the_others_spare_time() -> None:
     fail(made, 1, 2, now_ms=0)
     take(made, 0, 450)
     taken = take(made, 500, 40)
-    assert [it for it, _ in taken[:3]] == [timed, dead, timed]
+    assert [each for each, _ in taken[:3]] == [timed, dead, timed]
 
 
 def test_a_silent_drive_is_asked_also_when_there_is_no_spare_time() -> None:
     made = schedule(dead := job(1), job(2, 10, 10), job(3, 10, 10))
     fail(made, 1, 2, now_ms=0)
-    asked = sum(dead in (it for it, _ in take(made, now, 100)) for now in range(0, 5000, 100))
+    asked = sum(dead in (each for each, _ in take(made, now, 100)) for now in range(0, 5000, 100))
     assert asked >= 3
 
 
 def test_nothing_is_asked_while_a_late_answer_may_still_come() -> None:
     made = schedule(poll := job(1), other := job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=300)
-    assert {it for it, _ in take(made, 0, 299)} == {other}
-    assert poll in {it for it, _ in take(made, 300, 20)}
+    assert {each for each, _ in take(made, 0, 299)} == {other}
+    assert poll in {each for each, _ in take(made, 300, 20)}
 
 
 def test_a_late_answer_that_has_come_ends_the_waiting() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=900)
-    assert poll not in [it for it, _ in take(made, 0, 100)]
+    assert poll not in [each for each, _ in take(made, 0, 100)]
     fail(made, 1, 1, now_ms=100, late_until_ms=0)
-    assert poll in [it for it, _ in take(made, 100, 20)]
+    assert poll in [each for each, _ in take(made, 100, 20)]
 
 
 def test_a_late_answer_of_a_silent_drive_gives_it_another_chance() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=0, late_until_ms=900)
     fail(made, 1, 2, now_ms=100, late_until_ms=0)
-    assert [it for it, _ in take(made, 100, 60)].count(poll) == 1
+    assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
 def test_all_that_is_due_fits_to_the_nanosecond() -> None:
@@ -309,14 +315,14 @@ def test_all_that_is_due_fits_to_the_nanosecond() -> None:
         take(made, 0, 1)
         for drive, period_ms in ((1, 20), (2, 1000)):
             made.add(job(drive, period_ms, 10, kind=drive), 10 * MS - less)
-        assert [it.drive for it, _ in take(made, 10, 1 + 19)] == order
+        assert [each.drive for each, _ in take(made, 10, 1 + 19)] == order
 
 
 def test_a_line_that_has_caught_up_is_late_no_more() -> None:
     made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
     take(made, 0, 1, most=3)
     taken = take(made, 1000, 1010)  # slots of the quick one are over
-    assert [it for it, due in taken if due >= 2000] == [quick, middling, slow]
+    assert [each for each, due in taken if due >= 2000] == [quick, middling, slow]
 
 
 def test_a_slot_passes_whose_drive_falls_silent_before_its_turn() -> None:
@@ -325,13 +331,13 @@ def test_a_slot_passes_whose_drive_falls_silent_before_its_turn() -> None:
     fail(made, 2, 1, now_ms=5, late_until_ms=60)
     assert take(made, 10, 50) == []
     assert made.unasked == [(two, 0)]
-    assert {it for it, _ in take(made, 100, 20)} == {one, two}
+    assert {each for each, _ in take(made, 100, 20)} == {one, two}
 
 
 def test_who_is_asleep_keeps_its_place_in_the_round() -> None:
     made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
     fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
-    assert [it for it, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
+    assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
 
 
 def test_a_question_to_a_silent_drive_may_take_its_whole_time_out() -> None:
@@ -346,7 +352,7 @@ def test_the_same_outcome_told_again_ends_no_rest() -> None:
     made = schedule(poll := job(1), job(2))
     for now in (0, 100):
         fail(made, 1, 2, now_ms=now)
-    assert poll not in [it for it, _ in take(made, 100, 300)]
+    assert poll not in [each for each, _ in take(made, 100, 300)]
 
 
 def test_one_failure_is_no_rest_that_would_be_told() -> None:
@@ -388,18 +394,18 @@ def test_what_was_not_asked_when_it_ends_is_told() -> None:
 
 def test_slots_that_have_begun_pass_too_and_so_do_those_that_begin_just_now() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
-    assert [it for it, _ in take(made, 0, 100, most=2)] == [one, two]
+    assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
 
 
 def test_a_job_that_is_removed_leaves_the_others_their_turns() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
-    assert [it for it, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
-    for it in (jobs[0], timed):
-        made.remove(it)
-    assert [it for it, _ in take(made, 20, 15)] == [jobs[2], jobs[3], jobs[1]]
-    assert [it for it, _ in take(made, 1000, 5)] == [other]
+    assert [each for each, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
+    for each in (jobs[0], timed):
+        made.remove(each)
+    assert [each for each, _ in take(made, 20, 15)] == [jobs[2], jobs[3], jobs[1]]
+    assert [each for each, _ in take(made, 1000, 5)] == [other]
     assert made.jobs == [*jobs[1:], other]
 
 
@@ -413,14 +419,14 @@ def test_a_job_that_is_removed_within_its_slot_is_not_taken() -> None:
 def test_who_replaces_others_has_their_place_in_the_round_and_their_next_slot() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs)
-    assert [it for it, _ in take(made, 0, 10)] == jobs[:2]
+    assert [each for each, _ in take(made, 0, 10)] == jobs[:2]
     made.replace([jobs[0], jobs[2]], [both := job(8)], 0)
     made.replace([jobs[3]], [one := job(5), other := job(6)], 0)
-    assert [it for it, _ in take(made, 10, 25)] == [both, one, other, jobs[1], both]
+    assert [each for each, _ in take(made, 10, 25)] == [both, one, other, jobs[1], both]
     made.add(timed := job(9, 100), 40 * MS)
     assert take(made, 40, 1) == [(timed, 40)]
     made.replace([timed], [slower := job(7, 100)], timed.due_ns)
-    assert [(it, due) for it, due in take(made, 140, 1)] == [(slower, 140)]
+    assert [(each, due) for each, due in take(made, 140, 1)] == [(slower, 140)]
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
@@ -454,20 +460,20 @@ def test_no_drift_no_burst_whatever_stalls(
     """The line or Python stalls for longer than is planned ahead."""
     made = schedule(*(job(*kind) for kind in kinds))
     busy_until = now = 0
-    slots: dict[Job, list[int]] = {it: [] for it in made.jobs}
+    slots: dict[Job, list[int]] = {each: [] for each in made.jobs}
     for stall in stalls:
-        for it, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
+        for each, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
             busy_until = max(busy_until, now, not_before)
-            if due is not None and it.period_ns:
-                assert busy_until < due + it.period_ns  # it is not over
-                slots[it].append(due)
-            busy_until += it.duration_ns
+            if due is not None and each.period_ns:
+                assert busy_until < due + each.period_ns  # it is not over
+                slots[each].append(due)
+            busy_until += each.duration_ns
         now += stall * MS
-    for it, taken in slots.items():
-        if it.period_ns:
-            assert all(due % it.period_ns == 0 for due in taken)  # on its grid
+    for each, taken in slots.items():
+        if each.period_ns:
+            assert all(due % each.period_ns == 0 for due in taken)  # on its grid
             assert taken == sorted(set(taken))  # each slot once
-            assert it.due_ns // it.period_ns == len(taken) + it.skipped  # and none unaccounted for
+            assert each.due_ns // each.period_ns == len(taken) + each.skipped  # and none unaccounted for
 
 
 @settings(max_examples=examples(50))
@@ -477,10 +483,10 @@ def test_nobody_starves_whatever_is_asked_for(kinds: list[tuple[int, int | None,
     done = carry_out(made, 3)
     # Each of the others once, a few rounds of its class, and the share of those in turn.
     longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
-    for it in made.jobs:
-        sent = [0, *(at for other, _, at in done if other is it), 3000 * MS]
+    for each in made.jobs:
+        sent = [0, *(at for other, _, at in done if other is each), 3000 * MS]
         assert max(after - before for before, after in pairwise(sent)) <= longest
-    turns = [sum(1 for other, _, _ in done if other is it) for it in made.jobs if it.period_ns is None]
+    turns = [sum(1 for other, _, _ in done if other is each) for each in made.jobs if each.period_ns is None]
     assert not turns or max(turns) - min(turns) <= 1
 
 
@@ -491,10 +497,10 @@ def test_what_fits_is_kept(kinds: list[tuple[int, int | None, int, int]]) -> Non
     least = sum(duration for _, _, duration, _ in kinds)
     made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))
     done = carry_out(made, 3)
-    assert [it.skipped for it in made.jobs] == [0] * len(kinds)
-    for it in made.jobs:
-        if it.period_ns:
-            assert sum(1 for other, _, _ in done if other is it) >= 2900 * MS // it.period_ns
+    assert [each.skipped for each in made.jobs] == [0] * len(kinds)
+    for each in made.jobs:
+        if each.period_ns:
+            assert sum(1 for other, _, _ in done if other is each) >= 2900 * MS // each.period_ns
 
 
 def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come() -> None:
@@ -503,8 +509,8 @@ def test_a_drive_that_has_answered_is_not_asked_while_an_earlier_answer_may_come
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
     fail(made, 2, 0, now_ms=0, late_until_ms=60)
     assert take(made, 10, 40) == []
-    assert {it.drive for it, _ in take(made, 70, 20)} == {timed.drive}
-    assert {it.drive for it, _ in take(made, 101, 50)} == {quick.drive, timed.drive}
+    assert {each.drive for each, _ in take(made, 70, 20)} == {timed.drive}
+    assert {each.drive for each, _ in take(made, 101, 50)} == {quick.drive, timed.drive}
 
 
 class Operation(RuleBasedStateMachine):
@@ -525,18 +531,18 @@ class Operation(RuleBasedStateMachine):
     @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
     def add(self, drive: int, period: int | None, duration: int) -> None:
         if len(self.made.jobs) < 8:
-            it = job(drive, period, duration)
-            self.made.add(it, self.now)
+            chosen = job(drive, period, duration)
+            self.made.add(chosen, self.now)
             self.made.back_off.observe(
                 drive, self.failures[drive], self.now, late_until_ns=self.silent_until[drive], cost_ns=0
             )
-            self.added[it], self.slots[it] = self.now, []
+            self.added[chosen], self.slots[chosen] = self.now, []
 
     @precondition(lambda self: self.made.jobs)
     @rule(data=st.data())
     def remove(self, data: st.DataObject) -> None:
-        it = data.draw(st.sampled_from(self.made.jobs))
-        self.made.remove(it)
+        chosen = data.draw(st.sampled_from(self.made.jobs))
+        self.made.remove(chosen)
 
     @rule(drive=st.integers(0, 3), late=st.integers(0, 400))
     def fall_silent(self, drive: int, late: int) -> None:
@@ -547,14 +553,14 @@ class Operation(RuleBasedStateMachine):
         self._observe(drive, 0, 0)
 
     def _observe(self, drive: int, failures: int, until: int) -> None:
-        if any(it.drive == drive for it in self.made.jobs):
+        if any(job.drive == drive for job in self.made.jobs):
             self.failures[drive], self.silent_until[drive] = failures, until
             self.made.back_off.observe(drive, failures, self.now, late_until_ns=until, cost_ns=30 * MS)
 
     @rule()
     def lose_the_port(self) -> None:
         told = self.made.pass_all(self.now)
-        self.passed.update(it for it, _ in told if it.period_ns)
+        self.passed.update(each for each, _ in told if each.period_ns)
         assert all(due <= self.now for _, due in told)
 
     @rule(stall=st.integers(0, 300))
@@ -562,42 +568,42 @@ class Operation(RuleBasedStateMachine):
         self.now += stall * MS
         taken = self.made.take(self.now, self.busy_until, self.now + self.AHEAD, 64)
         at = max(self.now, self.busy_until)
-        for it, not_before, due in taken:
+        for each, not_before, due in taken:
             at = max(at, not_before)
-            assert it in self.made.jobs
+            assert each in self.made.jobs
             # Nothing is asked while an answer may still come, not even when the line is ready too soon.
-            assert max(self.now, not_before) >= self.silent_until[it.drive]
-            if it.period_ns and due is None:  # asked to see whether its drive answers, in no slot
-                assert self.failures[it.drive] >= 2
-            elif it.period_ns:
-                assert (due - self.added[it]) % it.period_ns == 0  # on its grid
-                assert due > max(self.slots[it], default=-1)  # each slot once, in their order
-                assert due > at - it.period_ns  # what was missed is not made up for
-                self.slots[it].append(due)
+            assert max(self.now, not_before) >= self.silent_until[each.drive]
+            if each.period_ns and due is None:  # asked to see whether its drive answers, in no slot
+                assert self.failures[each.drive] >= 2
+            elif each.period_ns:
+                assert (due - self.added[each]) % each.period_ns == 0  # on its grid
+                assert due > max(self.slots[each], default=-1)  # each slot once, in their order
+                assert due > at - each.period_ns  # what was missed is not made up for
+                self.slots[each].append(due)
             else:
-                self.slots[it].append(at)
-            at += it.duration_ns
+                self.slots[each].append(at)
+            at += each.duration_ns
         self.busy_until = at if taken else self.busy_until
 
     @invariant()
     def every_slot_is_accounted_for(self) -> None:
-        self.passed.update(it for it, _ in self.made.unasked if it.period_ns)
+        self.passed.update(each for each, _ in self.made.unasked if each.period_ns)
         self.made.unasked.clear()
-        for it in self.made.jobs:
-            if it.period_ns:
-                slots = (it.due_ns - self.added[it]) // it.period_ns
-                assert slots == len(self.slots[it]) + it.skipped + self.passed[it]
+        for job in self.made.jobs:
+            if job.period_ns:
+                slots = (job.due_ns - self.added[job]) // job.period_ns
+                assert slots == len(self.slots[job]) + job.skipped + self.passed[job]
 
     def teardown(self) -> None:
         """Everything is well again, and is asked, in its turn or at its rate."""
         for drive in range(4):
             self.wake(drive)
-        load = sum(it.duration_ns / it.period_ns for it in self.made.jobs if it.period_ns)
-        before = {it: len(self.slots[it]) for it in self.made.jobs}
+        load = sum(job.duration_ns / job.period_ns for job in self.made.jobs if job.period_ns)
+        before = {job: len(self.slots[job]) for job in self.made.jobs}
         for _ in range(100):
             self.go_on(20)
-        counts = {it: len(self.slots[it]) - before[it] for it in self.made.jobs}
-        in_turn = [count for it, count in counts.items() if it.period_ns is None]
+        counts = {job: len(self.slots[job]) - before[job] for job in self.made.jobs}
+        in_turn = [count for each, count in counts.items() if each.period_ns is None]
         if load < 0.5:
             assert all(counts.values())
             assert max(in_turn, default=0) - min(in_turn, default=0) <= 1
@@ -613,8 +619,8 @@ TestOperation.settings = settings(max_examples=examples(100), stateful_step_coun
 def test_what_is_due_next_is_known_when_a_job_has_left() -> None:
     made: Schedule[Job] = Schedule()
     jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
-    for at, it in jobs.items():
-        made.add(it, at * MS)
+    for at, each in jobs.items():
+        made.add(each, at * MS)
     made.remove(jobs[1])
     assert take(made, 0, 14) == [(jobs[13], 13)]
 
@@ -632,7 +638,7 @@ def test_the_turn_goes_on_where_a_job_has_left() -> None:
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]
     made.remove(second)  # whose turn it would be
-    assert [it for it, _ in take(made, 5, 1, 1)] == [third]
+    assert [each for each, _ in take(made, 5, 1, 1)] == [third]
 
 
 def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
@@ -641,7 +647,7 @@ def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
     made.remove(silent)
     made.back_off.forget(1)
     made.add(again := job(1), 0)
-    assert again in [it for it, _ in take(made, 1, 20)]
+    assert again in [each for each, _ in take(made, 1, 20)]
 
 
 # ---- drives that have never answered ----
@@ -649,7 +655,7 @@ def test_a_drive_that_was_forgotten_is_asked_like_a_new_one() -> None:
 
 def meet(*jobs: Job) -> Schedule[Job]:
     made = schedule(*jobs)
-    for drive in {it.drive for it in jobs}:
+    for drive in {job.drive for job in jobs}:
         made.back_off.meet(drive)
     return made
 

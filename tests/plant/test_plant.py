@@ -16,7 +16,8 @@ from multidrop.plant.model import Plant
 from multidrop.toml_check import parse_duration
 
 FAMILY = """\
-from multidrop.drive.family import Drive, Framing, Option
+from multidrop.drive.family import Drive, Framing
+from multidrop.drive.options import Option
 from multidrop.drive.declare import command, reading, setting
 
 class Toy(Drive):
@@ -174,11 +175,11 @@ address = 3
 
 def test_a_line_s_silence_takes_the_place_of_the_standard_s_and_of_no_family_s(load: Load) -> None:
     (line,) = load(SILENT).lines
-    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([500e-6, 10e-3, 0])
+    assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
     (line,) = load(SILENT.replace('silence = "500 us"\n', 'switching = "2 ms"\n')).lines
     assert line.switching == 2e-3
-    assert [it.drive.needed_silence() for it in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
+    assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
 def test_a_line_s_echo_is_learnt_unless_it_is_told(load: Load) -> None:
@@ -480,7 +481,7 @@ def test_a_drive_s_owner_says_what_it_keeps_in_ram_and_that_it_is_an_ibd(tmp_pat
         ram = ["acceleration_time"]
         """
     )
-    (drive,) = (it.drive for it in load_plant(path).lines[0].drives)
+    (drive,) = (each.drive for each in load_plant(path).lines[0].drives)
     assert (drive.ram, drive.option) == ({"acceleration_time"}, {"confirmed": 1})
     path.write_text(path.read_text().replace("acceleration_time", "acceleration"))
     with pytest.raises(PlantError, match="did you mean acceleration_time"):

@@ -486,16 +486,16 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
 
         def kept() -> tuple[int, ...]:
             lines = made.poller._lines
-            hall = lines.find("hall")
+            polled_line = lines.find("hall")
             return (
-                len(hall._planned),
-                len(hall._maker._made),
-                len(hall._maker._rows),
+                len(polled_line._drives._planned),
+                len(polled_line._maker._made),
+                len(polled_line._maker._rows),
                 len(lines._numbered),
                 len(lines._free),
                 max(lines._numbered),
-                len(hall.bus._exchanges._known),
-                len(hall._gone),
+                len(polled_line.bus._exchanges._known),
+                len(polled_line._drives._gone),
             )
 
         def adopt_some(number: int) -> None:

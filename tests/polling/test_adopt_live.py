@@ -32,7 +32,7 @@ class Quick(Toy):
     response_timeout = 0.05
 
 
-class Hall:
+class TwoLines:
     """Two lines with two simulated drives each."""
 
     def __init__(self, port: str = "pty") -> None:
@@ -43,7 +43,7 @@ class Hall:
             [Wire([*drives.values()], unpaced=True, port=port) for drives in (self.pumps, self.fans)]
         )
 
-    def __enter__(self) -> Hall:
+    def __enter__(self) -> TwoLines:
         self.simulator.__enter__()
         return self
 
@@ -68,8 +68,8 @@ def quick(name: str, address: int, every: float | None = 0.02) -> PolledDrive:
 
 
 @pytest.fixture
-def both() -> Iterator[Hall]:
-    with Hall() as made:
+def both() -> Iterator[TwoLines]:
+    with TwoLines() as made:
         yield made
 
 
@@ -89,7 +89,7 @@ def runs(drive: SimulatedDrive) -> bool:
 # ---- motors ----
 
 
-def test_motors_go_on_when_their_line_goes(both: Hall) -> None:
+def test_motors_go_on_when_their_line_goes(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.bus("yard").drives[0].start()
         poller.adopt(plant(both.hall()))
@@ -97,7 +97,7 @@ def test_motors_go_on_when_their_line_goes(both: Hall) -> None:
     assert runs(both.fans[1])
 
 
-def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: Hall) -> None:
+def test_motors_that_are_to_stop_at_exit_are_stopped_before_they_leave(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -120,7 +120,7 @@ class Other(Quick):
     model = "other"
 
 
-def test_a_drive_that_is_another_family_s_now_gets_no_stop_of_the_old_one(both: Hall) -> None:
+def test_a_drive_that_is_another_family_s_now_gets_no_stop_of_the_old_one(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for name in ("hall", "yard"):
@@ -154,7 +154,7 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
 # ---- calls under way ----
 
 
-def test_a_stop_goes_on_while_its_line_is_to_go(both: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_goes_on_while_its_line_is_to_go(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
@@ -188,7 +188,7 @@ def test_a_stop_goes_on_while_its_line_is_to_go(both: Hall, monkeypatch: pytest.
         assert list(poller.buses) == ["hall"]
 
 
-def test_calls_on_what_has_gone_say_so(both: Hall) -> None:
+def test_calls_on_what_has_gone_say_so(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus, (pump_1, pump_2) = poller.bus("hall"), poller.bus("hall").drives
         gone_bus, (fan, _) = poller.bus("yard"), poller.bus("yard").drives
@@ -203,7 +203,7 @@ def test_calls_on_what_has_gone_say_so(both: Hall) -> None:
     assert not runs(both.fans[1])
 
 
-def test_a_read_that_waits_for_a_line_that_goes_fails(both: Hall) -> None:
+def test_a_read_that_waits_for_a_line_that_goes_fails(both: TwoLines) -> None:
     both.fans[1].deaf_until = float("inf")
     slow = polled(SlowToy(1, name="fan-1"), [], None)
     with Poller(plant(both.hall(), line(both.yard().port, slow, name="yard"))) as poller:
@@ -235,7 +235,7 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     return bool(bus.line.queue and bus.line.queue.is_asking(bus.peer(of.drive)))
 
 
-def test_closing_waits_for_an_adoption(both: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, go_on = threading.Event(), threading.Event()
     open_bus = Bus.__init__
 
@@ -265,7 +265,7 @@ def test_closing_waits_for_an_adoption(both: Hall, monkeypatch: pytest.MonkeyPat
 
 def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """None is made before all are asked for; and none sleeps when it is closed."""
-    with Hall("socket://127.0.0.1:0") as both:
+    with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
         all_asked = threading.Barrier(2)
         connect = socket.create_connection
@@ -287,7 +287,7 @@ def test_connections_are_made_side_by_side(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_port_that_takes_its_time_holds_up_no_other_one(
-    both: Hall, monkeypatch: pytest.MonkeyPatch
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
     open_bus = Bus.__init__
@@ -329,7 +329,7 @@ def until_sampled(poller: Poller, drive: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_hundred_adoptions_leave_nothing_behind(both: Hall) -> None:
+def test_a_hundred_adoptions_leave_nothing_behind(both: TwoLines) -> None:
     """With threads that read by hand, look at statistics and take batches; every value is its own."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]

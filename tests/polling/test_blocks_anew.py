@@ -65,7 +65,7 @@ def test_other_drives_keep_their_place_in_the_round() -> None:
     drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
     drives[1].response_delay = LATE
     sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
-    with World(WorldWire(sims, Faults()), [polled(it, [Wide.near, Wide.far]) for it in drives]) as world:
+    with World(WorldWire(sims, Faults()), [polled(each, [Wide.near, Wide.far]) for each in drives]) as world:
         world.run(5.0)
         rows = [(row.drive, row.register) for row in world.run(2.0)]
     at = rows.index(("pump-1", "near"))

@@ -79,7 +79,7 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
     story = Story(of_one_variant(number))
     story.tell(KINDS[kind])
     assert (descriptors(), threads()) == before
-    assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
+    assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
 
 @pytest.mark.parametrize("name", LINES)
@@ -110,12 +110,12 @@ def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
     """Nothing is polled at a rate: that goes without the poller's thread until something fails."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
     story.tell(KINDS[kind])
-    assert any(story.wire.struck[it] for it in RATES if getattr(KINDS[kind], it))
+    assert any(story.wire.struck[rate] for rate in RATES if getattr(KINDS[kind], rate))
 
 
 def lines_that_tell(kind: str) -> Iterator[list[Drive]]:
     """Each variant alone, and all on one line."""
-    numbers = [it for it in LINES.values() if VARIANTS[it][1] not in NOT_TOLD.get(kind, ())]
+    numbers = [line for line in LINES.values() if VARIANTS[line][1] not in NOT_TOLD.get(kind, ())]
     yield from map(of_one_variant, numbers)
     if len(numbers) == len(LINES):
         yield of_all_variants()

@@ -64,8 +64,11 @@ def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
 ) -> None:
     drive, sim = slow()
     rest = [quick(address) for address in range(2, 2 + others)]
-    drives = [polled(drive, drive.registers.values(), every), *(polled(it, it.readings()) for it, _ in rest)]
-    with World(WorldWire([sim, *(it for _, it in rest)], Faults()), drives) as world:
+    drives = [
+        polled(drive, drive.registers.values(), every),
+        *(polled(one, one.readings()) for one, _ in rest),
+    ]
+    with World(WorldWire([sim, *(one for _, one in rest)], Faults()), drives) as world:
         world.run(2)
         del sim.times[:]
         rows = world.run(12)
@@ -82,7 +85,7 @@ def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> 
     (drive, sim), (other, its_sim) = slow(), quick(2)
 
     def exchanges(*drives: Drive) -> int:
-        before = [polled(it, it.readings()) for it in drives]
+        before = [polled(drive, drive.readings()) for drive in drives]
         with World(WorldWire([sim, its_sim], Faults()), before) as world:
             world.run(2)
             return sum(row.drive == other.name for row in world.run(10))

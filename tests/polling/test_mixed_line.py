@@ -64,7 +64,9 @@ def test_values_tell_all_registers_apart() -> None:
         asked = [polled(drive, drive.readings()) for drive in drives]
         truth = proofs(*asked)
         steps = {
-            (it.drive.name, poll.register.name): poll.register.scale for it in asked for poll in it.polls
+            (each.drive.name, poll.register.name): poll.register.scale
+            for each in asked
+            for poll in each.polls
         }
         raws = Counter(round(value / steps[key]) for key, value in truth.items())
         assert max(raws.values()) == 1
@@ -80,9 +82,9 @@ def test_all_variants_on_one_line_at_the_pace_of_a_real_one() -> None:
     with served(real_wires) as (path,):
         rows, summary = poll(path, drives, REAL_SECONDS)
     check(rows, drives, summary)
-    assert {row.drive for row in rows if row.value is not None} == {it.drive.name for it in drives}
+    assert {row.drive for row in rows if row.value is not None} == {each.drive.name for each in drives}
     # Each slot of each grid is a row, or counted as left out; the last ones are cut off by the end.
-    on_a_grid = {(it.drive.name, it.polls[-1].register.name) for it in drives}
+    on_a_grid = {(each.drive.name, each.polls[-1].register.name) for each in drives}
     kept = sum(1 for row in rows if (row.drive, row.register) in on_a_grid)
     assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
 

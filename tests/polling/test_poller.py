@@ -57,7 +57,7 @@ class Brisk(Toy):
 
 
 READINGS = Quick.readings()
-NAMES = {it.name for it in READINGS}
+NAMES = {reading.name for reading in READINGS}
 ONE = [Quick.output_current]
 
 
@@ -97,10 +97,10 @@ class Polling:
         assert summary["misses"] == misses.total()
         assert summary["dropped"] == 0
         told: Counter[str] = Counter()
-        for it in summary["lines"].values():
-            told.update(it["misses"])
-            assert it["samples"] == sum(drive["samples"] for drive in it["drives"].values())
-            for name, drive in it["drives"].items():
+        for each in summary["lines"].values():
+            told.update(each["misses"])
+            assert each["samples"] == sum(drive["samples"] for drive in each["drives"].values())
+            for name, drive in each["drives"].items():
                 rows = [row for row in self.rows if row.drive == name]
                 assert drive["samples"] == sum(1 for row in rows if row.value is not None)
                 seen = Counter(row.status for row in rows if row.value is None)
@@ -171,8 +171,8 @@ def test_neither_starves_the_other(port: str) -> None:
 )
 def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) -> None:
     drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
-    wire = WorldWire([simulated(it) for it in drives], Faults())
-    with World(wire, [polled(it, [Toy.fault]) for it in drives]) as world:
+    wire = WorldWire([simulated(drive) for drive in drives], Faults())
+    with World(wire, [polled(drive, [Toy.fault]) for drive in drives]) as world:
         rows = world.run(1)[: len(drives)]
     asked = [int(row.drive.removeprefix("drive-")) for row in rows]
     assert sorted(asked) == [1, 2, 3, 4, 5, 6]
@@ -237,12 +237,14 @@ def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytes
 def test_many_lines_at_once() -> None:
     with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
         drives = [polled(Quick(at, name=f"drive-{at}"), READINGS) for at in range(1, 17)]
-        lines = [line(wire.path, it, name=it.drive.name) for wire, it in zip(sim.wires, drives, strict=True)]
+        lines = [
+            line(wire.path, each, name=each.drive.name) for wire, each in zip(sim.wires, drives, strict=True)
+        ]
         before = threads()
         with Polling(*lines) as polling:
             assert threads() == before + 1
-            for it in drives:
-                polling.until("ok", 3 * len(READINGS), it.drive.name)
+            for drive in drives:
+                polling.until("ok", 3 * len(READINGS), drive.drive.name)
     truth = proofs(*drives)
     assert {(row.drive, row.register): row.value for row in polling.rows if row.value is not None} == truth
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
@@ -366,17 +368,17 @@ def test_a_port_that_vanishes_and_comes_back_under_its_link(tmp_path: Path) -> N
     targets: set[Path] = set()
     with ExitStack() as stack:
         for number in range(2):
-            wires = [Wire([simulated(it.drive) for it in asked], port=str(link), unpaced=True)]
+            wires = [Wire([simulated(each.drive) for each in asked], port=str(link), unpaced=True)]
             with Simulator(wires):
                 targets.add(link.readlink())
                 # A pty's number is not given again while anybody holds it.
                 stack.callback(os.close, os.open(link, os.O_RDONLY | os.O_NOCTTY))
                 if number == 0:
                     polling = stack.enter_context(Polling(line(str(link), *asked)))
-                for it in asked:
-                    polling.until("ok", 3, it.drive.name)
-            for it in asked:
-                polling.until("port lost", 2, it.drive.name)
+                for each in asked:
+                    polling.until("ok", 3, each.drive.name)
+            for each in asked:
+                polling.until("port lost", 2, each.drive.name)
     assert len(targets) == 2
     assert polling.statuses().keys() <= {"ok", "port lost"} | HOST_LATE
     polling.check_summary()
@@ -405,11 +407,11 @@ def test_a_lost_port_that_takes_its_time_does_not_hold_the_others_up(
     link, is_held_up, may_go_on = tmp_path / "hall-2", threading.Event(), threading.Event()
     act = getattr(Serial, slow)
 
-    def hold_up(it: Serial) -> None:
-        if it.port == str(link):
+    def hold_up(serial: Serial) -> None:
+        if serial.port == str(link):
             is_held_up.set()
             assert may_go_on.wait(PATIENCE)
-        act(it)
+        act(serial)
 
     with ExitStack() as stack:
         lines = [
@@ -486,7 +488,7 @@ class Patient(Toy):
 def patient(every: float | None) -> PolledDrive:
     """Two requests, to two drives."""
     polls = polled(Patient(1, name="pump-1"), [Patient.fault]).polls
-    return PolledDrive(Patient(1, name="pump-1"), tuple(replace(it, every=every) for it in polls))
+    return PolledDrive(Patient(1, name="pump-1"), tuple(replace(poll, every=every) for poll in polls))
 
 
 @pytest.fixture

@@ -39,8 +39,8 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
 def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
-    world = World(WorldWire(sims, Faults()), [polled(it, it.readings()[:1]) for it in drives])
-    gone = {it.name for it in drives[:dead]}
+    world = World(WorldWire(sims, Faults()), [polled(each, each.readings()[:1]) for each in drives])
+    gone = {each.name for each in drives[:dead]}
 
     def answered(seconds: float) -> int:
         return sum(1 for row in world.run(seconds) if row.value is not None)
@@ -48,12 +48,12 @@ def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_
     with world:
         world.run(5)  # until delays are learnt
         healthy = answered(10)
-        for it in sims[:dead]:
-            it.deaf_until = float("inf")
+        for sim in sims[:dead]:
+            sim.deaf_until = float("inf")
         world.run(10)  # until it is known
         assert answered(50) >= 0.97 * 5 * healthy
-        for it in sims[:dead]:
-            it.deaf_until = 0.0
+        for sim in sims[:dead]:
+            sim.deaf_until = 0.0
         revived, back = world.now, set()
         while not gone <= back:
             assert world.now <= revived + back_s * S
@@ -77,13 +77,15 @@ def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
         sims = [simulated(drive) for drive in drives]
         for sim in sims:
             sim.deaf_until = float("inf") if sim.drive.address in gone else 0.0
-        world = World(WorldWire(sims, Faults()), [polled(it, it.readings()[:1], every) for it in drives])
+        world = World(
+            WorldWire(sims, Faults()), [polled(each, each.readings()[:1], every) for each in drives]
+        )
         with world:
             found = [sum(row.value is not None for row in world.run(span)) for span in (FIRST, LATER)]
             for sim in sims:
                 sim.deaf_until = 0.0
             back = {row.drive for row in world.run(BACK) if row.value is not None}
-            assert back == {it.name for it in drives}
+            assert back == {each.name for each in drives}
             return found
 
     every_drive = list(range(1, count + 1))

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from examples import every_other, usually
 from lines import proof
-from motors import MAKE, Heard
+from motors import MAKE, ReceivedRequests
 from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
 
 from multidrop import bus
@@ -188,7 +188,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
     opened, line = path_of([sim], constant(seconds))
-    heard = Heard(sim)
+    received = ReceivedRequests(sim)
     sent_after: list[float] = []
     begun = line.now
 
@@ -197,7 +197,7 @@ def test_a_stop_over_a_slow_path_is_seen_to_be_done(
             sent_after.append((line.now - begun) / S)
         return False
 
-    heard.loses = note
+    received.loses = note
     with opened:
         line.wire.advance(line.now / S)  # its clock begins
         sim.motor.run(1)

@@ -161,7 +161,7 @@ def test_a_reset_whose_replies_are_lost_starts_nothing(line: Line, lost: int) ->
     line.bus.loses = lambda request: False
     assert not any(line.starts_it(request) for request in line.writes[begun:])
     where, word = line.drive.register(line.drive.reset_role).address, line.drive.reset_word
-    resets = [it for it in line.writes if it.start == where and it.data == word.to_bytes(2)]
+    resets = [write for write in line.writes if write.start == where and write.data == word.to_bytes(2)]
     assert len(resets) == 1
     line.sim.motor.reset()
     line.sim.trip(FAULT)

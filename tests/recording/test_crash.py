@@ -148,8 +148,8 @@ def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[
     """Every acknowledged write is there as done, none is there twice, and none that was not sent."""
     path = audit(directory)
     records = list(read_audit(path)) if path.exists() else []
-    noted = [int(str(it["write"]).removeprefix("number = ")) for it in records]
-    assert all(it["outcome"] == "done" for it in records)
+    noted = [int(str(record["write"]).removeprefix("number = ")) for record in records]
+    assert all(record["outcome"] == "done" for record in records)
     assert all(before < after for before, after in pairwise(noted))
     assert set(acknowledged) <= set(noted) <= set(numbers)
     assert len(numbers) - lives <= len(noted)

@@ -63,7 +63,7 @@ def look(ramp: Path) -> Recording:
 
 
 def test_series_have_every_value_and_every_miss(look: Recording) -> None:
-    assert [(it.drive, it.register, it.unit, len(it.time)) for it in look.series] == [
+    assert [(each.drive, each.register, each.unit, len(each.time)) for each in look.series] == [
         ("pump", "output_frequency", "Hz", 1000),
         ("pump", "fault", "", 1000),
         ("fan", "output_current", "raw count", 1001),
@@ -82,16 +82,16 @@ def test_series_have_every_value_and_every_miss(look: Recording) -> None:
 def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
     with open_writer(tmp_path / f"it{suffix}", METADATA) as writer:
         writer.write(example())
-    it = load(tmp_path / f"it{suffix}")
-    assert [(series.drive, series.register) for series in it.series] == [
+    loaded = load(tmp_path / f"it{suffix}")
+    assert [(series.drive, series.register) for series in loaded.series] == [
         ("pump-1", "output_frequency"),
         ("pump-1", "motor_speed"),
         ('fan, the "old" one', "output_frequency"),
         ("насос", "motor_speed"),
         ('fan, the "old" one', "motor_speed"),
     ]
-    assert it.series[0].value.tolist() == [49.99]
-    assert [dict(series.reasons()) for series in it.series[2:]] == [
+    assert loaded.series[0].value.tolist() == [49.99]
+    assert [dict(series.reasons()) for series in loaded.series[2:]] == [
         {"exception 12": 1},
         {"no reply": 1},
         {"not asked: drive is silent": 1},
@@ -103,9 +103,9 @@ def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
 def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
     with open_writer(tmp_path / "it.arrows", METADATA) as writer:
         writer.write(example())
-    it = load(tmp_path / "it.arrows")
-    assert png(plot(it)[0]).startswith(PNG)
-    assert "насос" in report_page(it)
+    loaded = load(tmp_path / "it.arrows")
+    assert png(plot(loaded)[0]).startswith(PNG)
+    assert "насос" in report_page(loaded)
 
 
 def test_a_fault_is_a_span_that_misses_do_not_end(look: Recording) -> None:
@@ -119,7 +119,7 @@ def test_a_fault_without_a_name_and_one_of_flags_are_told(tmp_path: Path) -> Non
     about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
     rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
     (series,) = load(record(tmp_path / "it.arrows", rows, about)).series
-    assert [(it.what, it.end - it.begin) for it in series.faults()] == [
+    assert [(fault.what, fault.end - fault.begin) for fault in series.faults()] == [
         ("HIGH HOT", 2 * SECOND),
         ("bit 7", SECOND),
     ]
@@ -448,7 +448,7 @@ def test_reasons_for_which_there_is_no_room_are_one(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
     rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
-    names = [it.get_text() for it in misses.get_legend().get_texts()]
+    names = [text.get_text() for text in misses.get_legend().get_texts()]
     assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
 
 
@@ -563,9 +563,10 @@ def test_metadata_that_makes_no_sense_is_left_out(tmp_path: Path, odd: Any) -> N
             continue  # is no recording
         look = load(record(tmp_path / f"{number}.arrows", turns()[:30], metadata))
         assert all(
-            np.isfinite([it.utilisation, it.rate("pump"), it.cycle or 0]).all() for it in line_uses(look)
+            np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()
+            for each in line_uses(look)
         )
-        assert {it.drive for it in delays(look)} == {"pump", "fan"}
+        assert {delay.drive for delay in delays(look)} == {"pump", "fan"}
         assert len(_about(look) + "".join(_drives(look))) > 100
         if metadata.get("planned") is odd or metadata.get("drives") is odd:
             assert report_page(look)

@@ -55,7 +55,7 @@ class Pair(Wire):
 
     def send(self, frame: bytes, now: float, settings: Settings) -> None:
         self.request = frame
-        self._groups = [it for it in self._all_groups if _alike(it.settings, settings)]
+        self._groups = [group for group in self._all_groups if _alike(group.settings, settings)]
         self.receive(frame, now, settings.baudrate)
         self._groups = self._all_groups
 
@@ -109,25 +109,25 @@ class Line:
 
 def found(line: Line, plan: Sequence[Sweep], families: Sequence[type] = FAMILIES) -> list[object]:
     """All findings but the progress."""
-    return [it for it in scan(line.carry_out, plan, families) if not isinstance(it, Progress)]
+    return [each for each in scan(line.carry_out, plan, families) if not isinstance(each, Progress)]
 
 
 def drives(findings: Sequence[object]) -> set[tuple[int, str, str, str]]:
     return {
-        (it.address, " or ".join(it.models), f"{it.settings}", f"{it.framing}")
-        for it in findings
-        if isinstance(it, Found)
+        (finding.address, " or ".join(finding.models), f"{finding.settings}", f"{finding.framing}")
+        for finding in findings
+        if isinstance(finding, Found)
     }
 
 
 def declared(*drives: object) -> set[tuple[int, str, str, str]]:
-    return {(it.address, it.model, f"{it.settings}", f"{it.framing}") for it in drives}
+    return {(drive.address, drive.model, f"{drive.settings}", f"{drive.framing}") for drive in drives}
 
 
 @pytest.fixture(scope="module")
 def whole_scan() -> tuple[Line, list[object]]:
     """All sweeps over a line of all eight, and what they found."""
-    line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
+    line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     return line, found(line, sweeps(FAMILIES))
 
 
@@ -138,7 +138,7 @@ def test_all_eight_are_found_at_their_settings_and_nothing_else(
     _, findings = whole_scan
     assert drives(findings) == declared(*ALL_EIGHT)
     assert len(findings) == len(ALL_EIGHT)
-    assert not any(it.doubt for it in findings)
+    assert not any(finding.doubt for finding in findings)
 
 
 @pytest.mark.story
@@ -146,17 +146,17 @@ def test_only_reads_are_sent(whole_scan: tuple[Line, list[object]]) -> None:
     line, _ = whole_scan
     functions = {(framing, parse_request(framing, frame)[1].function) for framing, frame in line.sent}
     assert all(function in READS[framing] for framing, function in functions)
-    assert not any(it.counters.writes for it in line.wire.drives)
+    assert not any(drive.counters.writes for drive in line.wire.drives)
 
 
 def test_the_usual_settings_come_first() -> None:
-    line = Line(Pair([simulated(it) for it in ALL_EIGHT]))
-    soon = [it for it in ALL_EIGHT if it.settings == type(it)(1, framing=it.framing).settings]
+    line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
+    soon = [each for each in ALL_EIGHT if each.settings == type(each)(1, framing=each.framing).settings]
     assert len(soon) == 4
     left = declared(*soon)
-    for it in scan(line.carry_out, sweeps(FAMILIES), FAMILIES):
-        if isinstance(it, Found):
-            left -= drives([it])
+    for each in scan(line.carry_out, sweeps(FAMILIES), FAMILIES):
+        if isinstance(each, Found):
+            left -= drives([each])
         if not left:
             break
     assert line.seconds < 15
@@ -182,7 +182,7 @@ def test_what_a_sweep_needs_is_its_silences_requests_and_time_outs() -> None:
 def test_the_progress_counts_down_to_nothing() -> None:
     line = Line(Pair([simulated(InvtCHE(3))]))
     plan = sweeps([InvtCHE], addresses=range(1, 5), baudrates=[9600], formats=["8N1"])
-    left = [it.left for it in scan(line.carry_out, plan, [InvtCHE]) if isinstance(it, Progress)]
+    left = [each.left for each in scan(line.carry_out, plan, [InvtCHE]) if isinstance(each, Progress)]
     assert left == sorted(left, reverse=True)
     assert left[-1] == 0
 
@@ -197,8 +197,8 @@ class Echo(Line):
 
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
 def test_an_echo_is_no_drive_and_hides_none(families: list[type]) -> None:
-    there = [it for it in ALL_EIGHT if type(it) in families and it.settings.baudrate in (9600, 19200)]
-    line = Echo(Pair([simulated(it) for it in ALL_EIGHT]))
+    there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
+    line = Echo(Pair([simulated(each) for each in ALL_EIGHT]))
     plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
     assert drives(found(line, plan, families)) == declared(*there)
 
@@ -221,10 +221,12 @@ class Junk(Line):
 
 
 def test_some_noise_is_neither_a_drive_nor_several() -> None:
-    line = Junk(Pair([simulated(it) for it in ALL_EIGHT]))
+    line = Junk(Pair([simulated(each) for each in ALL_EIGHT]))
     findings = found(line, sweeps(FAMILIES, addresses=range(1, 12), baudrates=[9600, 38400]))
-    assert drives(findings) == declared(*(it for it in ALL_EIGHT if it.settings.baudrate in (9600, 38400)))
-    assert not any(isinstance(it, Crowd) for it in findings)
+    assert drives(findings) == declared(
+        *(each for each in ALL_EIGHT if each.settings.baudrate in (9600, 38400))
+    )
+    assert not any(isinstance(finding, Crowd) for finding in findings)
 
 
 def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
@@ -234,10 +236,10 @@ def test_a_line_that_is_never_quiet_is_called_noisy() -> None:
     line = Always(Pair([simulated(InvtCHE(3))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
     assert drives(findings) == declared(InvtCHE(3))
-    noise = [it for it in findings if isinstance(it, Noise)]
+    noise = [finding for finding in findings if isinstance(finding, Noise)]
     assert noise
     assert noise[0].garbled == 30
-    assert not any(isinstance(it, Crowd) for it in findings)
+    assert not any(isinstance(finding, Crowd) for finding in findings)
 
 
 class Shared(Pair):
@@ -263,7 +265,7 @@ def test_two_drives_at_one_address_are_recognised() -> None:
     line = Line(Shared([simulated(InvtCHE(1)), one, simulated(InnovertIBD(4))], twin))
     findings = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
     assert drives(findings) == declared(InvtCHE(1), InnovertIBD(4))
-    assert [it for it in findings if not isinstance(it, Found)] == [
+    assert [finding for finding in findings if not isinstance(finding, Found)] == [
         Crowd(3, Settings(9600, "8N1"), Framing.RTU)
     ]
 
@@ -280,8 +282,8 @@ def test_all_eight_are_found_amid_echo_and_noise_with_two_drives_at_one_address(
     line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
     findings = found(line, sweeps(FAMILIES))
     assert drives(findings) == declared(*ALL_EIGHT)
-    assert {it.address for it in findings if not isinstance(it, Found)} == {9}
-    assert {type(it) for it in findings} == {Found, Crowd}
+    assert {finding.address for finding in findings if not isinstance(finding, Found)} == {9}
+    assert {type(finding) for finding in findings} == {Found, Crowd}
 
 
 class OneAfterTheOther(Shared):
@@ -297,7 +299,7 @@ def test_two_drives_that_answer_one_after_the_other_are_doubted() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     line = Line(OneAfterTheOther([one, simulated(InnovertIBD(4))], twin))
     findings = found(line, sweeps([InnovertIBD], baudrates=[9600], formats=["8N1"]), [InnovertIBD])
-    doubts = {it.address: it.doubt for it in findings if isinstance(it, Found)}
+    doubts = {finding.address: finding.doubt for finding in findings if isinstance(finding, Found)}
     assert "second drive" in doubts[3]
     assert doubts[4] == ""
 
@@ -309,7 +311,7 @@ def test_a_drive_that_answers_late_is_found_all_the_same(delay: float) -> None:
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
     findings = found(line, plan, [InvtCHE])
     assert drives(findings) == declared(InvtCHE(3), InvtCHE(5))
-    delays = {it.address: it.response_delay for it in findings if isinstance(it, Found)}
+    delays = {finding.address: finding.response_delay for finding in findings if isinstance(finding, Found)}
     assert delays[3] == pytest.approx(delay, abs=5e-3)
 
 
@@ -317,17 +319,17 @@ def test_a_slow_line_is_waited_for_longer_once_it_is_known() -> None:
     line = Line(Pair([simulated(InvtCHE(at), response_delay=0.04) for at in (1, 9)]))
     brisk = sweeps([InvtCHE], baudrates=[9600])
     brisk = brisk[: len(brisk) // 2]
-    left = [it.left for it in scan(line.carry_out, brisk, [InvtCHE]) if isinstance(it, Progress)]
+    left = [each.left for each in scan(line.carry_out, brisk, [InvtCHE]) if isinstance(each, Progress)]
     quiet = Line(Pair([simulated(InvtCHE(40))]))
-    usual = [it.left for it in scan(quiet.carry_out, brisk, [InvtCHE]) if isinstance(it, Progress)]
+    usual = [each.left for each in scan(quiet.carry_out, brisk, [InvtCHE]) if isinstance(each, Progress)]
     assert left[31] > usual[31]
 
 
 def test_a_drive_of_no_family_is_unknown() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7))]))
-    (it,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
-    assert isinstance(it, Found)
-    assert (it.address, it.models) == (7, ())
+    (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
+    assert isinstance(answering, Found)
+    assert (answering.address, answering.models) == (7, ())
 
 
 def test_a_family_of_one_s_own_is_found() -> None:
@@ -364,7 +366,9 @@ def test_who_holds_another_address_is_of_another_family(
     drive["address_setting"] = held
     plan = sweeps([Addressed], baudrates=[9600], formats=["8N1"])
     findings = found(Line(Pair([drive])), plan, [Addressed])
-    assert [(it.address, it.models) for it in findings if isinstance(it, Found)] == [(7, models)]
+    assert [(finding.address, finding.models) for finding in findings if isinstance(finding, Found)] == [
+        (7, models)
+    ]
 
 
 class Meddler(Toy):
@@ -420,7 +424,7 @@ def test_settings_that_the_port_refuses_are_passed_over_and_told() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600]), [InvtCHE])
     assert drives(findings) == declared(InvtCHE(2))
-    untried = {it.settings.format for it in findings if isinstance(it, Untried)}
+    untried = {finding.settings.format for finding in findings if isinstance(finding, Untried)}
     assert untried == {"8E1", "8O1", "8E2", "8O2"}
 
 
@@ -436,7 +440,9 @@ class Vanishing(Line):
 def test_a_port_that_is_lost_ends_the_scan_after_what_was_found() -> None:
     line = Vanishing(Pair([simulated(InvtCHE(2))]))
     findings = scan(line.carry_out, sweeps([InvtCHE], baudrates=[9600], formats=["8N1"]), [InvtCHE])
-    assert drives([next(it for it in findings if isinstance(it, Found))]) == declared(InvtCHE(2))
+    assert drives([next(finding for finding in findings if isinstance(finding, Found))]) == declared(
+        InvtCHE(2)
+    )
     with pytest.raises(LineError, match=r"^port: the port was lost \(hung up\)$"):
         list(findings)
 
@@ -470,7 +476,7 @@ def test_every_question_is_a_read_of_the_documents() -> None:
     for sweep in sweeps(FAMILIES):
         assert sweep.request.function in READS[sweep.framing]
         for family in sweep.families:
-            reads = {it.table.read for it in family.registers.values() if it.readable}
+            reads = {register.table.read for register in family.registers.values() if register.readable}
             assert sweep.request.function in reads
     assert len(set(questions(sweeps(FAMILIES)))) < 10
 
@@ -486,11 +492,11 @@ class Bare(SimulatedIBD):
 
 def test_an_ibd_that_does_not_show_its_line_is_named_in_doubt() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
-    line = Line(Pair([Bare(it) for it in bare]))
+    line = Line(Pair([Bare(each) for each in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
     findings = found(line, plan)
     assert drives(findings) == declared(*bare)
-    assert {it.doubt for it in findings} == {"it only reads like one: look at its name plate"}
+    assert {finding.doubt for finding in findings} == {"it only reads like one: look at its name plate"}
     text = plant_text("/dev/ttyUSB0", findings, MODELS)
     assert text.count("# it only reads like one: look at its name plate") == 2
     assert text.count("# confirmed = 1  # once its name plate says so") == 2
@@ -515,6 +521,6 @@ class Anything(SimulatedDrive):
 
 def test_a_device_that_answers_everything_is_of_no_family() -> None:
     line = Line(Pair([Anything(Toy(7))]))
-    (it,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
-    assert isinstance(it, Found)
-    assert (it.address, it.models) == (7, ())
+    (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
+    assert isinstance(answering, Found)
+    assert (answering.address, answering.models) == (7, ())

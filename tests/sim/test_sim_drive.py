@@ -206,7 +206,12 @@ def test_a_class_of_one_s_own_needs_no_family() -> None:
 
 
 def every_register() -> list[tuple[Register[float], int]]:
-    return [(it, at) for it in Own.registers.values() if it.readable for at in range(it.words)]
+    return [
+        (register, at)
+        for register in Own.registers.values()
+        if register.readable
+        for at in range(register.words)
+    ]
 
 
 @pytest.mark.parametrize(("register", "at"), every_register(), ids=str)

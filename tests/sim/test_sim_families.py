@@ -811,7 +811,7 @@ def test_yd_preset_speeds(yd: Bench, bits: int, speed: int) -> None:
         (0x0802, 64),
         (0x0803, 101),
     ],
-    ids=lambda it: f"{it:04X}",
+    ids=lambda each: f"{each:04X}",
 )
 def test_yd_refuses_what_is_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
     before = yd.ask(3, address)
@@ -896,7 +896,7 @@ def test_every_family_can_be_encoded(family: type[Drive]) -> None:
     drive = family(5)
     known = drive.known_counts()
     wire = Wire([EncodedDrive(drive)], unpaced=True)
-    for at, register in enumerate(it for it in family.registers.values() if it.readable):
+    for at, register in enumerate(each for each in family.registers.values() if each.readable):
         table = register.table
         asked = Message(5, table.read or 0, register.address, 1)
         if drive.framing is Framing.DELIXI:

@@ -28,7 +28,7 @@ START = checksums.rtu("01 06 10 00 C4 00")  # of a YD1000
 WHOLE = 5.0  # s, in which all that is on its way comes
 
 
-class Heard:
+class LineClient:
     """A client's view of a hostile line, on a clock that moves with its requests."""
 
     def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
@@ -51,12 +51,12 @@ def bits(one: bytes, other: bytes) -> int:
 
 
 def test_without_faults_it_is_a_wire() -> None:
-    assert Heard().bytes_after() == REPLY
+    assert LineClient().bytes_after() == REPLY
 
 
 def test_the_same_seed_brings_the_same_faults() -> None:
     def story(seed: int) -> list[Any]:
-        line = Heard(seed=seed, drop=0.2, delay=0.3, noise=0.2, merge=0.2, split=0.3)
+        line = LineClient(seed=seed, drop=0.2, delay=0.3, noise=0.2, merge=0.2, split=0.3)
         return [line.after() for _ in range(50)]
 
     assert story(1) == story(1) != story(2)
@@ -64,68 +64,68 @@ def test_the_same_seed_brings_the_same_faults() -> None:
 
 @pytest.mark.parametrize(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
 def test_a_frame_is_damaged_once(fault: str, length: int) -> None:
-    line = Heard(**{fault: 0.5})
+    line = LineClient(**{fault: 0.5})
     found = [line.bytes_after() for _ in range(200)]
-    damaged = [it for it in found if it not in (REPLY, b"")]
+    damaged = [each for each in found if each not in (REPLY, b"")]
     assert 20 < len(damaged) < 80  # half of them, where the request was spared
-    assert {len(it) - len(REPLY) for it in damaged} == {length}
+    assert {len(each) - len(REPLY) for each in damaged} == {length}
     if fault == "flip":
-        assert {bits(it, REPLY) for it in damaged} == {1}
+        assert {bits(each, REPLY) for each in damaged} == {1}
     assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
 
 
 def test_a_reply_comes_twice() -> None:
-    assert Heard(twice=1).bytes_after() == 2 * REPLY
+    assert LineClient(twice=1).bytes_after() == 2 * REPLY
 
 
 def test_a_reply_comes_late() -> None:
-    usual = Heard().after()[0][0]
-    delays = [Heard(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
+    usual = LineClient().after()[0][0]
+    delays = [LineClient(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
     assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
 
 
 def test_a_reply_waits_for_the_next_one() -> None:
-    line = Heard(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
+    line = LineClient(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
     line.wire.receive(READ, 0.0)
     assert timeline(line.wire, 0.3) == []
     line.wire.receive(checksums.rtu("02 03 00 02 00 01"), 0.3)
-    heard = timeline(line.wire, WHOLE)
-    assert b"".join(piece for _, piece in heard) == REPLY + checksums.rtu("02 03 02 00 00")
-    assert heard[-1][0] < 0.5
+    received = timeline(line.wire, WHOLE)
+    assert b"".join(piece for _, piece in received) == REPLY + checksums.rtu("02 03 02 00 00")
+    assert received[-1][0] < 0.5
 
 
 def test_a_reply_waits_only_so_long_for_the_next_one() -> None:
-    line = Heard(merge=1, late=0.2)
-    heard = line.after()
-    assert b"".join(piece for _, piece in heard) == REPLY
-    assert heard[-1][0] < 0.4
+    line = LineClient(merge=1, late=0.2)
+    received = line.after()
+    assert b"".join(piece for _, piece in received) == REPLY
+    assert received[-1][0] < 0.4
 
 
 def test_a_reply_has_a_pause_inside() -> None:
     pauses = []
     for seed in range(50):
-        times, pieces = zip(*Heard(split=1, pause=0.5, seed=seed).after(), strict=True)
+        times, pieces = zip(*LineClient(split=1, pause=0.5, seed=seed).after(), strict=True)
         assert b"".join(pieces) == REPLY
         pauses.append(times[-1] - times[0] - 6 * Toy(1).settings.character)
     assert max(pauses) > 0.4
 
 
 def test_a_request_comes_back() -> None:
-    assert Heard(echo=1).bytes_after() == READ + REPLY
+    assert LineClient(echo=1).bytes_after() == READ + REPLY
 
 
 def test_noise_is_heard_before_a_reply_and_by_the_drives() -> None:
     lengths = set()
-    line = Heard(noise=1, burst=9)
+    line = LineClient(noise=1, burst=9)
     for _ in range(100):
-        heard = line.bytes_after()
-        assert heard.endswith(REPLY)
-        lengths.add(len(heard) - len(REPLY))
+        received = line.bytes_after()
+        assert received.endswith(REPLY)
+        lengths.add(len(received) - len(REPLY))
     assert lengths == set(range(1, 10))
 
 
 def test_noise_comes_with_a_motor_s_start() -> None:
-    line = Heard(simulated(YD1000(1)), start_noise=1)
+    line = LineClient(simulated(YD1000(1)), start_noise=1)
     stop = checksums.rtu("01 06 10 00 C0 00")
     assert line.bytes_after(stop) == stop
     assert len(line.bytes_after(START)) > len(START)

@@ -37,9 +37,9 @@ def expected(address: int = 1) -> bytes:
 
 def exchange(fd: int, request: Message, framing: Framing = Framing.RTU) -> Message:
     os.write(fd, build_request(framing, request))
-    heard = receive(fd, reply_length(framing, request))
-    used, reply = parse_reply(framing, heard, request)
-    assert used == len(heard)
+    received = receive(fd, reply_length(framing, request))
+    used, reply = parse_reply(framing, received, request)
+    assert used == len(received)
     assert reply is not None
     return reply
 
@@ -69,8 +69,8 @@ def test_many_lines_are_one_thread() -> None:
     before = threads()
     with Simulator(wires) as sim:
         assert threads() == before + 1
-        for at, it in enumerate(sim.wires, 1):
-            with opened(it.path) as fd:
+        for at, each in enumerate(sim.wires, 1):
+            with opened(each.path) as fd:
                 assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)
 
 

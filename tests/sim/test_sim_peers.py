@@ -42,7 +42,7 @@ def values(done: subprocess.CompletedProcess[str]) -> list[str]:
         (InvtCHE(247), "output_voltage", 231, "-r 12291 -c 1 -t 4 -1", ["231"]),
         (InnovertIBD(1), "output_current", 2.5, "-r 3 -c 1 -t 4 -1", ["25"]),
     ],
-    ids=lambda it: it.name if isinstance(it, Drive) else str(it),
+    ids=lambda each: each.name if isinstance(each, Drive) else str(each),
 )
 def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown: list[str]) -> None:
     sim = simulated(drive)
@@ -59,7 +59,7 @@ def test_mbpoll_reads(drive: Drive, name: str, value: float, options: str, shown
         (MyCHE(1), "-r 11 -t 4", [70], "acceleration_time", 7),
         (InnovertIBD(1), "-r 107 -t 4", [200], "acceleration_time", 20),
     ],
-    ids=lambda it: it.name if isinstance(it, Drive) else str(it),
+    ids=lambda each: each.name if isinstance(each, Drive) else str(each),
 )
 def test_mbpoll_writes(drive: Drive, options: str, raw: list[int], name: str, value: float) -> None:
     sim = simulated(drive)

@@ -27,11 +27,11 @@ def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) 
 def test_the_reply_waits_for_the_request_s_last_bit_and_the_drive() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.02)])
     wire.receive(READ, 10.0)
-    heard = timeline(wire, 11.0)
-    assert b"".join(piece for _, piece in heard) == checksums.rtu("01 03 02 00 00")
+    received = timeline(wire, 11.0)
+    assert b"".join(piece for _, piece in received) == checksums.rtu("01 03 02 00 00")
     begin = 10.0 + 8 * CHARACTER_8N1 + 0.02
-    assert heard[0][0] == pytest.approx(begin + CHARACTER_8N1)
-    assert heard[-1][0] == pytest.approx(begin + 7 * CHARACTER_8N1)
+    assert received[0][0] == pytest.approx(begin + CHARACTER_8N1)
+    assert received[-1][0] == pytest.approx(begin + 7 * CHARACTER_8N1)
 
 
 @pytest.mark.parametrize("baudrate", [1200, 9600, 19200, 38400, 115200])
@@ -63,7 +63,7 @@ def test_an_rtu_drive_keeps_t3_5_even_if_it_is_quicker() -> None:
         (InnovertIBD(1), "01 03 00 03 00 01", 10e-3),
         (YD1000(1), "01 03 11 00 00 01", 24 * 11 / 9600),
     ],
-    ids=lambda it: getattr(it, "model", None),
+    ids=lambda each: getattr(each, "model", None),
 )
 def test_each_family_s_silence_before_its_reply(drive: Drive, request_: str, silence: float) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
@@ -122,11 +122,11 @@ def test_a_quick_drive_does_not_wait_for_a_slow_one_s_late_reply() -> None:
     wire = Wire([slow, quick])
     wire.receive(READ, 0.0)
     wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.2)
-    heard = timeline(wire, 5.0)
+    received = timeline(wire, 5.0)
     quick_reply, slow_reply = checksums.rtu("02 03 02 00 02"), checksums.rtu("01 03 02 00 01")
-    assert b"".join(piece for _, piece in heard) == quick_reply + slow_reply
-    assert heard[6][0] == pytest.approx(0.2 + 0.01 + (8 + 7) * CHARACTER_8N1)
-    assert heard[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
+    assert b"".join(piece for _, piece in received) == quick_reply + slow_reply
+    assert received[6][0] == pytest.approx(0.2 + 0.01 + (8 + 7) * CHARACTER_8N1)
+    assert received[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
 
 
 def test_replies_that_meet_follow_one_another() -> None:
@@ -134,10 +134,10 @@ def test_replies_that_meet_follow_one_another() -> None:
     wire = Wire([slow, quick])
     wire.receive(READ, 0.0)
     wire.receive(checksums.rtu("02 03 00 01 00 01"), 0.487)
-    heard = timeline(wire, 5.0)
+    received = timeline(wire, 5.0)
     first, second = checksums.rtu("02 03 02 00 00"), checksums.rtu("01 03 02 00 00")
-    assert b"".join(piece for _, piece in heard) in (first + second, second + first)
-    assert heard[-1][0] - heard[0][0] == pytest.approx(13 * CHARACTER_8N1)
+    assert b"".join(piece for _, piece in received) in (first + second, second + first)
+    assert received[-1][0] - received[0][0] == pytest.approx(13 * CHARACTER_8N1)
 
 
 def test_a_late_reply_is_sent_all_the_same() -> None:
@@ -146,8 +146,8 @@ def test_a_late_reply_is_sent_all_the_same() -> None:
     wire = Wire([slow, quick])
     wire.receive(READ, 0.0)
     assert timeline(wire, 0.2) == []
-    heard = exchange(wire, checksums.rtu("02 03 00 01 00 01"), 0.6)
-    assert heard == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
+    received = exchange(wire, checksums.rtu("02 03 00 01 00 01"), 0.6)
+    assert received == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
 
 
 def test_two_framings_share_a_line() -> None:
@@ -215,7 +215,7 @@ def test_noise_can_be_put_on_replies() -> None:
 
 
 def test_a_wire_that_nothing_happens_on_needs_no_waking() -> None:
-    wire = Wire([simulated(it) for it in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
+    wire = Wire([simulated(each) for each in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
     assert wire.wake is None
     wire.receive(b"\x01", 0.0)
     assert wire.wake is not None

@@ -26,7 +26,7 @@ def test_a_signal_ends_it_though_its_handler_is_not_called() -> None:
 
     over = threading.Event()
     simulators: list[Simulator] = []
-    threads = [threading.Thread(target=it) for it in (terminate, end_at_last)]
+    threads = [threading.Thread(target=each) for each in (terminate, end_at_last)]
 
     def begin(simulator: Simulator) -> None:
         simulators.append(simulator)

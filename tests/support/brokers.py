@@ -100,7 +100,7 @@ def _running(broker: Broker) -> Iterator[Broker]:
         broker.kill()
 
 
-class Heard(NamedTuple):
+class Published(NamedTuple):
     topic: str
     is_retained: bool
     payload: bytes
@@ -116,8 +116,8 @@ class Listener:
             stdout=subprocess.PIPE,
             text=True,
         )
-        self._heard: queue.Queue[Heard] = queue.Queue()
-        self.all: list[Heard] = []
+        self._received: queue.Queue[Published] = queue.Queue()
+        self.all: list[Published] = []
         self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
@@ -135,16 +135,16 @@ class Listener:
             if topic == self._probe:
                 self._hears.set()
             else:
-                self._heard.put(Heard(topic, kept == "1", bytes.fromhex(payload)))
+                self._received.put(Published(topic, kept == "1", bytes.fromhex(payload)))
 
-    def wait_for(self, wanted: Callable[[Heard], object]) -> Heard:
+    def wait_for(self, wanted: Callable[[Published], object]) -> Published:
         """Return the next message that is wanted; those before it are kept in `all`."""
         ends = time.monotonic() + PATIENCE_S
         while True:
-            heard = self._heard.get(timeout=max(0.0, ends - time.monotonic()))
-            self.all.append(heard)
-            if wanted(heard):
-                return heard
+            received = self._received.get(timeout=max(0.0, ends - time.monotonic()))
+            self.all.append(received)
+            if wanted(received):
+                return received
 
     def close(self) -> None:
         self._process.kill()

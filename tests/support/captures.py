@@ -1,4 +1,4 @@
-"""Captures of printed exchanges, and Wireshark's view of a capture."""
+"""Captures of printed exchanges, and what Wireshark and we make of a capture."""
 
 from __future__ import annotations
 
@@ -6,21 +6,31 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path
 
-from frames import Printed
+from frames import PRINTED, Printed
 from peers import require_program
 
-from multidrop.capture import CaptureWriter, Side
+from multidrop.capture import Capture, CaptureWriter, Decoding, Side
+from multidrop.core import FrameSpan, Framing, Message, Splitter
+from multidrop.plant.model import Plant
+from multidrop.polling.batch import Row
 
 BEGIN = 1_700_000_000_123_456_789
 STEP = 5_000_001  # ns between two frames
+
+RTU = [
+    each
+    for each in PRINTED
+    if each.request is not None and isinstance(each.says, Message) and each.framing is Framing.RTU
+]
+TEXT = [each for each in PRINTED if each.request is not None and each.framing is not Framing.RTU]
 
 
 def write(path: Path, exchanges: Iterable[Printed], line: str = "hall-1") -> Path:
     with CaptureWriter(path) as capture:
         time = BEGIN
-        for it in exchanges:
-            capture.write(it.request_frame, Side.ASKING, time, line)
-            capture.write(it.frame, Side.ANSWERING, time + STEP, line)
+        for exchange in exchanges:
+            capture.write(exchange.request_frame, Side.ASKING, time, line)
+            capture.write(exchange.frame, Side.ANSWERING, time + STEP, line)
             time += 2 * STEP
     return path
 
@@ -47,3 +57,20 @@ def tshark(path: Path) -> list[dict[str, str]]:
 
 def decimal(text: str) -> list[int]:
     return [int(number) for number in text.split(",")]
+
+
+def spans(path: Path) -> dict[str, list[FrameSpan]]:
+    """Return the frames of a capture, by line."""
+    found: dict[str, list[FrameSpan]] = {}
+    splitters: dict[str, Splitter] = {}
+    with Capture(path) as capture:
+        for _ in capture:
+            for name, stream in zip(capture.lines, capture.streams, strict=True):
+                splitter = splitters.setdefault(name, Splitter())
+                found.setdefault(name, []).extend(splitter.spans(stream))
+    return found
+
+
+def rows(path: Path, plant: Plant | None = None) -> list[Row]:
+    with Capture(path) as capture:
+        return [row for batch in Decoding(capture, plant) for row in batch]

@@ -29,12 +29,12 @@ class Reach:
 
 def of_python(report: Path) -> dict[str, Reach]:
     found = {}
-    for path, it in json.loads(report.read_text())["files"].items():
-        summary = it["summary"]
+    for path, each in json.loads(report.read_text())["files"].items():
+        summary = each["summary"]
         name = "src/multidrop/" + path.rpartition("multidrop/")[2]
-        missed = set(it["missing_lines"])
-        untaken = {(line, to) for line, to in it["missing_branches"] if line not in missed}
-        figures = (summary[it] for it in ("num_statements", "num_branches", "covered_branches"))
+        missed = set(each["missing_lines"])
+        untaken = {(line, to) for line, to in each["missing_branches"] if line not in missed}
+        figures = (summary[each] for each in ("num_statements", "num_branches", "covered_branches"))
         found[name] = Reach(*figures, missed, untaken)
     return found
 
@@ -44,14 +44,14 @@ def of_c(build: Path) -> dict[str, Reach]:
     for counts in sorted(build.rglob("*.gcda")):
         command = ["gcov", "--json-format", "--stdout", "--branch-probabilities", counts]
         text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        for file in (it for line in text.splitlines() for it in json.loads(line)["files"]):
+        for file in (load for line in text.splitlines() for load in json.loads(line)["files"]):
             if "/csrc/" not in file["file"]:
                 continue
             reach = found["csrc/" + file["file"].rpartition("/csrc/")[2]]
             for line in file["lines"]:
                 number, ways = line["line_number"], line["branches"]
                 reach.lines += 1
-                untaken = {(number, way) for way, it in enumerate(ways) if it["count"] == 0}
+                untaken = {(number, way) for way, each in enumerate(ways) if each["count"] == 0}
                 reach.branches += len(ways)
                 reach.taken += len(ways) - len(untaken)
                 if line["count"]:
@@ -63,9 +63,9 @@ def of_c(build: Path) -> dict[str, Reach]:
 
 def spans(numbers: Iterable[int]) -> str:
     """1-3 7 9-10"""
-    runs = groupby(enumerate(sorted(numbers)), lambda it: it[1] - it[0])
+    runs = groupby(enumerate(sorted(numbers)), lambda each: each[1] - each[0])
     ends = [[number for _, number in run] for _, run in runs]
-    return " ".join(f"{it[0]}-{it[-1]}" if len(it) > 1 else f"{it[0]}" for it in ends)
+    return " ".join(f"{end[0]}-{end[-1]}" if len(end) > 1 else f"{end[0]}" for end in ends)
 
 
 def room(name: str) -> str:
@@ -80,9 +80,9 @@ def main(report: str, build: str) -> None:
         rooms[room(name)].append(reach)
     print(f"{'':28}{'lines':>8}{'reached':>9}{'branches':>10}{'reached':>9}")
     for name, reaches in [*rooms.items(), ("all", [*reached.values()])]:
-        lines, branches = sum(it.lines for it in reaches), sum(it.branches for it in reaches)
-        hit = lines - sum(len(it.missed) for it in reaches)
-        taken = sum(it.taken for it in reaches)
+        lines, branches = sum(each.lines for each in reaches), sum(each.branches for each in reaches)
+        hit = lines - sum(len(each.missed) for each in reaches)
+        taken = sum(each.taken for each in reaches)
         print(f"{name:28}{lines:8}{hit / (lines or 1):9.1%}{branches:10}{taken / (branches or 1):9.1%}")
     for name, reach in sorted(reached.items()):
         if reach.missed:

@@ -11,9 +11,9 @@ from typing import Any
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.options import Option
 from multidrop.drive.register import Register
 from multidrop.drive.table import COIL, HOLDING, Kept, Table
-from multidrop.drive.verbs import Option
 from multidrop.family_file.verbs import add_verbs
 from multidrop.toml_check import TomlPlace
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from damage import COIL_VALUES, ECHOES, FUNCTIONS, MOST, READS, Said, data_bytes, request_body
-from judges import Heard, Verdict
+from judges import Understood, Verdict
 
 LIBMODBUS, PYMODBUS_RTU, PYMODBUS_ASCII = "libmodbus", "pymodbus rtu", "pymodbus ascii"
 PYMODBUS = (PYMODBUS_RTU, PYMODBUS_ASCII)
@@ -204,8 +204,8 @@ REPLIES = [
 @dataclass(frozen=True)
 class Difference:
     said: Said
-    ours: Heard | Verdict
-    theirs: Heard | Verdict
+    ours: Understood | Verdict
+    theirs: Understood | Verdict
 
     @property
     def kind(self) -> str:
@@ -218,15 +218,17 @@ def explain(differences: Iterable[Difference], rules: list[Rule], judge: str) ->
     """Every difference has its rule, and every rule its difference."""
     rules = [rule for rule in rules if judge in rule.judges]
     stale = list(rules)
-    for it in differences:
-        found = next((rule for rule in rules if rule.kind == it.kind and rule.when(it.said)), None)
-        assert found is not None, f"{judge} differs without a rule ({it.kind}): {it}"
+    for difference in differences:
+        found = next(
+            (rule for rule in rules if rule.kind == difference.kind and rule.when(difference.said)), None
+        )
+        assert found is not None, f"{judge} differs without a rule ({difference.kind}): {difference}"
         if found in stale:
             stale.remove(found)
     assert not stale, f"{judge} does not differ any more: {[rule.reason for rule in stale]}"
 
 
-def compare(said: Said, ours: Heard | Verdict, theirs: Heard | Verdict) -> list[Difference]:
+def compare(said: Said, ours: Understood | Verdict, theirs: Understood | Verdict) -> list[Difference]:
     """Nothing where both refuse, or both take it for the same."""
     if (isinstance(ours, str) and isinstance(theirs, str)) or ours == theirs:
         return []

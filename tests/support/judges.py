@@ -50,22 +50,25 @@ class Libmodbus:
         done = subprocess.run([self._program], input=said, capture_output=True, text=True, check=True)
         return done.stdout.splitlines()
 
-    def hear(self, requests: Sequence[Said]) -> list[Heard | str]:
+    def hear(self, requests: Sequence[Said]) -> list[Understood | str]:
         """Return what its server does at these requests, each addressed to it."""
-        return [_heard(line) for line in self._run(f"request {_text(it.frame)}" for it in requests)]
+        return [
+            _received(line) for line in self._run(f"request {_text(request.frame)}" for request in requests)
+        ]
 
     def ask(self, replies: Sequence[Said]) -> list[tuple[bytes, Verdict]]:
         """The requests that its client sends, and what it makes of these replies."""
-        asked = [it.request for it in replies]
+        asked = [reply.request for reply in replies]
         lines = [
-            f"reply {it.address} {it.function} {it.start} {it.count} {_text(it.data)} {_text(said.frame)}"
-            for it, said in zip(asked, replies, strict=True)
+            f"reply {ask.address} {ask.function} {ask.start} {ask.count} {_text(ask.data)} "
+            f"{_text(said.frame)}"
+            for ask, said in zip(asked, replies, strict=True)
         ]
-        return [_answered(it, line) for it, line in zip(asked, self._run(lines), strict=True)]
+        return [_answered(each, line) for each, line in zip(asked, self._run(lines), strict=True)]
 
 
 @dataclass(frozen=True)
-class Heard:
+class Understood:
     """A server's understanding, as far as it shows: bytes used, its reply, and cells (table, address)."""
 
     used: int
@@ -73,13 +76,13 @@ class Heard:
     changes: dict[tuple[int, int], int] = field(default_factory=dict)
 
 
-def _heard(line: str) -> Heard | str:
+def _received(line: str) -> Understood | str:
     word, *rest = line.split()
     if word == "refused":
         return line
     used, reply, changes = rest
     cells = [cell.split(":") for cell in changes.split(",") if changes != "-"]
-    return Heard(
+    return Understood(
         int(used),
         b"" if reply == "-" else bytes.fromhex(reply),
         {(int(table), int(address)): int(value) for table, address, value in cells},
@@ -112,11 +115,11 @@ def _confirmed(request: Message, values: str) -> Message:
 # ---- what a server with the judge's cells must do ----
 
 
-def expected(used: int, request: Message) -> Heard:
+def expected(used: int, request: Message) -> Understood:
     """The same of a server that understood this, by the application protocol V1.1b3, section 6."""
     changes: dict[tuple[int, int], int] = {}
     reply = _carry_out(request, changes)
-    return Heard(used, reply if request.address else b"", changes)
+    return Understood(used, reply if request.address else b"", changes)
 
 
 def _cell(function: int, address: int) -> int:

@@ -80,10 +80,10 @@ class LateWire(Wire):
 
     def advance(self, now: float) -> bytes:
         self._now = now
-        heard = super().advance(now)
+        received = super().advance(now)
         while self._late and self._late[0][0] <= now:
-            heard += heapq.heappop(self._late)[1]
-        return heard
+            received += heapq.heappop(self._late)[1]
+        return received
 
     @property
     def wake(self) -> float | None:
@@ -145,7 +145,7 @@ def rows_of(poller: Poller) -> list[Row]:
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:
     """The same for all that is polled, by the names of drive and register."""
     return {
-        (it.drive.name, poll.register.name): proof(it.drive, poll.register)
-        for it in drives
-        for poll in it.polls
+        (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
+        for drive in drives
+        for poll in drive.polls
     }

@@ -24,12 +24,12 @@ assert set(MAKE) == set(MODELS)
 
 # What starts the motor, of each family, by address and value, in the documents' words.
 STARTS: dict[str, Callable[[Message], bool]] = {
-    "erman-er-g-220": lambda it: it.function in (5, 15) and it.start == 0 and it.data != b"\0\0",
-    "invt-che": lambda it: it.start == 0x1000 and it.data[-1] in (1, 2, 3, 4),
-    "innovert-ibd": lambda it: it.start == 0x2000 and bool(it.data[-1] & 2),
-    "delixi-modbus": lambda it: it.start == 0x2000 and bool(it.data[-1] & 2),
-    "delixi-native": lambda it: it.function == 2 and it.start in (2, 3),
-    "yd1000": lambda it: it.start == 0x1000 and (bool(it.data[0] & 0x05) or not it.data[0] & 0x80),
+    "erman-er-g-220": lambda each: each.function in (5, 15) and each.start == 0 and each.data != b"\0\0",
+    "invt-che": lambda each: each.start == 0x1000 and each.data[-1] in (1, 2, 3, 4),
+    "innovert-ibd": lambda each: each.start == 0x2000 and bool(each.data[-1] & 2),
+    "delixi-modbus": lambda each: each.start == 0x2000 and bool(each.data[-1] & 2),
+    "delixi-native": lambda each: each.function == 2 and each.start in (2, 3),
+    "yd1000": lambda each: each.start == 0x1000 and (bool(each.data[0] & 0x05) or not each.data[0] & 0x80),
 }
 FAMILIES: dict[str, type[Drive]] = {**MODELS, "fan": Fan}
 WRITES = (5, 6, 15, 16)
@@ -43,7 +43,7 @@ def quick(kind: str) -> type[Drive]:
     return type(family.__name__, (family,), without)
 
 
-class Heard:
+class ReceivedRequests:
     """The requests that reach a simulated drive; `loses(request)` says whether its reply is lost."""
 
     def __init__(self, sim: MotorDrive) -> None:
@@ -64,8 +64,8 @@ class Heard:
     @property
     def writes(self) -> list[Message]:
         own = DELIXI_WRITES if self.sim.drive.model == "delixi-native" else WRITES
-        return [it for it in self.requests if it.function in own]
+        return [request for request in self.requests if request.function in own]
 
     @property
     def starts(self) -> list[Message]:
-        return [it for it in self.writes if STARTS[self.sim.drive.model](it)]
+        return [write for write in self.writes if STARTS[self.sim.drive.model](write)]

@@ -35,10 +35,10 @@ class PathWire(WorldWire):
         if said:
             before = self._path[-1][0] if self._path else 0.0
             self._path.append((max(before, now + self.delay(now)), said))
-        heard = b""
+        received = b""
         while self._path and self._path[0][0] <= now:
-            heard += self._path.popleft()[1]
-        return heard
+            received += self._path.popleft()[1]
+        return received
 
     @property
     def wake(self) -> float | None:

@@ -139,13 +139,13 @@ def _word(request: Message) -> int:
 
 # What turns the motor, of each family, by address and word, in the manuals' words; written by hand.
 STARTS: dict[str, Callable[[Message], bool]] = {
-    "abb-acs355": lambda it: it.start == 0 and _word(it) & 0x09 == 0x09,
-    "siemens-v20": lambda it: it.start == 99 and _word(it) & 0x09 == 0x09,
-    "schneider-atv320": lambda it: it.start == 8501 and _word(it) & 0x0F == 0x0F,
-    "danfoss-fc51": lambda it: it.start == 49999 and bool(_word(it) & 0x0140),
-    "delta-vfd-el": lambda it: it.start == 0x2000 and bool(_word(it) & 0x02),
-    "invt-goodrive": lambda it: it.start == 0x2000 and _word(it) in (1, 2, 3, 4),
-    "optidrive-e3": lambda it: it.start == 0 and bool(_word(it) & 0x01),
+    "abb-acs355": lambda each: each.start == 0 and _word(each) & 0x09 == 0x09,
+    "siemens-v20": lambda each: each.start == 99 and _word(each) & 0x09 == 0x09,
+    "schneider-atv320": lambda each: each.start == 8501 and _word(each) & 0x0F == 0x0F,
+    "danfoss-fc51": lambda each: each.start == 49999 and bool(_word(each) & 0x0140),
+    "delta-vfd-el": lambda each: each.start == 0x2000 and bool(_word(each) & 0x02),
+    "invt-goodrive": lambda each: each.start == 0x2000 and _word(each) in (1, 2, 3, 4),
+    "optidrive-e3": lambda each: each.start == 0 and bool(_word(each) & 0x01),
 }
 
 # The families that ship as files, with the one above whose words they share.

@@ -30,7 +30,7 @@ def opened(path: str, baudrate: int = 9600) -> Iterator[int]:
 
 
 def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
-    heard = b""
-    while len(heard) < length and select.select([fd], [], [], patience)[0]:
-        heard += os.read(fd, 1024)
-    return heard
+    received = b""
+    while len(received) < length and select.select([fd], [], [], patience)[0]:
+        received += os.read(fd, 1024)
+    return received

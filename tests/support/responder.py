@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from responder_line import Heard, ResponderLine
+from responder_line import ReceivedFrame, ResponderLine
 from responder_telnet import Telnet
 
-__all__ = ["Heard", "Responder", "ResponderLine"]
+__all__ = ["ReceivedFrame", "Responder", "ResponderLine"]
 
 
 class Responder:
@@ -52,9 +52,9 @@ class Responder:
                 self._links.append(directory / f"line-{number}")
                 self._plug_in(line)
                 self.ports.append(str(self._links[-1]))
-        for line, it in zip(self.lines, self._listening, strict=False):
-            self._listen(line, it)
-            host, port = it.getsockname()
+        for line, each in zip(self.lines, self._listening, strict=False):
+            self._listen(line, each)
+            host, port = each.getsockname()
             self.ports.append(f"{'rfc2217' if telnet else 'socket'}://{host}:{port}")
         self._thread = threading.Thread(target=self._run, name="responder", daemon=True)
         self._done = False

@@ -44,23 +44,25 @@ class Kind:
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
-    return lambda it: (it.function, it.start) == (function, start) and judge(it.value)
+    return lambda each: (each.function, each.start) == (function, start) and judge(each.value)
 
 
-def _erman_moves(it: Asked) -> bool:
+def _erman_moves(asked: Asked) -> bool:
     """START on, or STOP or EMERGENCY STOP off (section 10, commands)."""
-    start = (it.start, it.value) == (0, COIL_ON)
-    return it.function == 15 or (it.function == 5 and (start or (it.start in (1, 2) and it.value == 0)))
+    start = (asked.start, asked.value) == (0, COIL_ON)
+    return asked.function == 15 or (
+        asked.function == 5 and (start or (asked.start in (1, 2) and asked.value == 0))
+    )
 
 
-def _erman_stops(it: Asked) -> bool:
-    off = (it.start, it.value) == (0, 0)
-    return it.function == 5 and (off or (it.start in (1, 2) and it.value == COIL_ON))
+def _erman_stops(asked: Asked) -> bool:
+    off = (asked.start, asked.value) == (0, 0)
+    return asked.function == 5 and (off or (asked.start in (1, 2) and asked.value == COIL_ON))
 
 
 KINDS = {
-    it.name: it
-    for it in (
+    each.name: each
+    for each in (
         Kind(
             "erman-er-g-220",
             _erman_moves,
@@ -102,8 +104,8 @@ KINDS = {
         ),
         Kind(
             "delixi-native",
-            lambda it: it.function == 2 and it.start in (2, 3),
-            lambda it: it.function == 2 and it.start == 1,
+            lambda each: each.function == 2 and each.start in (2, 3),
+            lambda each: each.function == 2 and each.start == 1,
             {0: 2, 1: 1, 2: 2000, 428: 3},
             {500: 2000},
             "counter",

@@ -20,7 +20,7 @@ LENGTHS = dict.fromkeys((*READS, 5, 6, 8), 8)
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedFrame:
     """One frame as it came; `what` is moves, stops, writes, reads or damaged."""
 
     at: int  # ns, CLOCK_MONOTONIC, when it was read from the port
@@ -107,8 +107,8 @@ class ResponderLine:
     """
 
     def __init__(self, drives: Sequence[ResponderDrive]) -> None:
-        self.drives = {it.address: it for it in drives}
-        self.log: list[Heard] = []
+        self.drives = {drive.address: drive for drive in drives}
+        self.log: list[ReceivedFrame] = []
         self.troubles: list[str | int] = []
         self.deaf_until = 0.0  # s, CLOCK_MONOTONIC
         self.delay = 0.0
@@ -155,7 +155,9 @@ class ResponderLine:
 
     def _answer(self, frame: bytes, asked: Asked | None) -> list[bytes]:
         drives = [] if asked is None else self._addressed(asked.address)
-        self.log.append(Heard(time.monotonic_ns(), self.connection, frame, _what(asked, drives), asked))
+        self.log.append(
+            ReceivedFrame(time.monotonic_ns(), self.connection, frame, _what(asked, drives), asked)
+        )
         if asked is None or not drives:
             return []
         self._count()

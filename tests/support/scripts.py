@@ -54,7 +54,7 @@ class Wire:
         self.says: dict[str, list[Any]] = {}
         self.say(says or {})
         self.turns = turns or {}
-        self.loses = {text: list(it) for text, it in (loses or {}).items()}
+        self.loses = {text: list(each) for text, each in (loses or {}).items()}
         self.held: dict[str, Any] = {}
         self.sent: list[str] = []
         self.reads: list[str] = []
@@ -63,7 +63,7 @@ class Wire:
 
     def say(self, says: Mapping[str, Any]) -> None:
         """From now on."""
-        self.says |= {name: list(it) if isinstance(it, list) else [it] for name, it in says.items()}
+        self.says |= {name: list(each) if isinstance(each, list) else [each] for name, each in says.items()}
 
     def run(self, script: Script[Any]) -> Any:
         return self._run(script, self._step)
@@ -116,13 +116,13 @@ def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
     """Every register as (table, address, name, unit or enumeration, step)."""
     return {
         (
-            f"{it.table.read or 0:02X}/{it.table.write or 0:02X}",
-            f"{it.address:04X}",
+            f"{each.table.read or 0:02X}/{each.table.write or 0:02X}",
+            f"{each.address:04X}",
             name,
-            it.values.__name__ if it.values is not None else it.unit,
-            it.step if it.values is None else None,
+            each.values.__name__ if each.values is not None else each.unit,
+            each.step if each.values is None else None,
         )
-        for name, it in drive.registers.items()
+        for name, each in drive.registers.items()
     }
 
 

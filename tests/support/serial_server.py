@@ -47,8 +47,8 @@ class SerialServer:
 
     def _copy_back(self, client: socket.socket, manager: rfc2217.PortManager) -> None:
         with suppress(OSError):
-            while heard := self._wire.recv(1024):
-                client.sendall(b"".join(manager.escape(heard)))
+            while answer := self._wire.recv(1024):
+                client.sendall(b"".join(manager.escape(answer)))
 
     def close(self) -> None:
         self._thread.join()

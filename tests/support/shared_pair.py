@@ -105,11 +105,11 @@ class SharedPair:
         for listener in sorted(self._sides, key=lambda side: side == self._spoke):
             if listener == self._spoke and self._drives in said:
                 sleep(SLOT)  # a pty is slow: who is answered may act before the other has heard the answer
-            others = [it for speaker, it in said.items() if speaker != listener]
-            heard = self._mixed(others)
-            if heard:
+            others = [each for speaker, each in said.items() if speaker != listener]
+            received = self._mixed(others)
+            if received:
                 with suppress(BlockingIOError):
-                    os.write(listener, heard)
+                    os.write(listener, received)
 
     def _mixed(self, said: Sequence[bytes]) -> bytes:
         if len(said) < 2:

@@ -22,7 +22,7 @@ class Sniffer:
 
     @property
     def exchanges(self) -> list[dict[str, Any]]:
-        return [it for it in self.told if it.get("result") == "ok"]
+        return [record for record in self.told if record.get("result") == "ok"]
 
     @property
     def summary(self) -> dict[str, int]:

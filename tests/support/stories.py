@@ -26,7 +26,7 @@ REGISTERS = 5  # of each drive
 EVERY = 0.5  # s, of the first of them; the others as fast as the line allows
 HEALTHY, FAULTY = 4.0, 8.0  # s
 CYCLES = 10  # in which the rate must be back, but for what one of them holds
-UNASKED = {str(it) for it in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
+UNASKED = {str(each) for each in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 
@@ -121,7 +121,9 @@ class Story:
         assert Counter(line["misses"]) == misses
         slots = int(self.world.seconds / self.every) - 1 if self.every else 0
         rows = Counter((row.drive, row.register) for row in self.rows)
-        missing = sum(max(0, slots - rows[it.drive.name, it.polls[0].register.name]) for it in self.asked)
+        missing = sum(
+            max(0, slots - rows[each.drive.name, each.polls[0].register.name]) for each in self.asked
+        )
         assert missing <= line["overrun_slots"]
 
 
@@ -136,4 +138,4 @@ def _longest_gap(rows: Sequence[Row]) -> float:
     times: dict[tuple[str, str], list[int]] = {}
     for row in rows:
         times.setdefault((row.drive, row.register), []).append(row.monotonic_ns)
-    return max(b - a for it in times.values() for a, b in pairwise(it)) / S
+    return max(b - a for time in times.values() for a, b in pairwise(time)) / S

@@ -52,11 +52,11 @@ class Terminal:
 
 @contextmanager
 def on_terminal(*words: object, size: tuple[int, int] = (80, 24), **environment: str) -> Iterator[Terminal]:
-    it = Terminal([*MULTIDROP, *map(str, words)], size, **environment)
+    terminal = Terminal([*MULTIDROP, *map(str, words)], size, **environment)
     try:
-        yield it
+        yield terminal
     finally:
-        it.process.kill()
-        it.process.wait()
-        os.close(it.fd)
-        os.close(it.slave)
+        terminal.process.kill()
+        terminal.process.wait()
+        os.close(terminal.fd)
+        os.close(terminal.slave)

@@ -4,8 +4,9 @@ from enum import IntEnum, IntFlag
 
 from multidrop.drive import Condition, Direction, Drive, Framing, Script, State, read, write
 from multidrop.drive.declare import command, reading, setting
+from multidrop.drive.options import Option
 from multidrop.drive.table import HOLDING, Kept
-from multidrop.drive.verbs import Option, verb
+from multidrop.drive.verbs import verb
 
 
 class Fault(IntEnum):

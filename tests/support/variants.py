@@ -17,7 +17,7 @@ VARIANTS = (  # family, framing, baud rate of the fast line
     (DelixiNative, Framing.DELIXI, 500_000),
     (YD1000, Framing.RTU, 1_000_000),
 )
-REASONS = {str(it) for it in Status} - {str(Status.OK)}
+REASONS = {str(each) for each in Status} - {str(Status.OK)}
 TIMEOUT = 0.02  # s: the shortest there is, which drives that mostly answer at once come to have
 LATEST = 3 * TIMEOUT
 

@@ -19,12 +19,12 @@ class Own(Drive):
 
 def timeline(wire: Wire, until: float) -> list[tuple[float, bytes]]:
     """Every piece that the client hears, at the wake that brings it."""
-    heard = []
+    received = []
     for _ in range(10_000):
         wake = wire.wake
         if wake is None or wake > until:
             break
         piece = wire.advance(wake)
         if piece:
-            heard.append((wake, piece))
-    return heard
+            received.append((wake, piece))
+    return received

@@ -108,7 +108,7 @@ class WorldPort:
         self._wake = ffi.new("int64_t *")
         self._urgent: Any = None
         self._kept: list[object] = []  # the core may still look at it
-        self._heard = b""
+        self._received = b""
         self._guard = threading.RLock()  # as the engine's mutex
         self._is_closed = False
         lib.md_turn_init(self._turn, self._slots, self.room, world.now)
@@ -182,13 +182,13 @@ class WorldPort:
         lib.md_turn_lose(self._turn, ENODEV)
         lib.md_turn_want(self._turn, self._wake, self._world.now)
 
-    def advance(self, heard: bytes) -> int:
+    def advance(self, received: bytes) -> int:
         """Carry on until there is nothing to do but wait; return until when."""
         with self._guard:
-            return NEVER if self._is_closed else self._advance(heard)
+            return NEVER if self._is_closed else self._advance(received)
 
-    def _advance(self, heard: bytes) -> int:
-        self._heard += heard
+    def _advance(self, received: bytes) -> int:
+        self._received += received
         for _ in range(10_000):
             want = lib.md_turn_want(self._turn, self._wake, self._world.now)
             wake = int(self._wake[0])
@@ -199,15 +199,15 @@ class WorldPort:
                 self._send()
                 if self.lost:
                     return NEVER
-            elif want == lib.MD_READ and self._heard:
+            elif want == lib.MD_READ and self._received:
                 self._receive()
             elif want == lib.MD_WAIT or wake > self._world.now:
                 return wake
         raise AssertionError("the line never waits")
 
     def _receive(self) -> None:
-        heard, self._heard = self._heard, b""
-        lib.md_line_received(ffi.addressof(self._turn.line), heard, len(heard), self._world.now)
+        received, self._received = self._received, b""
+        lib.md_line_received(ffi.addressof(self._turn.line), received, len(received), self._world.now)
         assert not self._turn.line.is_out_of_step
 
     def _send(self) -> None:
@@ -423,11 +423,11 @@ class World:
         """All that happens now; when something happens next."""
         wake = NEVER
         for name, wire in self.wires.items():
-            heard, port = wire.advance(self.now / S), self.ports.get(name)
+            received, port = wire.advance(self.now / S), self.ports.get(name)
             if port and not port.lost and wire.port is None:
                 port.hang_up()
             if port and not port.lost:
-                wake = min(wake, port.advance(heard))
+                wake = min(wake, port.advance(received))
             if wire.wake is not None:
                 wake = min(wake, -int(-wire.wake * S // 1))
         return wake

@@ -68,7 +68,7 @@ def test_what_is_told_of_the_echo_is_told_again_when_the_port_is_reopened(
     echo: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Echo] = []
-    monkeypatch.setattr(Port, "tell_echo", lambda port, it: told.append(it))
+    monkeypatch.setattr(Port, "tell_echo", lambda port, each: told.append(each))
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
         bus.line.reopen()
         assert told == [Echo(echo)] * 2
@@ -204,9 +204,9 @@ def test_nothing_is_left_of_a_port_that_was_closed_or_not_opened(tmp_path: Path)
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
         Line(sim.wires[0].path).close()  # what the process has once is there now
         before = descriptors(), threads()
-        for it in sim.wires:
+        for each in sim.wires:
             for _ in range(3):
-                Line(it.path).close()
+                Line(each.path).close()
         for _ in range(3):
             Line("loop://").close()
             with pytest.raises(LineError):
@@ -364,4 +364,4 @@ def test_closing_ends_what_waits_for_a_reply() -> None:
     waiting.join()
     os.close(slave)
     os.close(master)
-    assert [it.port for it in failures] == [bus.line.port]
+    assert [failure.port for failure in failures] == [bus.line.port]

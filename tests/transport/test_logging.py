@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("_patient")
 
 
 def messages(caplog: pytest.LogCaptureFixture, logger: str) -> list[tuple[str, str]]:
-    return [(it.levelname, it.getMessage()) for it in caplog.records if it.name == logger]
+    return [(record.levelname, record.getMessage()) for record in caplog.records if record.name == logger]
 
 
 def test_a_port_that_is_opened_and_closed(caplog: pytest.LogCaptureFixture) -> None:
@@ -120,9 +120,9 @@ class Hanging(logging.Handler):
 def test_a_handler_that_hangs_keeps_no_stop_from_being_repeated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    hall, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(monkeypatch, InvtCHE(1))
     handler, logger = Hanging(), logging.getLogger("multidrop.control")
-    hall.answers = lambda request: b"" if len(hall.frames) < 6 else None
+    line.answers = lambda request: b"" if len(line.frames) < 6 else None
     logger.addHandler(handler)
     stop = threading.Thread(target=drive.stop)
     try:

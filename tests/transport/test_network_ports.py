@@ -196,17 +196,17 @@ def test_what_comes_is_handed_over_in_pieces_that_the_core_reads_whole() -> None
     port.read = lambda size: chunks.pop(0) if chunks else b""  # type: ignore[method-assign]
     port.read_all = lambda: arrived[1:]  # type: ignore[method-assign]
     bridge = Bridge(port)  # type: ignore[arg-type]
-    heard = b""
+    taken = b""
 
     def all_of_it() -> bool:
-        nonlocal heard
+        nonlocal taken
         with suppress(BlockingIOError):
-            heard += os.read(bridge.theirs.fileno(), 1024)
-        return len(heard) >= len(arrived)
+            taken += os.read(bridge.theirs.fileno(), 1024)
+        return len(taken) >= len(arrived)
 
     until(all_of_it)
     bridge.close()
-    assert heard == arrived
+    assert taken == arrived
 
 
 def test_a_bridge_closes_while_nobody_takes_what_comes() -> None:
@@ -305,13 +305,13 @@ class FarNetwork:
             return True
         return False
 
-    def all_heard(self) -> str:
+    def all_received(self) -> str:
         """Return what the server received on its serial line, once the network is joined again."""
         self.join()
         until(lambda: not connections(self.port))  # the kernel repeats nothing any more
         until(self._ends)
-        heard, _ = self._server.communicate()
-        return heard
+        taken, _ = self._server.communicate()
+        return taken
 
     def close(self) -> None:
         if self._server.poll() is None:
@@ -347,9 +347,9 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: FarNetwork) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
-    heard = far_network.all_heard()
-    assert "010600140002" in heard
-    assert START not in heard
+    taken = far_network.all_received()
+    assert "010600140002" in taken
+    assert START not in taken
 
 
 @pyserials_own
@@ -360,9 +360,9 @@ def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: F
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
         far_network.join()
         until(lambda: not waits_to_arrive(far_network.port))  # it arrived, or was given up
-    heard = far_network.all_heard()
-    assert "010600140002" in heard
-    assert START not in heard
+    taken = far_network.all_received()
+    assert "010600140002" in taken
+    assert START not in taken
 
 
 def test_a_network_is_given_up_before_a_write_is() -> None:

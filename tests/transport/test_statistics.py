@@ -197,7 +197,7 @@ def test_a_span_is_the_difference_of_two_looks() -> None:
     assert found.utilisation == 1.0
     assert found.misses == {"bad checksum": 1}
     assert found.diagnostics.bus_character_overruns == 3
-    assert {name: it.exchanges for name, it in found.drives.items()} == {"pump": 50, "fan": 10}
+    assert {name: each.exchanges for name, each in found.drives.items()} == {"pump": 50, "fan": 10}
     assert found.drives["pump"].utilisation == 0.5
 
 
@@ -245,8 +245,8 @@ def test_a_poller_counts_what_its_rows_say(toy: SimulatedDrive) -> None:
             return lambda: condition(poller.statistics()["line"])
 
         with poller:
-            until(has(lambda it: it.drives["none"].misses["not asked: drive is silent"] > 3))
-            until(has(lambda it: it.drives["pump"].samples > 100))
+            until(has(lambda each: each.drives["none"].misses["not asked: drive is silent"] > 3))
+            until(has(lambda each: each.drives["pump"].samples > 100))
     rows = rows_of(poller)
     found = poller.statistics()["line"]
     assert found.samples == sum(row.value is not None for row in rows)

@@ -103,10 +103,10 @@ def _demo_registers() -> list[str]:
 
 
 def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
-    from multidrop.gateway.commands import verbs_of
     from multidrop.gateway.parts import PARTS, settings_class
     from multidrop.gateway.rights import May, Right
     from multidrop.gateway.settings import ServeSettings
+    from multidrop.gateway.verb_rules import verbs_of
 
     drives = [polled.drive for line in plant.lines for polled in line.drives]
     writes = [

@@ -2,9 +2,10 @@
 
 from multidrop.core import Framing
 from multidrop.drive.family import Drive
+from multidrop.drive.options import Option
 from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Option, verb
+from multidrop.drive.verbs import verb
 from multidrop.errors import Advice, BusError, DriveRefused, NotDone, Refused, Unconfirmed, Unsupported
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Drive: the base of all families: facts of the line, registers, and the verbs that command the motor.
+"""Drive: the base of all families: registers, and the verbs that command the motor.
 
 A family is a subclass that declares registers. Its verbs are scripts; a verb of a drive that is attached
 to a bus is carried out there.
@@ -6,37 +6,29 @@ to a bus is carried out there.
 
 from __future__ import annotations
 
-import difflib
-import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any
 
-from multidrop.core import MODBUS, Framing
+from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
-from multidrop.drive.network import speaks_tcp
+from multidrop.drive.manual_facts import ManualFacts
+from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.read_limits import limit_errors
 from multidrop.drive.register import Access, Register
 from multidrop.drive.scale_check import scale_errors
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.table import Kept, Table
 from multidrop.drive.text import Text, text_errors
-from multidrop.drive.timing import Settings
-from multidrop.drive.verbs import MOVING, Option, verb
+from multidrop.drive.verbs import MOVING, verb
 from multidrop.errors import Advice, NotDone, Refused, Unconfirmed, Unsupported
 
-A = TypeVar("A")
-LONGEST_SILENCE = 1.0  # s
-SERIAL_ADDRESSES = range(1, 248)  # 0 is a broadcast there
 START_TIME = 5.0  # s, after which a motor that was started must be seen to run
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 
-_CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
-_CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop check` of its file was read")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
 
-class Drive:
+class Drive(ManualFacts):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
     `address` is 1 to 247, as far as the family goes; on a tcp:// port it is a unit id, which may be 0 to
@@ -47,51 +39,6 @@ class Drive:
     registers that the owner knows to be kept in RAM although the document does not say so. Raises
     ValueError for anything the family's document does not allow.
     """
-
-    model: ClassVar[str] = ""
-    declared_in: ClassVar[str] = ""  # name of the file that declares it; nobody tested such a family
-    title: ClassVar[str] = ""
-    manual: ClassVar[str] = ""
-
-    framings: ClassVar[tuple[Framing, ...]] = (Framing.RTU,)
-    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first is the default
-    baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
-    addresses: ClassVar[range] = range(1, 248)
-
-    silence: ClassVar[float] = 0.0  # s, before and after a frame; t3.5 is the least for RTU
-    silence_characters: ClassVar[float] = 0.0  # the same, in characters
-    response_delay: float = 0.005  # s, typical, from the request's end to the reply's begin
-    response_delay_characters: ClassVar[float] = 0.0  # the same, in characters, where that is more
-    response_timeout: ClassVar[float] = 0.3  # s, after which no reply is to be expected
-    answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
-    turnaround_delay: ClassVar[float] = 0.1  # s, after a broadcast
-
-    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange with it to its next request
-
-    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; the standard's where none is stated
-    readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that may be read across
-    read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
-    exceptions: ClassVar[Mapping[int, str]] = {
-        1: "illegal function",
-        2: "illegal address",
-        3: "illegal value",
-        4: "device failure",
-        5: "acknowledged, still working",
-        6: "busy",
-    }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # of these, codes of a damaged request
-    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # and codes of a drive that will answer later
-    broadcasts: ClassVar[bool] = False  # the document has them; nobody answers one
-    identity_is_inferred: ClassVar[bool] = False  # a drive that `identify` refuses may be of the family
-    options: ClassVar[Mapping[str, Option]] = {}
-    setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
-    remote: ClassVar[str] = "the drive must take its commands from the line"  # to be set on its keypad
-    line_parameters: ClassVar[str] = ""  # those for its address, baud rate and format
-    no_broadcasts: ClassVar[str] = "none documented"  # in words, where there are none
-    watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
-
-    registers: ClassVar[Mapping[str, Register[Any]]] = {}
-    texts: ClassVar[Mapping[str, Text]] = {}
 
     bus: Any = None  # that it is attached to
 
@@ -109,27 +56,19 @@ class Drive:
             cls.formats = dict.fromkeys(cls.framings, ("8N1", "8E1", "8O1", "8N2"))
 
     @classmethod
-    def _declared(cls, kind: type[A]) -> dict[str, A]:
-        """Return the class's attributes of a kind by name, without those that a subclass has replaced."""
-        found: dict[str, A] = {}
-        for owner in reversed(cls.__mro__):
-            for name, attribute in vars(owner).items():
-                if isinstance(attribute, kind):
-                    found[name] = attribute
-                else:
-                    found.pop(name, None)
-        return found
-
-    @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
         """Return the class's options, and `confirmed` where it commands a motor untested or unidentified."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
-        if not (commands or verbs) or not (cls.declared_in or cls.identify is Drive.identify):
+        if not (commands or verbs):
             return cls.options
-        return {"confirmed": _CHECKED if cls.declared_in else _CONFIRMED, **cls.options}
+        return {**confirmation(cls.declared_in, identifies=cls._identifies()), **cls.options}
+
+    @classmethod
+    def _identifies(cls) -> bool:
+        return cls.identify is not Drive.identify
 
     def check_confirmed(self, what: str) -> None:
         """Raise Refused where nobody has confirmed a drive of a class that needs it.
@@ -137,27 +76,15 @@ class Drive:
         That is a class that cannot identify its drives, since the same address means different things to
         different makes, and may start their motor; and one from a file, which nobody has tested.
         """
-        family = type(self)
         if "confirmed" not in self.options or self.option.get("confirmed"):
             return
-        if family.declared_in:
-            reason = (
-                f"{family.declared_in} declares it, which nobody has tested: read `multidrop check "
-                f"{family.declared_in}` against the manual and look at its name plate"
+        kind = self.title or type(self).__name__
+        if why := doubt(kind, self.declared_in, identifies=self._identifies()):
+            raise Refused(
+                f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
+                rule="nobody has confirmed what it is",
+                advice=Advice.declare("confirmed", 1),
             )
-        elif family.identify is Drive.identify:
-            kind = self.title or family.__name__
-            reason = (
-                f"its class has no `identify` that could tell a {kind} from another drive, to which the same "
-                "may mean a start; look at its name plate"
-            )
-        else:
-            return
-        raise Refused(
-            f"{what} is not sent to {self.name}: {reason}, and declare confirmed = 1",
-            rule="nobody has confirmed what it is",
-            advice=Advice.declare("confirmed", 1),
-        )
 
     def __init__(
         self,
@@ -171,23 +98,11 @@ class Drive:
         ram: Iterable[str] = (),
         **options: float,
     ) -> None:
-        self.address = self._checked("address", address, self.addresses)
-        self.framing = self._framing(framing)
-        self._declared_framing = None if framing is None else self.framing
-        formats = self.formats_in(self.framing)
-        self.settings = Settings(
-            self._checked("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
-            self._checked("format", formats[0] if format is None else format, formats),
-        )
-        self.agreed_silence = silence
-        self._check_silence()
-        self.response_delay = max(
-            self.response_delay, self.response_delay_characters * self.settings.character
-        )
+        super().__init__(address, framing, baudrate, format, silence)
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not self.name.isprintable():  # a truncated line of a text recording must be recognised
             raise ValueError(f"the name {name!r} is not one line of printable characters")
-        self.option = self._options(options)
+        self.option = checked_options(self.title or type(self).__name__, self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self.commanded: float | None = None  # setpoint that set_frequency wrote last
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
@@ -209,173 +124,6 @@ class Drive:
 
     def _perform_nowhere(self, script: Script[Any]) -> Any:
         raise RuntimeError(f"{self.name} is not attached to a bus: use bus.attach(...)")
-
-    @classmethod
-    def _checked(cls, what: str, value: Any, allowed: Any) -> Any:
-        if value in allowed:
-            return value
-        choices = (
-            f"{allowed[0]} to {allowed[-1]}"
-            if isinstance(allowed, range)
-            else ", ".join(str(choice) for choice in allowed)
-        )
-        raise ValueError(f"{what} {value!r} is not one of {cls.title or cls.__name__}: {choices}")
-
-    @classmethod
-    def _framing(cls, framing: Framing | str | None) -> Framing:
-        if framing is None:
-            return cls.framings[0]
-        if isinstance(framing, str):
-            framing = {str(known): known for known in Framing}.get(framing.lower(), framing)
-        if framing is Framing.TCP and cls.speaks(framing):
-            return framing
-        return cast(Framing, cls._checked("framing", framing, cls.framings))
-
-    @classmethod
-    def speaks(cls, framing: Framing) -> bool:
-        """Return True for the document's framings, and for TCP where one is Modbus: a gateway translates."""
-        return framing in cls.framings or (
-            framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
-        )
-
-    @classmethod
-    def formats_in(cls, framing: Framing) -> tuple[str, ...]:
-        """Return the formats of a framing; with TCP those of the wire behind the gateway."""
-        return cls.formats.get(framing) or cls.formats[cls.framings[0]]
-
-    def take_framing_of(self, port: str) -> None:
-        """Take the framing that this port has: TCP on tcp://, and what was declared on any other.
-
-        Raises ValueError where the drive cannot have it.
-        """
-        is_tcp, declared = speaks_tcp(port), self._declared_framing or self.framings[0]
-        if is_tcp and self._declared_framing not in (None, Framing.TCP):
-            raise ValueError(
-                f"framing {declared} is a serial line's, and {port} speaks Modbus TCP: leave "
-                "framing out, or name the port socket:// where the far end passes serial bytes on"
-            )
-        if is_tcp and not self.speaks(Framing.TCP):
-            raise ValueError(
-                f"{self.title or type(self).__name__} does not speak Modbus, and {port} carries "
-                "nothing else: name the port socket://, and have the far end pass serial bytes on"
-            )
-        if not is_tcp and declared is Framing.TCP:
-            raise ValueError(
-                f"framing tcp is that of tcp:// ports, such as tcp://10.0.0.7:502, and {port} is none"
-            )
-        if not is_tcp and self.address not in SERIAL_ADDRESSES:
-            raise ValueError(
-                f"address {self.address} is a unit id of Modbus TCP; on {port} it is to be "
-                f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
-            )
-        self.framing = Framing.TCP if is_tcp else declared
-
-    @classmethod
-    def _options(cls, given: dict[str, float]) -> dict[str, float]:
-        for name, value in given.items():
-            if name not in cls.options:
-                known = ", ".join(cls.options) or "none"
-                raise ValueError(f"{cls.title or cls.__name__} has no option {name!r}; its options: {known}")
-            low, high = cls.options[name].span
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise ValueError(
-                    f"{name} = {value!r} is outside {low:g} to {high:g} {cls.options[name].unit}".rstrip()
-                )
-            if not cls.options[name].unit and value != int(value):
-                raise ValueError(f"{name} = {value!r} is no whole number from {low:g} to {high:g}")
-        return given
-
-    @classmethod
-    def _in_ram(cls, name: str) -> str:
-        if not isinstance(name, str):
-            raise TypeError(f"ram takes names of registers, not {name!r}")
-        register = cls.register(name)
-        if register.kept is Kept.EEPROM:
-            raise ValueError(f"{name} of {cls.title or cls.__name__} is in EEPROM, as its document says")
-        return register.name
-
-    @classmethod
-    def register(cls, name: str) -> Register[Any]:
-        """Return the register of this name; ValueError with the nearest names when there is none."""
-        try:
-            return cls.registers[name]
-        except KeyError:
-            near = difflib.get_close_matches(name, cls.registers, n=3)
-            hint = f"did you mean {' or '.join(near)}?" if near else f"see `multidrop models {cls.model}`"
-            raise ValueError(f"{cls.title or cls.__name__} has no register {name!r}; {hint}") from None
-
-    @classmethod
-    def readings(cls) -> tuple[Register[Any], ...]:
-        """Return the registers that are polled by default."""
-        return tuple(
-            register
-            for register in cls.registers.values()
-            if register.access is Access.READING and register.readable
-        )
-
-    @property
-    def ledger_name(self) -> str:
-        """Name under which writes to its EEPROM are counted: files of one name are told by their titles."""
-        if self.declared_in:
-            return f"{self.model}: {self.title}"
-        return self.model or type(self).__name__
-
-    @property
-    def echo_probe(self) -> Register[Any] | None:
-        """Register whose reply is never a copy of its request, where a family has others; else None.
-
-        It is read first while it is unknown whether the adapter echoes.
-        """
-        return None
-
-    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers that hold raw counts in a known range, from the least to the most.
-
-        Where a family reads one register at a time its replies differ in nothing else: a late reply is told
-        from another register's by its value, so no two of the ranges may overlap.
-        """
-        return {}
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in self.registers:
-            raise AttributeError(f"{name} is a register, which bus.write(drive, drive.{name}, VALUE) writes")
-        if name in self.texts:
-            raise AttributeError(f"{name} is a text, which bus.read_text(drive, drive.{name}) reads")
-        super().__setattr__(name, value)
-
-    def exception(self, code: int) -> str:
-        """Return the meaning of an exception code in this family."""
-        return self.exceptions.get(code, "a code that the document does not explain")
-
-    def is_passing(self, code: int) -> bool:
-        """Return True where the request may be right, and came damaged or at a bad time."""
-        return code in self.exceptions and code in self.damaged | self.later
-
-    def needed_silence(self) -> float:
-        """Return the silence in s that this drive needs before a request and after its reply."""
-        own = max(self.silence, self.silence_characters * self.settings.character)
-        if self.framing is Framing.TCP:  # the gateway keeps it
-            return 0.0
-        if self.framing is not Framing.RTU:
-            return own
-        return max(self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence, own)
-
-    def _check_silence(self) -> None:
-        """Refuse a silence that may also occur within a frame, or that is no time at all."""
-        agreed, least = self.agreed_silence, 1.5 * self.settings.character
-        if agreed is None:
-            return
-        if (
-            isinstance(agreed, bool)
-            or not isinstance(agreed, (int, float))
-            or not 0 <= agreed <= LONGEST_SILENCE
-        ):
-            raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")
-        if self.framing is Framing.RTU and self.needed_silence() < least:
-            raise ValueError(
-                f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {self.settings}, which may "
-                f"pass within a frame: it is to be {math.ceil(least * 1e6)} us or more"
-            )
 
     # ---- verbs; each family replaces those that its document has ----
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
@@ -15,18 +14,6 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 P = ParamSpec("P")
-
-
-@dataclass(frozen=True)
-class Option:
-    """A fact about one drive that only its owner knows, such as its maximum frequency.
-
-    Without a unit it is a whole number: a choice, or a number of something.
-    """
-
-    unit: str
-    span: tuple[float, float]
-    meaning: str
 
 
 # Sent only to a drive that is known to be of its family, and not after a stop was called.

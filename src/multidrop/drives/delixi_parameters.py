@@ -7,10 +7,10 @@ from enum import IntEnum
 
 from multidrop.drive import Drive, Refused
 from multidrop.drive.declare import reading, setting
+from multidrop.drive.options import Option
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, read
 from multidrop.drive.table import Table
-from multidrop.drive.verbs import Option
 
 STOP_TIME = 60.0  # s; the deceleration time's number is not known
 

@@ -8,11 +8,12 @@ from typing import Any, Unpack
 from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.declare import Details, command, declaration, reading, setting
 from multidrop.drive.number_format import NumberFormat
+from multidrop.drive.options import Option
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.table import HOLDING, Kept
-from multidrop.drive.verbs import Option, verb
+from multidrop.drive.verbs import verb
 
 CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"

@@ -10,11 +10,12 @@ from typing import Any, Unpack
 
 from multidrop.drive import BusError, Drive, DriveRefused, Refused, Unconfirmed
 from multidrop.drive.declare import Details, command, reading, setting
+from multidrop.drive.options import Option
 from multidrop.drive.register import Register
 from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.table import HOLDING, Kept
-from multidrop.drive.verbs import Option, verb
+from multidrop.drive.verbs import verb
 
 STOP_MARGIN = 5.0  # s, on top of the deceleration time
 SELECTION_TIME = 1.0  # s in which a preset speed becomes the frequency command

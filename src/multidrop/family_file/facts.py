@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from multidrop.core import Framing
-from multidrop.drive.family import LONGEST_SILENCE
+from multidrop.drive.line_facts import LONGEST_SILENCE
 from multidrop.drive.read_limits import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.table import Table
 from multidrop.drive.timing import Settings

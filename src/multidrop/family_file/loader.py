@@ -12,32 +12,20 @@ from typing import Any
 from multidrop.drive.declaration_check import DeclarationError, declaration_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access
-from multidrop.drive.verbs import Option
 from multidrop.family_file.addresses import Counting
 from multidrop.family_file.csv_table import MOST_BYTES, beside, declare_rows
 from multidrop.family_file.facts import FAMILY_KEYS, facts_of
-from multidrop.family_file.names import unusable
+from multidrop.family_file.options import options_of
 from multidrop.family_file.register_keys import shown
 from multidrop.family_file.registers import MOST_REGISTERS, Declared, defaults_of
 from multidrop.family_file.texts import texts_of
 from multidrop.family_file.verbs import SECTIONS as VERB_SECTIONS
 from multidrop.family_file.verbs import add_verbs
-from multidrop.toml_check import Key, TomlPlace, parse_document
+from multidrop.toml_check import TomlPlace, parse_document
 
 SECTIONS = ("family", "default", *(access.value for access in Access), "text", "option", *VERB_SECTIONS)
 MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
-
-_OPTION_KEYS = {
-    "unit": Key(str, 'unit = "Hz"'),
-    "span": Key(list, "span = [1, 600]", needed=True),
-    "meaning": Key(str, 'meaning = "parameter 1105, of which 20000 is 100 %"', needed=True),
-}
-# What a drive in a plant file, and its class, have for something else.
-_NOT_OPTIONS = frozenset(
-    {"name", "model", "address", "framing", "baudrate", "format", "silence", "ram", "every", "poll"}
-    | {"confirmed"}
-)
 
 
 class FamilyError(ValueError):
@@ -140,7 +128,7 @@ def _family(
             "where the manual's numbers are sent as they are, or 1 where its register 1 is sent as 0"
         )
     texts = texts_of(document.get("text", {}), counting, declared.places, place)
-    options = _options(document.get("option", {}), declared.places, place)
+    options = options_of(document.get("option", {}), declared.places, place)
     if not declared.places and not document.get("text") and not given.get("registers"):
         place.wrong("declares no register; add [reading] and NAME = { at = 0x0010 }")
     if len(declared.places) > MOST_REGISTERS:
@@ -212,33 +200,6 @@ def _named_bytes(table: Path) -> bytes:
         return _bytes(table, "table of registers")
     except ValueError as mistake:
         raise ValueError(f'registers = ["{table.name}"]: {mistake}') from None
-
-
-def _options(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
-    if not isinstance(table, dict):
-        place.wrong("[option] is no table; write [option] and NAME = { unit, span, meaning }")
-        return {}
-    options = {}
-    for name, given in table.items():
-        at = place.within(f"[option] {name[:60]}")
-        why = unusable(name)
-        if why or name in _NOT_OPTIONS:
-            at.wrong(
-                f"{shown(name)} cannot be an option's name: {why or 'every drive has it for something else'}"
-            )
-        if name in registers:
-            at.wrong("a register has this name too; call one of the two otherwise")
-        good = at.check(given, _OPTION_KEYS)
-        span = good.get("span", [])
-        if span and (len(span) != 2 or not all(map(_is_number, span)) or span[0] > span[1]):
-            at.wrong(f"span = {shown(span)} is not right; write the least and the most, span = [1, 600]")
-        elif span and "meaning" in good:
-            options[name] = Option(good.get("unit", ""), (span[0], span[1]), good["meaning"])
-    return options
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf")
 
 
 def _add_verbs(

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from math import isfinite
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from multidrop import (
     Bus,
     BusError,
-    Direction,
     Drive,
     Effect,
     Plant,
@@ -26,14 +24,15 @@ from multidrop import (
     Seen,
     Stopped,
     Unsupported,
-    written_by,
 )
+from multidrop.gateway.command_threads import begin_stop, in_thread
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
+from multidrop.gateway.verb_rules import VERBS
 
 MOST_WRITES = 8  # under way on a line, without stops
 BUSY = "too many writes are under way"  # a rule
+WAYS_WITHOUT_VERBS = frozenset({"modbus"})
 
-R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -52,44 +51,6 @@ class PolledLines(Protocol):
     def plant(self) -> Plant: ...
     def bus(self, line: str) -> Bus: ...
     async def settled(self) -> None: ...
-
-
-class VerbRule(NamedTuple):
-    """The rights that a verb needs, and its options."""
-
-    role: Right
-    is_listed: bool  # it must stand in [serve.may] verbs
-    options: Mapping[str, Callable[[object], Any]]
-
-
-def _direction(value: object) -> Direction:
-    try:
-        return Direction(value)
-    except ValueError:
-        raise ValueError(f"direction = {value!r} is neither forward nor reverse") from None
-
-
-def _hertz(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"hz = {value!r} is no number")  # noqa: TRY004 (a person's mistake)
-    return float(value)
-
-
-VERBS: Mapping[str, VerbRule] = {
-    "start": VerbRule(Right.WRITE, True, {"direction": _direction}),
-    "jog": VerbRule(Right.WRITE, True, {"direction": _direction}),
-    "reset_fault": VerbRule(Right.WRITE, True, {}),
-    "set_frequency": VerbRule(Right.WRITE, True, {"hz": _hertz}),
-    "coast": VerbRule(Right.STOP, True, {}),  # a hoist would drop its load
-    "emergency_stop": VerbRule(Right.STOP, True, {}),
-    "stop": VerbRule(Right.STOP, False, {}),
-}
-WAYS_WITHOUT_VERBS = frozenset({"modbus"})
-
-
-def verbs_of(drive: Drive) -> list[str]:
-    """Return the verbs of these that the drive's family has."""
-    return [name for name in VERBS if getattr(type(drive), name) is not getattr(Drive, name)]
 
 
 class Commands:
@@ -141,9 +102,9 @@ class Commands:
             for name in here:
                 self._stops[name] = self._stops.get(name, 0) + 1
             if here and len(here) == len(line.drives):
-                waited.append(_begin_stop(partial(self._stop_line, line.name, list(here)), caller))
+                waited.append(begin_stop(partial(self._stop_line, line.name, list(here)), caller))
             else:
-                waited += [_begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
+                waited += [begin_stop(partial(_stop_one, drive), caller) for drive in here.values()]
         for name in wanted:
             if name not in there:
                 told[name] = _failed(ValueError(f"there is no drive {name!r}"))
@@ -189,7 +150,7 @@ class Commands:
         if verb == "stop":
             return (await self.stop([drive], caller))[drive]
         try:
-            arguments = _arguments(rule, verb, options)
+            arguments = rule.arguments(verb, options)
         except ValueError as mistake:
             return _failed(mistake)
         return await self._carry_out(drive, caller, what, partial(_act, verb=verb, arguments=arguments))
@@ -212,7 +173,7 @@ class Commands:
 
         self._under_way[line.name] = self._under_way.get(line.name, 0) + 1
         try:
-            future = _in_thread(checked, caller)
+            future = in_thread(checked, caller)
         except RuntimeError as failure:
             self._end(line.name)
             return _failed(failure)
@@ -227,66 +188,6 @@ class Commands:
 
 def _drives(plant: Plant) -> dict[str, Drive]:
     return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
-
-
-def _begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
-    """Begin a stop in a thread, or here and now where the system gives none: a stop is always sent."""
-    try:
-        return _in_thread(work, caller)
-    except RuntimeError:
-        future: asyncio.Future[R] = asyncio.get_running_loop().create_future()
-        with written_by(*_author(caller)):
-            future.set_result(work())
-        return future
-
-
-def _in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
-    """Begin work in a thread of its own, as this caller's, whoever waits for it or no longer does."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[R] = loop.create_future()
-
-    def finish(result: R | None, failure: BaseException | None) -> None:
-        if future.done():
-            return
-        if failure is not None:
-            future.set_exception(failure)
-        else:
-            future.set_result(result)  # type: ignore[arg-type]
-
-    def run() -> None:
-        result, failure = None, None
-        try:
-            with written_by(*_author(caller)):
-                result = work()
-        except BaseException as error:
-            failure = error
-        try:
-            loop.call_soon_threadsafe(finish, result, failure)
-        except RuntimeError:  # the loop is closed: nobody waits any more
-            _log.warning("a command ended after the gateway: %s", failure or result)
-
-    threading.Thread(target=run, name="multidrop command", daemon=True).start()
-    return future
-
-
-def _author(caller: Caller) -> tuple[str, str]:
-    """Return the caller as the audit log takes him."""
-    clean = [_printable(text) for text in (caller.name, f"{caller.way} from {caller.address}")]
-    return clean[0] or "anyone", clean[1]
-
-
-def _printable(text: str) -> str:
-    return "".join(sign if sign.isprintable() else "?" for sign in text)[:200].strip()
-
-
-def _arguments(rule: VerbRule, verb: str, options: Mapping[str, object]) -> dict[str, Any]:
-    for name in options:
-        if name not in rule.options:
-            known = ", ".join(rule.options) or "none"
-            raise ValueError(f"{verb} has no option {name!r}; it has {known}")
-    if "hz" in rule.options and "hz" not in options:
-        raise ValueError(f"{verb} needs a frequency: hz = 20.0")
-    return {name: rule.options[name](value) for name, value in options.items() if value is not None}
 
 
 def _stop_one(drive: Drive) -> dict[str, Told]:

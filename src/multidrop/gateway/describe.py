@@ -8,8 +8,8 @@ from enum import Flag
 from typing import Any, cast
 
 from multidrop import Drive, Plant, PlantLine, PolledDrive, Register
-from multidrop.gateway.commands import verbs_of
 from multidrop.gateway.rights import May, Right
+from multidrop.gateway.verb_rules import verbs_of
 
 FREQUENCIES = ("output_frequency", "motor_speed")
 CURRENTS = ("output_current",)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from multidrop import Key, Plant, PlantError, TomlPlace
-from multidrop.gateway.commands import VERBS, verbs_of
 from multidrop.gateway.parts import PARTS, Part, settings_class
 from multidrop.gateway.rights import May, Right, Token, is_loopback, read_tokens
+from multidrop.gateway.verb_rules import VERBS, verbs_of
 
 LISTEN = "127.0.0.1:8750"
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")

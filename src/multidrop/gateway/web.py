@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
@@ -22,15 +21,14 @@ from multidrop.gateway.commands import Told
 from multidrop.gateway.describe import describe
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
 from multidrop.gateway.metrics import CONTENT_TYPE, metrics_of
-from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, Right
+from multidrop.gateway.request_fields import body_of, caller_of, number_in, text_in
+from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
 PAGE = Path(__file__).parent / "page"
-MOST_BYTES = 64 * 1024  # of a body
-BODY_S = 10.0  # that it may take to come
 MOST_QUERIES = 2  # of the history, and of the audit log, at the same time
 COOKIE_S = 30 * 24 * 3600
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
@@ -101,47 +99,6 @@ async def _denied(request: Request, failure: Exception) -> Response:
     return _error(getattr(failure, "status", 400), str(failure))
 
 
-def _caller(request: Request) -> Caller:
-    caller: Caller = request.scope["caller"]
-    return caller
-
-
-async def _body(request: Request) -> dict[str, Any]:
-    """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
-    data = bytearray()
-    try:
-        async with asyncio.timeout(BODY_S):
-            async for chunk in request.stream():
-                data += chunk
-                if len(data) > MOST_BYTES:
-                    raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
-    except ClientDisconnect:
-        raise Denied(400, "the client is gone") from None
-    except TimeoutError:
-        raise Denied(408, f"the body did not come within {BODY_S:g} s") from None
-    try:
-        found = json.loads(data)
-    except (ValueError, RecursionError):
-        raise Denied(400, "the body is not JSON") from None
-    if not isinstance(found, dict):
-        raise Denied(400, "the body is not a JSON object")
-    return found
-
-
-def _text(body: Mapping[str, Any], key: str) -> str:
-    value = body.get(key)
-    if not isinstance(value, str) or not value:
-        raise Denied(400, f"{key} is missing, or is no text")
-    return value
-
-
-def _number(text: str, key: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None
-
-
 def _told(told: Told) -> dict[str, Any]:
     return {"done": told.is_done, "text": told.text}
 
@@ -172,7 +129,7 @@ class _Pages:
         described = describe(
             gateway.plant,
             gateway.settings.may,
-            _caller(request).role,
+            caller_of(request).role,
             revision=gateway.revision,
             version=gateway.version,
             is_demo=gateway.settings.is_demo,
@@ -181,7 +138,7 @@ class _Pages:
         return JSONResponse(described)
 
     async def frame(self, request: Request) -> Response:
-        after = _number(request.query_params.get("after", "-1"), "after")
+        after = number_in(request.query_params.get("after", "-1"), "after")
         try:
             frame = await self._gateway.frames.after(after)
         except OverflowError as full:
@@ -213,14 +170,14 @@ class _Pages:
 
     async def audit(self, request: Request) -> Response:
         query = request.query_params
-        before, count = query.get("before", ""), _number(query.get("count", str(MOST_RECORDS)), "count")
+        before, count = query.get("before", ""), number_in(query.get("count", str(MOST_RECORDS)), "count")
         async with self._queries:
             found = await asyncio.to_thread(newest_records, self._gateway.settings.audit, before, count)
         return JSONResponse(found)
 
     async def alarms(self, request: Request) -> Response:
         query = request.query_params
-        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         found = self._gateway.events.between(begin, end)
         return JSONResponse({"alarms": [alarm._asdict() for alarm in found]})
 
@@ -229,8 +186,8 @@ class _Pages:
     async def history(self, request: Request) -> Response:
         part = self._history()
         query = request.query_params
-        points = _number(query.get("points", "800"), "points")
-        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        points = number_in(query.get("points", "800"), "points")
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
             async with self._queries:
                 return JSONResponse(await part.series(query.getlist("series"), begin, end, points))
@@ -243,7 +200,7 @@ class _Pages:
         kind = query.get("format", "csv")
         if kind not in KINDS:
             return _error(400, f"format = {kind[:20]!r} is neither csv nor parquet")
-        begin, end = (_number(query.get(key, ""), key) for key in ("from", "to"))
+        begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
         try:
             chunks = part.export(query.getlist("series"), begin, end, kind)
         except ValueError as mistake:
@@ -260,35 +217,35 @@ class _Pages:
     # ---- commands ----
 
     async def stop(self, request: Request) -> Response:
-        body = await _body(request)
+        body = await body_of(request)
         drives = body.get("drives")
         if drives is not None and not (
             isinstance(drives, list) and all(isinstance(one, str) for one in drives)
         ):
             raise Denied(400, "drives is neither a list of names nor null, which means all")
-        told = await self._gateway.commands.stop(drives, _caller(request))
+        told = await self._gateway.commands.stop(drives, caller_of(request))
         return JSONResponse({name: _told(one) for name, one in told.items()})
 
     async def write(self, request: Request) -> Response:
-        body = await _body(request)
+        body = await body_of(request)
         value = body.get("value")
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise Denied(400, "value is missing, or is no number")
-        drive, register = _text(body, "drive"), _text(body, "register")
-        return _answer(await self._gateway.commands.write(drive, register, value, _caller(request)))
+        drive, register = text_in(body, "drive"), text_in(body, "register")
+        return _answer(await self._gateway.commands.write(drive, register, value, caller_of(request)))
 
     async def act(self, request: Request) -> Response:
-        body = await _body(request)
+        body = await body_of(request)
         options = body.get("options", {})
         if not isinstance(options, dict):
             raise Denied(400, "options is no JSON object")
-        drive, verb = _text(body, "drive"), _text(body, "verb")
-        return _answer(await self._gateway.commands.act(drive, verb, options, _caller(request)))
+        drive, verb = text_in(body, "drive"), text_in(body, "verb")
+        return _answer(await self._gateway.commands.act(drive, verb, options, caller_of(request)))
 
     async def reload(self, request: Request) -> Response:
-        if (await _body(request)).get("confirm") is not True:
+        if (await body_of(request)).get("confirm") is not True:
             raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
-        told = await self._gateway.reload.carry_out(_caller(request).by)
+        told = await self._gateway.reload.carry_out(caller_of(request).by)
         return JSONResponse(
             {"done": told.is_done, "text": told.text, "mistakes": told.mistakes, "restart": told.restart}
         )
@@ -297,8 +254,8 @@ class _Pages:
 
     async def token(self, request: Request) -> Response:
         """Keep a token in a cookie that no script can read."""
-        gateway, caller = self._gateway, _caller(request)
-        secret = _text(await _body(request), "token")
+        gateway, caller = self._gateway, caller_of(request)
+        secret = text_in(await body_of(request), "token")
         if gateway.tokens.is_shut(caller.address, gateway.guard_clock()):
             raise Denied(429, "too many wrong tokens came from this address: try again in a minute")
         token = gateway.tokens.find(secret)

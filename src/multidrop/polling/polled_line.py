@@ -1,7 +1,4 @@
-"""PolledLine: one line that is polled: its drives, its schedule, and a port that may be lost.
-
-Blocks are planned anew when a drive's response delay turns out to be another than its document's.
-"""
+"""PolledLine: one line that is polled: its drives, its schedule, and a port that may be lost."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from multidrop.bus import Bus
-from multidrop.core import Peer, Port, RowQueue, Status
+from multidrop.core import Port, RowQueue, Status
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -18,7 +15,8 @@ from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
 from multidrop.plant.model import PlantLine, PolledDrive
-from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, RowNames
+from multidrop.polling.jobs import JobMaker, PolledJob, RowNames
+from multidrop.polling.line_drives import LineDrives
 from multidrop.polling.port_queue import PortQueue, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.polling.summary import line_summary
@@ -26,7 +24,6 @@ from multidrop.transport import clock
 
 LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
-MARGIN = 0.05  # of a response delay, by which it may be outside those that a plan suits
 GONE_S = 0.001  # between looks whether a drive that left is asked yet
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
 
@@ -53,11 +50,7 @@ class PolledLine:
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # also of drives that were removed
-        self._present: dict[Drive, PolledDrive] = {}  # of drives that are here
-        self._gone: dict[int, Peer] = {}  # of drives that left, by address: it may be asked yet
-        self._polled: list[tuple[Drive, Peer]] = []
-        self._observed: list[tuple[int, int, bool]] = []  # of each: failures, late until, has answered
+        self._drives = LineDrives(bus, self._schedule, self._maker, self._refusals)
         self._is_started = False
         self._learnt_ns = 0
         self._reopening: threading.Thread | None = None
@@ -84,7 +77,7 @@ class PolledLine:
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
         """Drives that are here, with what is polled of each now."""
-        return tuple(self._present.values())
+        return self._drives.polled
 
     def add(self, polled: PolledDrive) -> None:
         """Poll one more drive; one that comes back has the jobs that it had.
@@ -95,19 +88,7 @@ class PolledLine:
         settings = polled.drive.settings  # here, as the polling must not wait for a port that is being opened
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
-            drive = self.bus.attach(polled.drive)
-            try:
-                if polled not in self._planned:
-                    self._planned[polled] = self._maker.plan(polled, drive.response_delay)
-            except BaseException:
-                self.bus.detach(drive)
-                raise
-            self._present[drive] = polled
-            jobs = self._planned[polled].jobs
-            if jobs:
-                self._polled.append((drive, self.bus.peer(drive)))
-            if self._is_started:
-                self._add_jobs(drive, jobs, clock.now_ns())
+            self._drives.add(polled, is_started=self._is_started)
         self._row_queue.call(self.number)
 
     def put_in_order(self) -> None:
@@ -118,38 +99,23 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def _await_gone(self, address: int) -> None:
-        peer = self._gone.pop(address, None)
+        peer = self._drives.take_gone(address)
         while peer and not self._is_left and (port := self.bus.line.queue) and port.is_asking(peer):
             clock.sleep(GONE_S)
-
-    def _add_jobs(self, drive: Drive, jobs: list[PolledJob], due_ns: int) -> None:
-        for job in jobs:
-            self._schedule.add(job, due_ns)
-        if jobs and not self.bus.peer(drive).has_answered:
-            self._schedule.back_off.meet(drive.address)
 
     def remove(self, drive: Drive) -> None:
         """Poll a drive no more; what is queued of it is still asked."""
         with self._lock:
             now = clock.now_ns()
-            jobs = [job for job in self._schedule.jobs if job.owner is drive]
-            slots = [(job, job.due_ns) for job in jobs if job.period_ns]
-            self._miss(_over(slots, now), Status.POLL_ENDED)
-            for job in jobs:
-                self._schedule.remove(job)
-            self._schedule.back_off.forget(drive.address)
-            self._refusals.forget(drive)
-            self._present.pop(drive, None)
-            self._polled = [(other, peer) for other, peer in self._polled if other is not drive]
-            self._gone[drive.address] = self.bus.peer(drive)
+            self._miss(_over(self._drives.slots(drive), now), Status.POLL_ENDED)
+            self._drives.remove(drive)
         self.bus.detach(drive)
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
         """Keep nothing of a drive that was removed and does not come back, but what its answers taught."""
         with self._lock:
-            self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
-            self._maker.forget_drive(drive)
+            self._drives.forget(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
         """Read a register of a drive, or all that is polled of it, every so many seconds from now on.
@@ -158,48 +124,15 @@ class PolledLine:
         ValueError for a register that is not polled.
         """
         with self._lock:
-            after = self._present[drive].at_rate(register, every)
+            after = self._drives.polled_of(drive).at_rate(register, every)
         self.set_polls(after)
 
     def set_polls(self, after: PolledDrive) -> None:
         """Poll other registers of a drive that is here, or at other rates; what stays keeps its slots."""
-        drive = after.drive
         with self._lock:
-            before = self._present[drive]
-            if after == before:
+            if not self._drives.set_polls(after, is_started=self._is_started):
                 return
-            peer = self.bus.peer(drive)
-            planned = self._maker.plan(after, peer.response_delay or drive.response_delay)
-            if self._is_started:
-                self._change_jobs(drive, planned.jobs, clock.now_ns())
-            others = [(other, known) for other, known in self._polled if other is not drive]
-            self._polled = [*others, (drive, peer)] if planned.jobs else others
-            self._planned.pop(before)
-            self._planned[after] = planned
-            self._present[drive] = after
         self._row_queue.call(self.number)
-
-    def _change_jobs(self, drive: Drive, wanted: list[PolledJob], now_ns: int) -> None:
-        """Put these jobs in the place of those that a drive has; what is queued of it is still asked.
-
-        Refused registers are asked as all others once more.
-        """
-        present = [job for job in self._schedule.jobs if job.owner is drive]
-        dues = {job.period_ns: job.due_ns for job in sorted(present, key=_due, reverse=True)}  # the first
-        self._refusals.forget(drive)
-        old = [job for job in present if job not in wanted]
-        for period_ns in dict.fromkeys(job.period_ns for job in [*wanted, *old]):
-            self._schedule.replace(
-                [job for job in old if job.period_ns == period_ns],
-                [job for job in wanted if job.period_ns == period_ns and job not in present],
-                dues.get(period_ns, now_ns) if period_ns else now_ns,
-            )
-        self._maker.forget(old)
-        back_off = self._schedule.back_off
-        if not wanted:
-            back_off.forget(drive.address)
-        elif not present and not self.bus.peer(drive).has_answered:
-            back_off.meet(drive.address)
 
     # ---- polling ----
 
@@ -209,8 +142,7 @@ class PolledLine:
             self.bus.tended(True)
             self.bus.reset_statistics()
             for drive in in_order(self.bus.drives, self.switching):
-                jobs = self._planned[self._present[drive]].jobs
-                self._add_jobs(drive, jobs, self.started_ns)
+                self._drives.begin(drive, self.started_ns)
             self._is_started = True
         self._row_queue.call(self.number)
 
@@ -236,52 +168,19 @@ class PolledLine:
             if port.lost:
                 self._lose(port, now_ns)
                 return
-            self._observe(now_ns)
+            if now_ns - self._learnt_ns >= LEARN_NS:
+                self._learn(now_ns)
+            self._drives.observe(now_ns)
             self._refusals.heed(now_ns)
             self._queue.keep_busy(port, now_ns)
             self._miss_unasked(now_ns)
 
-    def _observe(self, now_ns: int) -> None:
-        """Tell the schedule which drives are silent, and whose answers may come late."""
-        if now_ns - self._learnt_ns >= LEARN_NS:
-            self._learn(now_ns)
-        seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
-        if seen == self._observed:
-            return
-        self._observed = seen
-        for (drive, peer), (failures, late_until_ns, has_answered) in zip(self._polled, seen, strict=True):
-            self._schedule.back_off.observe(
-                drive.address,
-                failures,
-                now_ns,
-                late_until_ns=late_until_ns,
-                cost_ns=peer.vain_ns,
-                has_answered=has_answered,
-            )
-
     def _learn(self, now_ns: int) -> None:
         """Take the drives' measured response delays into durations of exchanges and into the plan."""
         self._learnt_ns = now_ns
-        delays = {drive: peer.response_delay for drive, peer in self._polled}
-        for job in self._schedule.jobs:
-            job.duration_ns = job.own_ns + round((delays[job.owner] or job.owner.response_delay) * 1e9)
+        delays = self._drives.measure()
         self._queue.measure()
-        for polled in self._present.values():
-            planned, delay = self._planned[polled], delays.get(polled.drive)
-            if delay and not planned.plan.suits(delay, MARGIN):
-                self._plan_anew(polled, planned, delay, now_ns)
-
-    def _plan_anew(self, polled: PolledDrive, before: PlannedJobs, delay: float, now_ns: int) -> None:
-        """Replace a drive's jobs by better ones, unless refused registers are asked in another way."""
-        if not set(before.jobs) <= set(self._schedule.jobs):
-            return
-        anew = self._maker.plan(polled, delay)
-        for period_ns in {job.period_ns for job in anew.jobs}:
-            old = [job for job in before.jobs if job.period_ns == period_ns and job not in anew.jobs]
-            new = [job for job in anew.jobs if job.period_ns == period_ns and job not in before.jobs]
-            due_ns = min((job.due_ns for job in old if period_ns), default=now_ns)
-            self._schedule.replace(old, new, due_ns)
-        self._planned[polled] = anew
+        self._drives.plan_anew(delays, now_ns)
 
     # ---- rows without a value ----
 
@@ -352,7 +251,7 @@ class PolledLine:
             else:
                 self._miss(self._schedule.pass_slots(ended_ns), Status.LINE_LOST)
             self._over_ns = clock.now_ns()
-            self._schedule = Schedule()
+            self._schedule = self._drives.schedule = Schedule()
             self.bus.close()
 
     # ---- how it went ----
@@ -369,10 +268,6 @@ class PolledLine:
             "switching_ms": round(self.switching * 1e3, 3),
             "set_aside": self._refusals.names,
         }
-
-
-def _due(job: PolledJob) -> int:
-    return job.due_ns
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:

@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 
 from multidrop.drive import Advice, Drive, DriveRefused, NotDone, Refused, Unconfirmed
 from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.options import Option
 from multidrop.drive.register import Register
 from multidrop.drive.script import Script, insist, read, until, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Option, verb
+from multidrop.drive.verbs import verb
 from multidrop.profiles.role import PROOFS, Role, completed, errors_together, own_errors
 
 STOP_TIME = 60.0  # s; the deceleration ramp is a role of no profile

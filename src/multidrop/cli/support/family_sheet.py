@@ -10,11 +10,12 @@ from typing import Any
 from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
+from multidrop.drive.options import Option
 from multidrop.drive.read_limits import read_limit, stated_limit
 from multidrop.drive.register import Access, Register
 from multidrop.drive.table import Carrier, Kept, Table
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import VERBS, Option
+from multidrop.drive.verbs import VERBS
 from multidrop.drives.registry import is_users_own
 from multidrop.planning.reading_gain import ReadingGain, reading_gain
 

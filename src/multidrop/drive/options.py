@@ -1,0 +1,62 @@
+"""Options: facts about one drive that only its owner knows, among them that it is what its class says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Option:
+    """A fact about one drive that only its owner knows, such as its maximum frequency.
+
+    Without a unit it is a whole number: a choice, or a number of something.
+    """
+
+    unit: str
+    span: tuple[float, float]
+    meaning: str
+
+
+_CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
+_CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop check` of its file was read")
+
+
+def checked_options(
+    family: str, options: Mapping[str, Option], given: Mapping[str, float]
+) -> Mapping[str, float]:
+    """Return what was given. Raises ValueError for what is no option, or outside its span."""
+    for name, value in given.items():
+        if name not in options:
+            known = ", ".join(options) or "none"
+            raise ValueError(f"{family} has no option {name!r}; its options: {known}")
+        low, high = options[name].span
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise ValueError(
+                f"{name} = {value!r} is outside {low:g} to {high:g} {options[name].unit}".rstrip()
+            )
+        if not options[name].unit and value != int(value):
+            raise ValueError(f"{name} = {value!r} is no whole number from {low:g} to {high:g}")
+    return given
+
+
+def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
+    """Return the option `confirmed` for a class that commands motors untested or unidentified."""
+    if declared_in:
+        return {"confirmed": _CHECKED}
+    return {} if identifies else {"confirmed": _CONFIRMED}
+
+
+def doubt(family: str, declared_in: str, *, identifies: bool) -> str:
+    """Return why a drive of this class must be confirmed; nothing where it need not be."""
+    if declared_in:
+        return (
+            f"{declared_in} declares it, which nobody has tested: read `multidrop check "
+            f"{declared_in}` against the manual and look at its name plate"
+        )
+    if not identifies:
+        return (
+            f"its class has no `identify` that could tell a {family} from another drive, to which the same "
+            "may mean a start; look at its name plate"
+        )
+    return ""

@@ -1,0 +1,65 @@
+"""Threads of commands: one for each, which runs to its end whoever waits for it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+from multidrop import written_by
+from multidrop.gateway.rights import Caller
+
+R = TypeVar("R")
+_log = logging.getLogger("multidrop.gateway")
+
+
+def begin_stop(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
+    """Begin a stop in a thread, or here and now where the system gives none: a stop is always sent."""
+    try:
+        return in_thread(work, caller)
+    except RuntimeError:
+        future: asyncio.Future[R] = asyncio.get_running_loop().create_future()
+        with written_by(*_author(caller)):
+            future.set_result(work())
+        return future
+
+
+def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
+    """Begin work in a thread of its own, as this caller's, whoever waits for it or no longer does."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[R] = loop.create_future()
+
+    def finish(result: R | None, failure: BaseException | None) -> None:
+        if future.done():
+            return
+        if failure is not None:
+            future.set_exception(failure)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]
+
+    def run() -> None:
+        result, failure = None, None
+        try:
+            with written_by(*_author(caller)):
+                result = work()
+        except BaseException as error:
+            failure = error
+        try:
+            loop.call_soon_threadsafe(finish, result, failure)
+        except RuntimeError:  # the loop is closed: nobody waits any more
+            _log.warning("a command ended after the gateway: %s", failure or result)
+
+    threading.Thread(target=run, name="multidrop command", daemon=True).start()
+    return future
+
+
+def _author(caller: Caller) -> tuple[str, str]:
+    """Return the caller as the audit log takes him."""
+    clean = [_printable(text) for text in (caller.name, f"{caller.way} from {caller.address}")]
+    return clean[0] or "anyone", clean[1]
+
+
+def _printable(text: str) -> str:
+    return "".join(sign if sign.isprintable() else "?" for sign in text)[:200].strip()

@@ -1,0 +1,57 @@
+"""Fields of a request to the web server: its caller, its body, and texts and numbers in them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from starlette.requests import ClientDisconnect, Request
+
+from multidrop.gateway.guard import Denied
+from multidrop.gateway.rights import Caller
+
+MOST_BYTES = 64 * 1024  # of a body
+BODY_S = 10.0  # that it may take to come
+
+
+def caller_of(request: Request) -> Caller:
+    caller: Caller = request.scope["caller"]
+    return caller
+
+
+async def body_of(request: Request) -> dict[str, Any]:
+    """Return the body's JSON object. Raises Denied for any other, and for one that is too long."""
+    data = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) > MOST_BYTES:
+                    raise Denied(413, f"the body is longer than {MOST_BYTES} bytes")
+    except ClientDisconnect:
+        raise Denied(400, "the client is gone") from None
+    except TimeoutError:
+        raise Denied(408, f"the body did not come within {BODY_S:g} s") from None
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        raise Denied(400, "the body is not JSON") from None
+    if not isinstance(found, dict):
+        raise Denied(400, "the body is not a JSON object")
+    return found
+
+
+def text_in(body: Mapping[str, Any], key: str) -> str:
+    value = body.get(key)
+    if not isinstance(value, str) or not value:
+        raise Denied(400, f"{key} is missing, or is no text")
+    return value
+
+
+def number_in(text: str, key: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise Denied(400, f"{key} = {text[:40]!r} is no whole number") from None

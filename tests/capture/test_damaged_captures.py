@@ -1,0 +1,221 @@
+"""Captures that are damaged, cut, large, or change under the reader."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from captures import RTU, rows, spans, write
+from peers import require_program
+
+from multidrop.capture import Capture, CaptureError, Decoding
+from multidrop.core import (
+    STREAM_ROOM,
+    Kind,
+    Unpacker,
+)
+
+READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
+
+
+# ---- what is no capture ----
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "is not a capture: it is empty"),
+        (b"hello, world", "is not a capture: it does not begin like pcap or pcapng"),
+        (b"\xd4\xc3\xb2\xa1\x02\0", "is not a capture: it ends within its header"),
+        (b"\x0a\x0d\x0d\x0a\x1c\0", "is not a capture: it ends within its header"),
+        (
+            struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1),
+            "a is Ethernet (link type 1), not a serial line",
+        ),
+        (
+            struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 147) + b"\xff" * 40,
+            "is damaged: what begins at byte 24 is no packet",
+        ),
+    ],
+)
+def test_what_is_no_capture_of_a_line_is_told_in_a_sentence(
+    tmp_path: Path, content: bytes, sentence: str
+) -> None:
+    path = tmp_path / "a.pcap"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError) as mistake:
+        spans(path)
+    assert str(mistake.value).startswith(str(path))
+    assert str(mistake.value).endswith(sentence)
+    assert "\n" not in str(mistake.value)
+
+
+def described(*options: tuple[int, bytes]) -> bytes:
+    """A pcapng file with one interface, described so, and no packet."""
+    told = b"".join(
+        struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4) for code, value in options
+    )
+    interface = struct.pack("<HHI", 147, 0, 0) + told
+    size = len(interface) + 12
+    section = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+    return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
+
+
+def test_a_resolution_that_says_nothing_is_the_usual_one(tmp_path: Path) -> None:
+    (tmp_path / "a.pcapng").write_bytes(described((9, b"")))
+    assert spans(tmp_path / "a.pcapng") == {"a-0": []}
+
+
+def test_a_clock_that_is_off_by_ages_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
+    with pytest.raises(CaptureError, match=r"byte 28: its clock is 1099511627776 s off"):
+        spans(tmp_path / "a.pcapng")
+
+
+def block(kind: int, body: bytes) -> bytes:
+    return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
+
+
+def packet(interface: int, content: bytes, told: int | None = None) -> bytes:
+    """An enhanced packet block; `told` is its length as it says itself."""
+    length = len(content) if told is None else told
+    return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
+
+
+NO_PACKET = " is damaged: what begins at byte 48 is no packet"
+SECTION, INTERFACE = described()[:28], described()[28:]
+BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (SECTION[:8] + b"\xde\xad\xbe\xef" + SECTION[12:], " is damaged: what begins at byte 0 is no packet"),
+        (SECTION + struct.pack("<III", 1, 7, 7), " is damaged: what begins at byte 28 is no packet"),
+        (SECTION + block(1, bytes(4)), " is damaged: what begins at byte 28 is no packet"),
+        (described((9, b"\x0a")), ": byte 28: its clock is finer than a nanosecond"),
+        (described() + packet(1, READ), NO_PACKET),  # of an interface that is not there
+        (described() + packet(0, READ, told=9), NO_PACKET),  # longer than its block
+        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its two lengths differ
+        (described() + SECTION, ": byte 48: only the first section can be read"),
+        (described() + BIG_ENDIAN_SECTION, ": byte 48: sections of both byte orders cannot be read"),
+        (
+            SECTION + block(3, bytes(8)),
+            ": byte 28: packets without time or of the old kind cannot be read; "
+            "`editcap` turns them into enhanced ones",
+        ),
+        (
+            SECTION + INTERFACE * (Unpacker.MOST_CHANNELS + 1),
+            f": more than {Unpacker.MOST_CHANNELS} interfaces",
+        ),
+    ],
+)
+def test_a_pcapng_file_that_cannot_be_read_is_told_in_a_sentence(
+    tmp_path: Path, content: bytes, sentence: str
+) -> None:
+    path = tmp_path / "a.pcapng"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError) as mistake:
+        spans(path)
+    assert str(mistake.value) == f"{path}{sentence}"
+
+
+def test_a_capture_that_is_cut_within_a_description_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcapng"
+    path.write_bytes(described()[:-6])
+    with Capture(path) as capture:
+        assert list(capture) == [None]
+        assert (capture.lines, capture.truncated) == ([], 14)
+
+
+@pytest.mark.parametrize(
+    "tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"]
+)
+def test_a_packet_that_ends_within_its_tags_holds_nothing(tmp_path: Path, tags: bytes) -> None:
+    """A frame that somebody exported begins behind tags that say what it is; here none does."""
+    path = tmp_path / "a.pcapng"
+    interface = block(1, struct.pack("<HHI", 252, 0, 0))
+    path.write_bytes(SECTION + interface + packet(0, tags) + packet(0, b"\0\0\0\0" + READ))
+    (found,) = spans(path).values()
+    assert [span.raw for span in found] == [READ]
+
+
+@pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, STREAM_ROOM // 700 + 1)])
+@pytest.mark.parametrize("format", ["pcapng", "pcap"])
+def test_a_capture_may_hold_more_than_is_heard_at_once(
+    tmp_path: Path, format: str, content: bytes, count: int
+) -> None:
+    """More packets than there is room for, or more bytes."""
+    path = tmp_path / f"a.{format}"
+    if format == "pcapng":
+        path.write_bytes(described() + packet(0, content) * count)
+    else:
+        header = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 147)
+        path.write_bytes(header + (struct.pack("<IIII", 1, 0, len(content), len(content)) + content) * count)
+    (found,) = spans(path).values()
+    assert b"".join(span.raw for span in found) == content * count
+    assert {span.kind for span in found} == {Kind.REQUEST if content == READ else Kind.JUNK}
+
+
+@pytest.mark.parametrize("format", ["pcapng", "pcap"])
+def test_a_cut_capture_is_read_as_far_as_it_goes(tmp_path: Path, format: str) -> None:
+    path = write(tmp_path / "a.pcapng", RTU)
+    if format == "pcap":
+        whole = tmp_path / "a.pcap"
+        subprocess.run([require_program("editcap"), "-F", "nsecpcap", path, whole], check=True)
+        path = whole
+    content, read = path.read_bytes(), []
+    for cut in range(1, len(content) - 60, 97):
+        path.write_bytes(content[: len(content) - cut])
+        with Capture(path) as capture:
+            read.append(sum(map(len, Decoding(capture))))
+            assert capture.truncated < 300
+    assert read == sorted(read, reverse=True)
+    assert read[0] > read[-1] == 0
+
+
+# ---- files that are large, or change under the reader ----
+
+
+@pytest.mark.parametrize("piece", [200, 256, 333, 512])
+def test_pieces_of_a_file_are_one_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
+) -> None:
+    path = write(tmp_path / "it.pcapng", RTU[:40])
+    path.write_bytes(path.read_bytes() + OTHER_BLOCK)
+    whole, torn = spans(path), rows(path)
+    monkeypatch.setattr("multidrop.capture.pcapng_reader._PIECE", piece)
+    assert spans(path) == whole
+    assert rows(path) == torn
+    path.write_bytes(path.read_bytes()[:-3])
+    with Capture(path) as capture:
+        for _ in capture:
+            pass
+        assert capture.truncated == len(OTHER_BLOCK) - 3
+
+
+OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # of statistics
+
+
+def test_a_capture_that_is_cut_short_while_it_is_read_is_a_sentence(tmp_path: Path) -> None:
+    """In a process of its own: where the file is mapped, the end of its bytes is the end of the process."""
+    path = write(tmp_path / "it.pcapng", RTU * 20)
+    code = (
+        "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"
+        "with Capture(sys.argv[1]) as capture:\n"
+        "    os.truncate(sys.argv[1], 64)\n"
+        "    try:\n"
+        "        for _ in capture: pass\n"
+        "    except CaptureError as cut:\n"
+        "        print(cut)\n"
+    )
+    size = path.stat().st_size
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True)
+    assert (done.returncode, done.stderr, done.stdout) == (
+        0,
+        "",
+        f"{path} was cut short while it was read: it had {size} bytes, and ends at byte 64 now\n",
+    )
