@@ -71,6 +71,19 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
     assert problems == []
 
 
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """A page of no gateway yet; it fails at the end where it broke, or broke its CSP."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    page, problems = context.new_page(), []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+    yield page
+    context.close()
+    assert problems == []
+
+
 def is_problem(said: Any) -> bool:
     """Return True for errors but those of requests, which tests let fail."""
     return said.type in ("error", "warning") and "Failed to load resource" not in said.text

@@ -7,27 +7,12 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-from conftest import PATIENCE_MS, is_problem
 from gateways import served
 from lines import until as until_here
 from watching import LIVE, STALE, cell, until
-
-
-@pytest.fixture
-def page(browser: Any) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    page, problems = context.new_page(), []
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
-    yield page
-    context.close()
-    assert problems == []
 
 
 def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:

@@ -49,6 +49,11 @@ class Reload:
         self._is_settled = asyncio.Event()
         self._is_settled.set()
 
+    @property
+    def has_file(self) -> bool:
+        """Return True where there is a file to be read again."""
+        return self._read is not None
+
     def begin(self) -> None:
         """Reload as soon as the one that is under way has ended. To be called in the loop."""
         self._is_wanted = True

@@ -183,6 +183,7 @@ class _Pages:
             revision=gateway.revision,
             version=gateway.version,
             is_demo=gateway.settings.is_demo,
+            has_file=gateway.reload.has_file,
             mistakes=gateway.reload.mistakes,
         )
         return JSONResponse(described)
