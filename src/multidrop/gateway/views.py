@@ -81,7 +81,7 @@ def look_at_lines(gateway: Gateway) -> dict[str, Any]:
 def health_of(gateway: Gateway) -> dict[str, Any]:
     """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
     lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
-    parts = {name: gateway.dead.get(name) or _health_of_part(feed) for name, feed in gateway.feeds.items()}
+    parts = {name: _health_of_part(feed) for name, feed in gateway.feeds.items()} | gateway.dead
     is_well = all(said == "ok" for said in (*lost.values(), *parts.values())) and not gateway.reload.mistakes
     return {
         "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
