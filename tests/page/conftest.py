@@ -13,6 +13,7 @@ from watching import LIVE, until
 
 SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
 PATIENCE_MS = 30000  # a busy machine is no failure of the page
+OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # a rebound name
 Opener = Callable[..., Any]
 
 
@@ -34,7 +35,7 @@ def browser() -> Iterator[Any]:
     if chromium is None:
         missing("no Chromium is installed")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
         yield browser
         browser.close()
 

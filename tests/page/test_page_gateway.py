@@ -8,8 +8,10 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+import pytest
 from gateways import served
 from lines import until as until_here
 from watching import LIVE, STALE, cell, until
@@ -73,3 +75,26 @@ def test_a_killed_gateway_is_told(page: Any) -> None:
         process.kill()
         process.wait()
         process.stdout.close()
+
+
+@pytest.mark.long
+def test_a_viewer_at_8_kb_a_second_falls_no_further_behind(page: Any, tmp_path: Path) -> None:
+    """`python -m bench.questions.page` measures how old what it sees is."""
+    with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        network = page.context.new_cdp_session(page)
+        network.send("Network.enable")
+        limits = {"latency": 0, "downloadThroughput": 8000, "uploadThroughput": 8000}
+        network.send("Network.emulateNetworkConditions", {"offline": False, **limits})
+        look = """import('/page/store.js').then(m => [m.store.frame.n, Date.now() - m.store.time])"""
+        seen = []
+        for _ in range(60):
+            seen.append(page.evaluate(look))
+            page.wait_for_timeout(100)
+        numbers, ages = zip(*seen, strict=True)
+        assert len(set(numbers)) > 5
+        assert list(numbers) == sorted(numbers)
+        assert median(ages[30:]) < median(ages[10:30]) + 1000
+        assert gateway.gateway.frames.viewers <= 1
+        until(page, LIVE)
