@@ -90,6 +90,16 @@ def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
 
 
+def test_what_is_not_well_beside_the_lines_is_told(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
+    page = opened()
+    notice = page.locator("#notice")
+    notice.wait_for()
+    assert notice.inner_text() == "history: nothing is recorded: No space left on device. mqtt: <b>."
+    gateway.changes = {}
+    notice.wait_for(state="hidden")
+
+
 def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
     page = opened("#/drives/labeller")
     assert cell(page, "labeller", "state").inner_text().strip().startswith("silent for ")

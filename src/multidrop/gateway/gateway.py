@@ -29,6 +29,7 @@ from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import ServeSettings
 from multidrop.gateway.side_reads import SideReads
+from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
 
 TAKE_S = 0.05  # between looks for new rows
@@ -258,9 +259,10 @@ class Gateway:
         return list(struct.unpack(f">{count}H", data))
 
     def _frame(self, n: int) -> dict[str, Any]:
-        return frame_of(
+        frame = frame_of(
             self.hub, self.events, self.lately, n=n, revision=self.revision, time_ns=time.time_ns()
         )
+        return frame | {"troubles": troubles_of(self)}
 
 
 class _Server(uvicorn.Server):

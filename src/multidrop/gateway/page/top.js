@@ -55,6 +55,7 @@ function drawNotice(isNow, age) {
   const wrong = store.plant?.mistakes?.length ?? 0;
   const count = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
   if (wrong) parts.push(`The plant file has ${count}; the plant before it goes on.`);
+  for (const trouble of store.frame?.troubles ?? []) parts.push(`${trouble}.`);
   const off = correction();
   if (Math.abs(off) > SKEW_MS) {
     parts.push(
