@@ -381,6 +381,11 @@ class Bus:
 
     # ---- how it went ----
 
+    @property
+    def audit_trouble(self) -> str:
+        """Return why the newest write is not in the audit log; "" where it is, or there is no log."""
+        return self._records.audit_trouble
+
     def statistics(self) -> LineStatistics:
         """Return those of all exchanges since the bus was opened, or `reset_statistics`, also per drive.
 

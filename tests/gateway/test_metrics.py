@@ -19,7 +19,7 @@ except ImportError:
 
 
 def families(gateway: Served) -> dict[str, Any]:
-    answer = gateway.get("/metrics")
+    answer = gateway.get("/metrics", accept="application/openmetrics-text; version=1.0.0")
     assert answer.headers["content-type"] == "application/openmetrics-text; version=1.0.0; charset=utf-8"
     return {family.name: family for family in parse(answer.body.decode())}
 

@@ -13,6 +13,7 @@ from watching import LIVE, until
 
 SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
 PATIENCE_MS = 30000  # a busy machine is no failure of the page
+OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # a rebound name
 Opener = Callable[..., Any]
 
 
@@ -34,7 +35,7 @@ def browser() -> Iterator[Any]:
     if chromium is None:
         missing("no Chromium is installed")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
         yield browser
         browser.close()
 
@@ -68,6 +69,19 @@ def opened(browser: Any, gateway: FakeGateway) -> Iterator[Opener]:
     yield open_page
     for context in contexts:
         context.close()
+    assert problems == []
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """A page of no gateway yet; it fails at the end where it broke, or broke its CSP."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    page, problems = context.new_page(), []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+    yield page
+    context.close()
     assert problems == []
 
 

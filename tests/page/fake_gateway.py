@@ -38,10 +38,17 @@ class FakeGateway:
         self.renamed: dict[str, str] = {}
         self.stuck: dict[str, float] = {}  # drives whose values stay what they were at this time
         self.clocked: str | None = None  # a drive whose frequency is the time
+        self.plant_changes: dict[str, Any] = {}  # keys of the plant with other values
         self.changes: dict[str, Any] = {}  # keys of the frame with other values
         self.posts: list[tuple[str, Any]] = []
         self.token: str | None = None  # POST wants it where it is set
         self.has_history = True
+        self.reloaded: dict[str, Any] = {
+            "done": True,
+            "text": "plant.toml is in effect",
+            "mistakes": [],
+            "restart": [],
+        }
         self.is_silent = False  # requests for frames are not answered
         self.stands_still = False  # no newer frame comes
         self.began = time.time()
@@ -160,7 +167,9 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
                 self.tell({"error": "This wants a token."}, 401)
                 return
             gateway.posts.append((self.path, body))
-            if self.path == "/api/stop":
+            if self.path == "/api/reload":
+                self.tell(gateway.reloaded)
+            elif self.path == "/api/stop":
                 names = body["drives"] or [
                     d["name"] for line in fake_plant.plant(gateway.renamed)["lines"] for d in line["drives"]
                 ]
@@ -186,7 +195,7 @@ def drive(name: str, gateway: FakeGateway) -> dict[str, Any]:
 
 
 def plant(handler: Any, gateway: FakeGateway, _: object) -> None:
-    handler.tell(fake_plant.plant(gateway.renamed))
+    handler.tell(fake_plant.plant(gateway.renamed) | gateway.plant_changes)
 
 
 def lines(handler: Any, gateway: FakeGateway, _: object) -> None:

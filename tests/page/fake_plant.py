@@ -60,6 +60,7 @@ def plant(renamed: dict[str, str]) -> dict[str, Any]:
     ]  # fmt: skip
     return {
         "revision": 1, "version": "0.2", "name": "bottling plant.toml", "demo": False, "lines": lines,
+        "file": True, "mistakes": [],
         "may": {
             "role": "write",
             "write": ["pump-1.frequency_setpoint"],

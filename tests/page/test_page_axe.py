@@ -7,10 +7,21 @@ from typing import Any
 
 import pytest
 from conftest import SIZES, Opener, missing
+from fake_gateway import FakeGateway
 
 pytestmark = pytest.mark.long  # Chromium is started for each file
 
-VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/log", "settings", "stop")
+VIEWS = (
+    "#/drives",
+    "#/drives/pump-1",
+    "#/trends",
+    "#/faults",
+    "#/lines",
+    "#/log",
+    "settings",
+    "stop",
+    "reload",
+)
 SHORT = {("desk", "light"), ("phone", "dark")}
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 
@@ -36,7 +47,8 @@ def violations(page: Any) -> list[str]:
         for theme in ("light", "dark")
     ],
 )
-def test_axe_finds_nothing(opened: Opener, axe: str, size: str, theme: str) -> None:
+def test_axe_finds_nothing(opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str) -> None:
+    gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)
     found = {}
@@ -46,6 +58,12 @@ def test_axe_finds_nothing(opened: Opener, axe: str, size: str, theme: str) -> N
         elif view == "stop":
             page.keyboard.press("Escape")
             page.locator("#stopall").click()
+        elif view == "reload":
+            page.keyboard.press("Escape")
+            page.locator("#more").click()
+            page.get_by_role("button", name="Read the plant file again").click()
+            page.get_by_role("button", name="Read bottling plant.toml").click()
+            page.get_by_role("heading", name="The file has 40 mistakes").wait_for()
         else:
             page.evaluate("view => { location.hash = view }", view)
         page.wait_for_timeout(700)

@@ -7,27 +7,14 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
-from conftest import PATIENCE_MS, is_problem
 from gateways import served
 from lines import until as until_here
 from watching import LIVE, STALE, cell, until
-
-
-@pytest.fixture
-def page(browser: Any) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    page, problems = context.new_page(), []
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
-    yield page
-    context.close()
-    assert problems == []
 
 
 def test_a_polled_plant_is_shown_and_stopped(page: Any, tmp_path: Path) -> None:
@@ -88,3 +75,26 @@ def test_a_killed_gateway_is_told(page: Any) -> None:
         process.kill()
         process.wait()
         process.stdout.close()
+
+
+@pytest.mark.long
+def test_a_viewer_at_8_kb_a_second_falls_no_further_behind(page: Any, tmp_path: Path) -> None:
+    """`python -m bench.questions.page` measures how old what it sees is."""
+    with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        network = page.context.new_cdp_session(page)
+        network.send("Network.enable")
+        limits = {"latency": 0, "downloadThroughput": 8000, "uploadThroughput": 8000}
+        network.send("Network.emulateNetworkConditions", {"offline": False, **limits})
+        look = """import('/page/store.js').then(m => [m.store.frame.n, Date.now() - m.store.time])"""
+        seen = []
+        for _ in range(60):
+            seen.append(page.evaluate(look))
+            page.wait_for_timeout(100)
+        numbers, ages = zip(*seen, strict=True)
+        assert len(set(numbers)) > 5
+        assert list(numbers) == sorted(numbers)
+        assert median(ages[30:]) < median(ages[10:30]) + 1000
+        assert gateway.gateway.frames.viewers <= 1
+        until(page, LIVE)

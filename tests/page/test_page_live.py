@@ -92,6 +92,16 @@ def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
 
 
+def test_what_is_not_well_beside_the_lines_is_told(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
+    page = opened()
+    notice = page.locator("#notice")
+    notice.wait_for()
+    assert notice.inner_text() == "history: nothing is recorded: No space left on device. mqtt: <b>."
+    gateway.changes = {}
+    notice.wait_for(state="hidden")
+
+
 def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
     page = opened("#/drives/labeller")
     assert cell(page, "labeller", "state").inner_text().strip().startswith("silent for ")
@@ -162,11 +172,10 @@ def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
         page.goto(gateway.url)
     for page in pages:
         until(page, LIVE)
-    pages[0].wait_for_timeout(3000)
-    for page in pages:
-        page.bring_to_front()
-        page.wait_for_timeout(400)
+    shown = "Number([...document.querySelectorAll('tr.drive .number')][0].textContent)"
+    first = [page.evaluate(shown) for page in pages]
+    for page, before in zip(pages, first, strict=True):
+        until(page, f"{shown} > {before}")
         assert link(page) == "live"
-        shown = float(cell(page, "pump-1", "frequency").locator(".number").inner_text())
-        assert (time.time() - shown) % 1000 < BUSY_S
+        assert (time.time() - page.evaluate(shown)) % 1000 < BUSY_S
     context.close()

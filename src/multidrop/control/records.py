@@ -31,6 +31,7 @@ class WriteRecords:
 
     def __init__(self, line: Line, ledger: Ledger, audit: AuditLog | None) -> None:
         self.audit = audit
+        self.audit_trouble = ""  # why the newest record is not in the log
         self._line = line
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
@@ -102,7 +103,9 @@ class WriteRecords:
             return
         try:
             audit.add(at_ns, record)
+            self.audit_trouble = ""
         except (OSError, ValueError) as failure:  # it may be closed meanwhile
+            self.audit_trouble = str(failure)
             _log.warning("the audit log cannot be written: %s", failure)
 
     def _note(self, cell: LedgerCell) -> None:

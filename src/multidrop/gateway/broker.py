@@ -64,6 +64,9 @@ class Speaker(Protocol):
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         """Take a message."""
 
+    def pass_over(self) -> int:
+        """Return how many messages there would be now, of which nobody hears."""
+
 
 class Broker:
     """The connection of a speaker. Paho's thread does the sending; nothing here waits for it."""
@@ -109,6 +112,13 @@ class Broker:
         self._client.disconnect()
         await asyncio.get_running_loop().run_in_executor(None, self._client.loop_stop)
 
+    @property
+    def trouble(self) -> str:
+        """Return that there is no connection, and why where it is known."""
+        return f"no connection to {self._address.host}:{self._address.port}" + (
+            self._why and f": {self._why}"
+        )
+
     def _send(self, message: Publication) -> int | None:
         if not self.is_connected:
             return None
@@ -131,8 +141,8 @@ class Broker:
 
     def _failed(self, why: str) -> None:
         if why != self._why:
-            _log.warning("no connection to %s:%d: %s", self._address.host, self._address.port, why)
-        self._why = why
+            self._why = why
+            _log.warning("%s", self.trouble)
 
     def _lost(self, why: str) -> None:
         self.is_connected = False

@@ -23,6 +23,7 @@ def describe(
     revision: int,
     version: str,
     is_demo: bool,
+    has_file: bool = False,
     mistakes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what GET /api/plant answers to a caller with this right."""
@@ -32,6 +33,7 @@ def describe(
         "version": version,
         "name": plant.path.name,
         "demo": is_demo,
+        "file": has_file,  # that can be read again
         "mistakes": list(mistakes),  # of the file, where the newest reload was refused
         "may": {
             "role": None if right is None else right.name.lower(),

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import struct
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,19 +23,19 @@ from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.hub import SILENT, Hub
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import BACKLOG, listen
-from multidrop.gateway.parts import PARTS, Feed, Inside, build
+from multidrop.gateway.live_parts import END_S, LiveParts
 from multidrop.gateway.reload import Read, Reload
 from multidrop.gateway.rights import OwnNames, Tokens
 from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import ServeSettings
 from multidrop.gateway.side_reads import SideReads
+from multidrop.gateway.views import troubles_of
 from multidrop.gateway.web import make_app
 
 TAKE_S = 0.05  # between looks for new rows
 EVENTS_S = 0.2  # between looks for faults and silence
 TICK_S = 1.0  # between readings of the statistics
 LOG_S = 60.0  # between log lines of a part that goes on failing
-END_S = 3.0  # for which requests under way are waited for at the end
 MOST_ASKED = 16  # requests past a register table at the same time
 
 _log = logging.getLogger("multidrop.gateway")
@@ -59,7 +59,8 @@ class Gateway:
         self.revision = 1
         self.failures: dict[str, int] = {}
         self.dead: dict[str, str] = {}  # parts, and why they do not live any more
-        self.feeds: dict[str, Feed] = {}
+        self.parts = LiveParts(self)
+        self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
@@ -89,7 +90,7 @@ class Gateway:
         tasks: list[asyncio.Task[None]] = []
         server = _Server(self._server_config())
         try:
-            self._build_parts()
+            self.parts.build(self.settings.parts)
             nothing = replace(self.plant, lines=())
             self.poller = Poller(nothing, ledger=self.ledger, audit=self.settings.audit)
             with self.poller:
@@ -100,9 +101,9 @@ class Gateway:
                     for name, work in (
                         ("take", self._take_all()),
                         ("tick", self._tick()),
-                        *((name, self._live(name, feed.run)) for name, feed in self.feeds.items()),
                     )
                 ]
+                self.parts.start()
                 serving = asyncio.create_task(server.serve([self.listener]))
                 while not server.started and not serving.done():
                     await asyncio.sleep(0.005)
@@ -110,13 +111,13 @@ class Gateway:
                     on_ready()
                     self.notifier.tell("READY=1", self.status)
                 end = asyncio.create_task(self._end.wait())
-                await asyncio.wait({end, serving, *tasks[:2]}, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({end, serving, *tasks}, return_when=asyncio.FIRST_COMPLETED)
                 end.cancel()
                 self.notifier.tell("STOPPING=1")
                 self.frames.close()
                 server.should_exit = True
                 await serving
-                for task in tasks[:2]:
+                for task in tasks:
                     if task.done():
                         task.result()
                 await self.side_reads.close()
@@ -129,7 +130,7 @@ class Gateway:
             await self.reload.close()
             if self.poller is not None:
                 self.hand_out(self.poller)  # what came while it closed
-            await self._close_parts()
+            await self.parts.close()
             self.listener.close()
             self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -153,21 +154,6 @@ class Gateway:
             timeout_graceful_shutdown=int(END_S),
             ssl_context_factory=None if context is None else lambda config, default: context,
         )
-
-    def _build_parts(self) -> None:
-        inside = Inside(self.plant, self.hub, self.commands, self.ask, self.settings.folder, self.version)
-        for name, settings in self.settings.parts.items():
-            try:
-                self.feeds[name] = build(PARTS[name], settings, inside)
-            except (ValueError, OSError) as failure:
-                raise ValueError(f"[serve.{name}]: {failure}") from failure
-
-    async def _close_parts(self) -> None:
-        for name, feed in self.feeds.items():
-            try:
-                await asyncio.wait_for(feed.close(), END_S)
-            except Exception:  # the others are closed all the same
-                _log.exception("%s did not end in good order", name)
 
     # ---- rows ----
 
@@ -206,20 +192,14 @@ class Gateway:
         try:
             work(*arguments)
         except Exception:  # whatever it is, polling and stops go on
-            self._note_failure(name)
+            self.note_failure(name)
 
-    def _note_failure(self, name: str) -> None:
+    def note_failure(self, name: str) -> None:
+        """Count what a part raised just now, and log it from time to time."""
         self.failures[name] = self.failures.get(name, 0) + 1
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
             _log.exception("%s failed, %d times so far; the others go on", name, self.failures[name])
-
-    async def _live(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
-        try:
-            await run()
-        except Exception as failure:  # it dies alone
-            self.dead[name] = f"{type(failure).__name__}: {failure}"
-            self._note_failure(name)
 
     async def _tick(self) -> None:
         notifier = self.notifier
@@ -279,9 +259,10 @@ class Gateway:
         return list(struct.unpack(f">{count}H", data))
 
     def _frame(self, n: int) -> dict[str, Any]:
-        return frame_of(
+        frame = frame_of(
             self.hub, self.events, self.lately, n=n, revision=self.revision, time_ns=time.time_ns()
         )
+        return frame | {"troubles": troubles_of(self)}
 
 
 class _Server(uvicorn.Server):

@@ -86,6 +86,16 @@ class Historian:
         """Go on with another plant file: the next segment has its metadata."""
         self._writer.begin(plant.metadata())
 
+    def health(self) -> str:
+        """Return why nothing is recorded now; "" is well."""
+        trouble = self.state.trouble
+        return f"nothing is recorded: {trouble}" if trouble else ""
+
+    def figures(self) -> dict[str, float]:
+        """Return rows written and rows lost since the start."""
+        state = self.state
+        return {"rows_total": state.rows, "dropped_total": state.dropped}
+
     @property
     def state(self) -> HistoryState:
         """Rows written, rows lost, and what is wrong now."""

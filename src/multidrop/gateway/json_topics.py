@@ -111,6 +111,10 @@ class JsonTopics:
                 self._available[drive] = available
                 self.outbox.put(self._kept(self._topic(drive, "available"), available))
 
+    def pass_over(self) -> int:
+        """Return how many messages `publish` would have."""
+        return len(list(self._hub.drives))
+
     def leave(self) -> None:
         """Say that the gateway goes."""
         self.outbox.put(self.will())

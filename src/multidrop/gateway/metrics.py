@@ -1,23 +1,19 @@
-"""Metrics: the plant as OpenMetrics text. Pure.
+"""Metrics: the plant as families of samples. Pure.
 
 A drive that is silent has no values: its series vanish, and nobody takes an old value for the present one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import isfinite
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from multidrop import LineStatistics
+from multidrop.gateway.exposition import Family, Sample
 from multidrop.gateway.frames import lost_of
 from multidrop.gateway.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
 
-CONTENT_TYPE = "application/openmetrics-text; version=1.0.0; charset=utf-8"
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-
-Labels = Mapping[str, str]
-Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
 
 
 class Figures(NamedTuple):
@@ -31,34 +27,24 @@ class Figures(NamedTuple):
     parts: Mapping[str, Mapping[str, float]]  # figures of each, by name
 
 
-def metrics_of(hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures) -> str:
-    """Return the exposition, with its end mark."""
-    families = (
-        _family("multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)]),
-        _family(
-            "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
-        ),
-        _family("multidrop_drive_state", "stateset", "State of each drive.", _states(hub)),
-        _family(
-            "multidrop_line_up",
-            "gauge",
-            "1 while a line's port is there, 0 while it is lost.",
-            _ups(hub),
-        ),
-        *_line_families(statistics),
-        *_drive_families(statistics),
-        _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped),
-        _count("multidrop_frames", "Frames made for viewers.", figures.frames),
-        _family("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)]),
-        _family(
-            "multidrop_part_failures",
-            "counter",
-            "Failures of each part.",
-            [("_total", {"part": name}, n) for name, n in figures.failures.items()],
-        ),
-        *_part_families(figures.parts),
+def families_of(hub: Hub, statistics: Mapping[str, LineStatistics], figures: Figures) -> Iterator[Family]:
+    """Yield all there is to be scraped."""
+    yield Family("multidrop_build", "info", "The version.", [("_info", {"version": figures.version}, 1)])
+    yield Family(
+        "multidrop_value", "gauge", "Newest values of polled registers, in their unit.", _values(hub)
     )
-    return "".join(line for family in families for line in family) + "# EOF\n"
+    yield Family("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
+    yield Family(
+        "multidrop_line_up", "gauge", "1 while a line's port is there, 0 while it is lost.", _ups(hub)
+    )
+    yield from _line_families(statistics)
+    yield from _drive_families(statistics)
+    yield _count("multidrop_rows_dropped", "Rows that nobody took in time.", figures.dropped)
+    yield _count("multidrop_frames", "Frames made for viewers.", figures.frames)
+    yield Family("multidrop_viewers", "gauge", "Viewers that wait.", [("", {}, figures.viewers)])
+    failures = [("_total", {"part": name}, float(n)) for name, n in figures.failures.items()]
+    yield Family("multidrop_part_failures", "counter", "Failures of each part.", failures)
+    yield from _part_families(figures.parts)
 
 
 def _values(hub: Hub) -> Iterator[Sample]:
@@ -87,7 +73,7 @@ def _ups(hub: Hub) -> Iterator[Sample]:
         yield "", {"line": line.name}, float(lost_of(hub, line.name) is None)
 
 
-def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterable[str]]:
+def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family]:
     counters: dict[str, tuple[str, Callable[[LineStatistics], float]]] = {
         "multidrop_line_exchanges": ("Requests that left.", lambda line: line.exchanges),
         "multidrop_line_samples": ("Values that came.", lambda line: line.samples),
@@ -98,10 +84,10 @@ def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterabl
     }
     for name, (text, count) in counters.items():
         samples = [("_total", {"line": line}, count(found)) for line, found in statistics.items()]
-        yield _family(name, "counter", text, samples)
+        yield Family(name, "counter", text, samples)
 
 
-def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterable[str]]:
+def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Family]:
     drives = [
         ({"line": line, "drive": name}, drive)
         for line, found in statistics.items()
@@ -112,42 +98,26 @@ def _drive_families(statistics: Mapping[str, LineStatistics]) -> Iterator[Iterab
         for labels, drive in drives
         for reason, n in drive.misses.items()
     ]
-    yield _family("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
+    yield Family("multidrop_misses", "counter", "Values that are missing, by reason.", misses)
     delays: list[Sample] = []
     for labels, drive in drives:
         found = drive.delays
         for quantile, value in (("0.5", found.p50), ("0.9", found.p90), ("0.99", found.p99)):
             delays.append(("", {**labels, "quantile": quantile}, value))
         delays.append(("_count", labels, float(found.replies)))
-    yield _family(
+    yield Family(
         "multidrop_response_delay_seconds", "summary", "From a request's end to its reply's begin.", delays
     )
 
 
-def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[Iterable[str]]:
+def _part_families(parts: Mapping[str, Mapping[str, float]]) -> Iterator[Family]:
     for part, found in parts.items():
         for name, value in found.items():
             base, is_count = name.removesuffix("_total"), name.endswith("_total")
             kind, suffix = ("counter", "_total") if is_count else ("gauge", "")
             text = base.replace("_", " ").capitalize() + f" of {part}."
-            yield _family(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
+            yield Family(f"multidrop_{part}_{base}", kind, text, [(suffix, {}, float(value))])
 
 
-def _count(name: str, text: str, value: float) -> Iterable[str]:
-    return _family(name, "counter", text, [("_total", {}, value)])
-
-
-def _family(name: str, kind: str, text: str, samples: Iterable[Sample]) -> Iterator[str]:
-    yield f"# TYPE {name} {kind}\n# HELP {name} {text}\n"
-    for suffix, labels, value in samples:
-        if isfinite(value):
-            inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
-            yield (
-                f"{name}{suffix}{{{inside}}} {float(value)!r}\n"
-                if inside
-                else f"{name}{suffix} {float(value)!r}\n"
-            )
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+def _count(name: str, text: str, value: float) -> Family:
+    return Family(name, "counter", text, [("_total", {}, value)])

@@ -59,6 +59,8 @@ class Mqtt:
             for broker, speaker in zip(self._brokers, self._speakers, strict=True):
                 if broker.is_connected:
                     speaker.publish()
+                else:
+                    broker.outbox.dropped += speaker.pass_over()
             await sleep(self._every)
 
     async def close(self) -> None:
@@ -67,6 +69,10 @@ class Mqtt:
             if broker.is_connected:
                 speaker.leave()
             await broker.close()
+
+    def health(self) -> str:
+        """Return why a broker is not reached; "" is well."""
+        return next((broker.trouble for broker in self._brokers if not broker.is_connected), "")
 
     def figures(self) -> dict[str, float]:
         """Return messages sent and dropped since the start, and how many connections there are."""

@@ -11,13 +11,14 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from multidrop import Plant, PlantError, Poller
+from multidrop.gateway.parts import PARTS
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
     from multidrop.gateway.settings import ServeSettings
 
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
-AT_ONCE = ("names", "tokens", "may")  # keys of [serve]; all others wait for a restart
+AT_ONCE = ("names", "tokens", "may", *PARTS)  # keys of [serve]; all others wait for a restart
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
 
@@ -48,6 +49,11 @@ class Reload:
         self._is_wanted = False
         self._is_settled = asyncio.Event()
         self._is_settled.set()
+
+    @property
+    def has_file(self) -> bool:
+        """Return True where there is a file to be read again."""
+        return self._read is not None
 
     def begin(self) -> None:
         """Reload as soon as the one that is under way has ended. To be called in the loop."""
@@ -88,13 +94,16 @@ class Reload:
             return Reloaded(False, NO_FILE)
         plant, settings = await _beside(self._read)
         planned = await _beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
+        exchange = await gateway.parts.exchange(settings.parts, plant)
         self._is_settled.clear()
         try:
             unopened = await _beside(partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
+            gateway.parts.take_up(exchange)
         except Exception:
             if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
                 self._take_up(poller, gateway.settings, None)
+            await gateway.parts.take_back(exchange)
             raise
         finally:
             self._is_settled.set()
@@ -157,10 +166,8 @@ def _sentence(failure: Exception) -> str:
 
 def _after_restart(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each key of [serve] that has changed, and that a running gateway keeps."""
-    changed = [
-        key
+    return [
+        f"{key} of [serve] {RESTART}"
         for key in dict.fromkeys((*before, *now))
         if key not in AT_ONCE and before.get(key) != now.get(key)
     ]
-    tables = {key for key in changed if isinstance(now.get(key, before.get(key)), dict)}
-    return [f"[serve.{key}] {RESTART}" if key in tables else f"{key} of [serve] {RESTART}" for key in changed]

@@ -109,6 +109,13 @@ class SparkplugNode:
                 self._changed.setdefault(drive, {}).update(changed)
                 self._put(drive, "DDATA", self._data)
 
+    def pass_over(self) -> int:
+        """Return how many drives changed since the last call: each would have a message."""
+        values = {drive: self._values(drive) for drive in self._hub.drives}
+        changed = [drive for drive, found in values.items() if self._said.get(drive) != found]
+        self._said = values
+        return len(changed)
+
     def leave(self) -> None:
         """Say that the node goes: its will is not sent at a disconnect in good order."""
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))

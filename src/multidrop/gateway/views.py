@@ -81,8 +81,9 @@ def look_at_lines(gateway: Gateway) -> dict[str, Any]:
 def health_of(gateway: Gateway) -> dict[str, Any]:
     """Return how all is, by line and by part: "ok", "degraded", or "failed" where nothing is polled."""
     lost = {line.name: lost_of(gateway.hub, line.name) or "ok" for line in gateway.plant.lines}
-    parts = {name: gateway.dead.get(name) or _health_of_part(feed) for name, feed in gateway.feeds.items()}
-    is_well = all(said == "ok" for said in (*lost.values(), *parts.values())) and not gateway.reload.mistakes
+    parts = parts_of(gateway)
+    audit = audit_trouble_of(gateway) or "ok"
+    is_well = {"ok", audit, *lost.values(), *parts.values()} == {"ok"} and not gateway.reload.mistakes
     return {
         "status": "failed" if gateway.hub.taken == 0 else "ok" if is_well else "degraded",
         "version": gateway.version,
@@ -90,10 +91,31 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
         "newest_row": gateway.hub.time // 1_000_000,
         "lines": lost,
         "parts": parts,
+        "audit": audit,
         "mistakes": gateway.reload.mistakes,
         "restart": gateway.reload.restart,
         "failures": gateway.failures,
     }
+
+
+def parts_of(gateway: Gateway) -> dict[str, str]:
+    """Return "ok" of each part, or what is not well with it."""
+    return {name: _health_of_part(feed) for name, feed in gateway.feeds.items()} | gateway.dead
+
+
+def audit_trouble_of(gateway: Gateway) -> str:
+    """Return why the newest write of a line is not in the audit log; "" is well."""
+    poller = gateway.poller
+    lines = [line.name for line in gateway.plant.lines] if poller else []
+    found = (poller.bus(line).audit_trouble for line in lines if poller)
+    return next((f"the newest write is not noted: {why}" for why in found if why), "")
+
+
+def troubles_of(gateway: Gateway) -> list[str]:
+    """Return a sentence for each thing beside the lines that is not well, for the page."""
+    said = {name: one for name, one in parts_of(gateway).items() if one != "ok"}
+    audit = audit_trouble_of(gateway)
+    return [f"{name}: {one}" for name, one in (said | ({"audit log": audit} if audit else {})).items()]
 
 
 def _health_of_part(feed: object) -> str:

@@ -19,8 +19,15 @@ from multidrop import Refused
 from multidrop.gateway.audit import MOST_RECORDS, newest_records
 from multidrop.gateway.commands import Told
 from multidrop.gateway.describe import describe
+from multidrop.gateway.exposition import (
+    OPEN_METRICS,
+    OPEN_METRICS_TYPE,
+    PLAIN_TYPE,
+    open_metrics,
+    plain_text,
+)
 from multidrop.gateway.guard import COOKIE, Denied, Guard, Needed
-from multidrop.gateway.metrics import CONTENT_TYPE, metrics_of
+from multidrop.gateway.metrics import families_of
 from multidrop.gateway.request_fields import body_of, caller_of, number_in, text_in
 from multidrop.gateway.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
 from multidrop.gateway.views import figures_of, health_of, look_at, look_at_lines
@@ -133,6 +140,7 @@ class _Pages:
             revision=gateway.revision,
             version=gateway.version,
             is_demo=gateway.settings.is_demo,
+            has_file=gateway.reload.has_file,
             mistakes=gateway.reload.mistakes,
         )
         return JSONResponse(described)
@@ -165,8 +173,11 @@ class _Pages:
 
     async def metrics(self, request: Request) -> Response:
         gateway = self._gateway
-        text = metrics_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
-        return PlainTextResponse(text, headers={"content-type": CONTENT_TYPE})
+        families = families_of(gateway.hub, gateway.lately.newest, figures_of(gateway))
+        is_open = OPEN_METRICS in request.headers.get("accept", "")
+        kind = OPEN_METRICS_TYPE if is_open else PLAIN_TYPE
+        text = open_metrics(families) if is_open else plain_text(families)
+        return PlainTextResponse(text, headers={"content-type": kind, "vary": "accept"})
 
     async def audit(self, request: Request) -> Response:
         query = request.query_params

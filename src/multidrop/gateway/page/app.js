@@ -142,7 +142,8 @@ addEventListener(
   () => find("#ask").open || askToken("This gateway wants a token to look, too."),
 );
 addEventListener("written", () => drive.refresh());
-addEventListener("signed", () => get("api/plant").then(takePlant, () => {}));
+for (const changed of ["signed", "reloaded"])
+  addEventListener(changed, () => get("api/plant").then(takePlant, () => {}));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 find(".skip").addEventListener("click", event => {
   event.preventDefault();

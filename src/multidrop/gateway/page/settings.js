@@ -4,6 +4,7 @@ import { post } from "./api.js";
 import { askToken, tell } from "./ask.js";
 import * as clock from "./clock.js";
 import { find, make } from "./dom.js";
+import { mayReload, reload } from "./reload.js";
 import { store } from "./store.js";
 
 const THEME = "multidrop-theme";
@@ -98,9 +99,11 @@ async function show() {
     ),
   ];
   const choice = await tell("Settings", contents, [
+    ...(mayReload() ? [["reload", "Read the plant file again", "calm"]] : []),
     ["token", "Enter a token", "calm"],
     ["forget", "Sign out", "calm"],
   ]);
+  if (choice === "reload") await reload();
   if (choice === "token")
     await askToken("A token gives the right to stop or to write. The gateway's keeper makes them.");
   if (choice === "forget") {

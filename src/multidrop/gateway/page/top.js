@@ -52,6 +52,10 @@ function drawNotice(isNow, age) {
   else if (store.frame && age > LIVE_MS) parts.push("The daemon sends no new values.");
   if (store.frame && !isNow)
     parts.push(`What is shown is of ${clock.when(store.time)} ${clock.zoneName()}.`);
+  const wrong = store.plant?.mistakes?.length ?? 0;
+  const count = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
+  if (wrong) parts.push(`The plant file has ${count}; the plant before it goes on.`);
+  for (const trouble of store.frame?.troubles ?? []) parts.push(`${trouble}.`);
   const off = correction();
   if (Math.abs(off) > SKEW_MS) {
     parts.push(

@@ -1,0 +1,181 @@
+"""Measure how old the gateway's page is in Chromium: in one tab, in nine, on a slow way, and after a kill.
+
+31 drives on three simulated lines, each with ten values every 0.1 s, by `multidrop serve` and the page
+itself. A frame's age is the viewer's clock less the frame's time: when it comes, and while it is shown, which
+is until the next one comes. A value's age is that of the drive whose newest value is the oldest. All is
+looked at every 10 ms. The slow way is Chromium's own (Network.emulateNetworkConditions): it counts whole
+packets of 1500 bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from bench.support import tables
+from multidrop import InvtCHE
+
+LINES = (11, 10, 10)  # drives
+SLOW = 8000  # bytes a second
+LOOK_MS = 10
+AGES = """async ([seconds, every]) => {
+  const { store } = await import('/page/store.js');
+  const end = performance.now() + seconds * 1000, shown = [], came = [];
+  let n = store.frame.n;
+  while (performance.now() < end) {
+    const now = Date.now(), drives = Object.values(store.frame.drives);
+    shown.push([now - store.time, Math.max(...drives.map(d => now - d.values.output_frequency[1]))]);
+    if (n !== store.frame.n) came.push(now - store.time);
+    n = store.frame.n;
+    await new Promise(done => setTimeout(done, every));
+  }
+  return [came, shown, document.hidden];
+}"""
+STALE = "document.body.classList.contains('stale')"
+LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
+
+
+def plant_text(ports: Path) -> str:
+    names = [register.name for register in InvtCHE.readings()][:10]
+    text, number = '[serve]\nlisten = "127.0.0.1:0"\n', 0
+    for line, drives in enumerate(LINES, 1):
+        text += f'[[line]]\nname = "hall-{line}"\nport = "{ports}/hall-{line}"\nbaudrate = 38400\n'
+        for address in range(1, drives + 1):
+            number += 1
+            text += f'[[line.drive]]\nname = "drive-{number}"\nmodel = "invt-che"\naddress = {address}\n'
+            text += f'every = "100 ms"\npoll = {names}\n'
+    return text
+
+
+@contextmanager
+def program(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A multidrop command, and the first line that it prints."""
+    command = [sys.executable, "-m", "multidrop", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline()
+        finally:
+            process.kill()
+
+
+def until(page: Any, expression: str) -> float:
+    began = time.monotonic()
+    while not page.evaluate(expression):
+        time.sleep(0.01)
+    return time.monotonic() - began
+
+
+def opened(context: Any, url: str, bytes_a_second: int | None = None) -> Any:
+    """A live page; where it is slowed down, from then on, with its network's handle."""
+    page = context.new_page()
+    page.goto(url)
+    until(page, LIVE)
+    if bytes_a_second is not None:
+        network = context.new_cdp_session(page)
+        network.send("Network.enable")
+        limits = {"downloadThroughput": bytes_a_second, "uploadThroughput": bytes_a_second}
+        network.send("Network.emulateNetworkConditions", {"offline": False, "latency": 0, **limits})
+    return page
+
+
+def row(what: str, pages: list[Any], seconds: float) -> list[object]:
+    """Look at some pages, one after another while all are open, as a row of the table."""
+    arrived: list[float] = []
+    frames: list[float] = []
+    values: list[float] = []
+    hidden = 0
+    for page in pages:
+        came, shown, is_hidden = page.evaluate(AGES, [seconds, LOOK_MS])
+        arrived += [age / 1000 for age in came]
+        frames += [age / 1000 for age, _ in shown]
+        values += [age / 1000 for _, age in shown]
+        hidden += is_hidden
+    a_second = f"{len(arrived) / seconds / len(pages):.1f}"
+    return [what, hidden, a_second, *figures(arrived), *figures(frames), *figures(values)]
+
+
+def figures(ages: list[float]) -> list[str]:
+    """Return median and 99th percentile, in s."""
+    cut = statistics.quantiles(ages, n=100)
+    return [f"{statistics.median(ages):.2f}", f"{min(cut[98], max(ages)):.2f}"]
+
+
+def frame_sizes(url: str) -> str:
+    """Return the bytes of a frame, as the daemon sends it and unpacked."""
+    import gzip
+    import urllib.request
+
+    request = urllib.request.Request(f"{url}api/frame", headers={"accept-encoding": "gzip"})
+    with urllib.request.urlopen(request) as answer:
+        packed = answer.read()
+    return f"a frame has {len(packed)} bytes on the wire, {len(gzip.decompress(packed))} unpacked"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="for which each row is looked at")
+    parser.add_argument("--kills", type=int, default=5, help="of the daemon")
+    arguments = parser.parse_args()
+    from playwright.sync_api import sync_playwright
+
+    tables.heading("How old is what the page shows?")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
+    with TemporaryDirectory() as directory, sync_playwright() as playwright:
+        plant = Path(directory) / "plant.toml"
+        plant.write_text(plant_text(Path(directory)))
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        with program("simulate", str(plant), "--ports", directory, "--unpaced"):
+            with program("serve", str(plant)) as (_, ready):
+                url = ready.split()[-1]
+                rows = []
+                context = browser.new_context()
+                rows.append(row("1 tab", [opened(context, url)], arguments.seconds))
+                context.close()
+                context = browser.new_context()
+                pages = [opened(context, url) for _ in range(9)]
+                rows.append(row("9 tabs", pages, arguments.seconds / 9))
+                context.close()
+                context = browser.new_context()
+                slow = opened(context, url, SLOW)
+                slow.wait_for_timeout(2000)
+                rows.append(row("1 tab at 8 kB/s", [slow], arguments.seconds))
+                context.close()
+                print(frame_sizes(url))
+            print()
+            columns = [
+                "hidden tabs",
+                "frames/s",
+                "s old when it comes: median",
+                "p99",
+                "while shown: median",
+                "p99",
+            ]
+            tables.show(["viewer", *columns, "a value, while shown: median", "p99"], rows)
+            print()
+            found = []
+            for _ in range(arguments.kills):
+                with program("serve", str(plant)) as (daemon, ready):
+                    context = browser.new_context()
+                    page = opened(context, re.sub("127.0.0.1", "localhost", ready.split()[-1]))
+                    daemon.send_signal(signal.SIGKILL)
+                    found.append(until(page, STALE))
+                    context.close()
+            columns = ["daemons killed", "s until the page says so: median", "longest"]
+            tables.show(columns, [[len(found), f"{statistics.median(found):.2f}", f"{max(found):.2f}"]])
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()

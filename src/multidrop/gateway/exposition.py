@@ -1,0 +1,52 @@
+"""Exposition: families of metrics as text, in the two forms that scrapers read. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import isfinite
+from typing import NamedTuple
+
+OPEN_METRICS = "application/openmetrics-text"
+OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
+PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
+PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # kinds that the plain form lacks
+NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # by the plain form, the family too
+
+Labels = Mapping[str, str]
+Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
+
+
+class Family(NamedTuple):
+    """Samples of one name."""
+
+    name: str
+    kind: str  # "gauge", "counter", "summary", "info" or "stateset"
+    text: str
+    samples: Iterable[Sample]
+
+
+def open_metrics(families: Iterable[Family]) -> str:
+    """Return OpenMetrics 1.0, with its end mark."""
+    return "".join(_written(one, one.name, one.kind) for one in families) + "# EOF\n"
+
+
+def plain_text(families: Iterable[Family]) -> str:
+    """Return version 0.0.4 of Prometheus' text format: other names of families, and the same samples."""
+    return "".join(
+        _written(one, one.name + NAMED_WITH_SUFFIX.get(one.kind, ""), PLAIN_KINDS.get(one.kind, one.kind))
+        for one in families
+    )
+
+
+def _written(family: Family, name: str, kind: str) -> str:
+    lines = [f"# TYPE {name} {kind}\n# HELP {name} {family.text}\n"]
+    for suffix, labels, value in family.samples:
+        if isfinite(value):
+            inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels.items())
+            braced = f"{{{inside}}}" if inside else ""
+            lines.append(f"{family.name}{suffix}{braced} {float(value)!r}\n")
+    return "".join(lines)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")

@@ -1,0 +1,133 @@
+"""Hostile pages in Chromium: whatever they try, nothing is read and no write reaches the simulated wire."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateways import Served, served
+from lines import until as until_here
+from watching import LIVE, until
+
+MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
+# Everything by which a page can send, or read what it may not. Each is [what, what came of it].
+ATTACK = """async gateway => {
+  const stop = '{"drives": null}', found = [];
+  const note = (what, came) => found.push([what, came]);
+  const attempt = async (what, path, options) => {
+    try {
+      const answer = await fetch(gateway + path, { ...options, signal: AbortSignal.timeout(20000) });
+      note(what, `${answer.status} ${(await answer.text()).length}`);
+    } catch (error) { note(what, error.name); }
+  };
+  const json = { 'content-type': 'application/json' };
+  const post = (headers, mode) => ({ method: 'POST', body: stop, headers, mode, credentials: 'include' });
+  await attempt('read', 'api/plant', { credentials: 'include' });
+  await attempt('read blindly', 'api/plant', { mode: 'no-cors' });
+  await attempt('post', 'api/stop', post(json));
+  await attempt('post a text', 'api/stop', post({ 'content-type': 'text/plain' }));
+  await attempt('post a text blindly', 'api/stop', post({ 'content-type': 'text/plain' }, 'no-cors'));
+  await attempt('start', 'api/act', { ...post(json), body: '{"drive": "pump-1", "verb": "start"}' });
+  navigator.sendBeacon(gateway + 'api/stop', stop);
+  const loads = (tag, path) => new Promise(done => {
+    const element = document.createElement(tag);
+    element.onload = () => done('loaded');
+    element.onerror = () => done('error');
+    element.src = gateway + path;
+    document.body.append(element);
+  });
+  note('script', await loads('script', 'api/plant'));
+  note('image', await loads('img', 'page/icon.svg'));
+  return found;
+}"""
+# A form that sends JSON as text, as no form of ours does.
+FORM = """gateway => {
+  const form = document.createElement('form'), field = document.createElement('input');
+  Object.assign(form, { method: 'POST', action: gateway + 'api/stop', enctype: 'text/plain' });
+  Object.assign(field, { name: '{"drives": null, "x": "', value: '"}' });
+  form.append(field);
+  document.body.append(form);
+  form.submit();
+}"""
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[int]:
+    """A server on another port of this machine, with an empty page; its port."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("content-type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<!doctype html><title>elsewhere</title><body></body>")
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    yield server.server_address[1]
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def strange(browser: Any) -> Iterator[Any]:
+    """A page whose errors are those that it provokes."""
+    context = browser.new_context()
+    yield context.new_page()
+    context.close()
+
+
+def written(gateway: Served) -> list[Any]:
+    return [write for sim in gateway.sims.values() for write in sim.counters.writes]
+
+
+def sent_by_form(page: Any, gateway: str) -> int:
+    """Submit the form, and return the status of the answer."""
+    with page.expect_response("**/api/stop") as answer:
+        page.evaluate(FORM, gateway)
+    page.wait_for_url("**/api/stop")
+    return int(answer.value.status)
+
+
+def test_no_page_but_our_own_reads_or_sends_anything(strange: Any, elsewhere: int, tmp_path: Path) -> None:
+    with served(tmp_path, MAY) as gateway:
+        gateway.await_state("pump-1", "stands")
+        port = gateway.gateway.port
+        refused = dict.fromkeys(("read", "read blindly", "post", "post a text", "start"), "TypeError")
+        refused |= {"post a text blindly": "TypeError", "script": "error", "image": "error"}
+        # A page of another site, and one of another port of the very host that the gateway has.
+        for host, ours in (("evil.example", "127.0.0.1"), ("localhost", "localhost")):
+            strange.goto(f"http://{host}:{elsewhere}/")
+            own = f"http://{ours}:{port}/"
+            assert dict(strange.evaluate(ATTACK, own)) == refused, host
+            assert sent_by_form(strange, own) == 403
+        # A name of another site that leads to this machine: to the browser it is the gateway's own page.
+        rebound = f"http://evil.example:{port}/"
+        assert strange.goto(rebound).status == 421
+        came = dict(strange.evaluate(ATTACK, rebound))
+        assert {said.split()[0] for said in came.values()} == {"421", "error"}, came
+        assert written(gateway) == []
+        assert gateway.get("/api/audit").json["entries"] == []
+
+        strange.goto(f"http://localhost:{port}/")
+        until(strange, LIVE)
+        send = """async ([path, body]) => (await fetch(path, { method: 'POST', body: JSON.stringify(body),
+            headers: { 'content-type': 'application/json' } })).status"""
+        setpoint = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+        start = {"drive": "pump-1", "verb": "start"}
+        assert strange.evaluate(send, ["api/write", setpoint]) == 401
+        assert strange.evaluate(send, ["api/act", start]) == 403  # who may stop is known, and may no more
+        assert strange.evaluate(send, ["api/reload", {"confirm": True}]) == 401
+        assert written(gateway) == []
+        assert (
+            strange.evaluate(send, ["api/stop", {"drives": None}]) == 200
+        )  # the same request, from our own page
+        until_here(lambda: written(gateway))
