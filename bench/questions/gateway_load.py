@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -141,9 +141,9 @@ class Gateway(Polling):
         def total(name: str) -> float:
             return sum(map(float, re.findall(rf"^{name}_total{{.*}} (\S+)$", text, re.M)))
 
-        misses: Counter[str] = Counter()
+        misses: dict[str, float] = {}
         for reason, number in re.findall(r'^multidrop_misses_total{.*reason="(.*)"} (\S+)$', text, re.M):
-            misses[reason] += float(number)
+            misses[reason] = misses.get(reason, 0.0) + float(number)
         return Counts(total("multidrop_line_exchanges"), total("multidrop_line_samples"), misses)
 
 
@@ -230,7 +230,7 @@ class Hall:
     def __init__(self, pumps: SimulatedPumps, plant: Path, place: Place, before: Sequence[str]) -> None:
         self.pumps, self.plant, self.place, self.before = pumps, plant, place, before
         self.failures: Counter[str] = Counter()
-        self.counts: Counter[str] = Counter()
+        self.counts: dict[str, float] = {}
         self.loaded_s = 0.0
 
     @contextmanager
@@ -243,8 +243,8 @@ class Hall:
         self.loaded_s += time.monotonic() - begun
         self.failures.update(failures)
         for what, number in counts.items():
-            is_most = "longest" in what
-            self.counts[what] = max(self.counts[what], number) if is_most else self.counts[what] + number
+            before = self.counts.get(what, 0.0)
+            self.counts[what] = max(before, number) if "longest" in what else before + number
 
     def slices(self, number: int, seconds: float) -> Iterator[tuple[object, ...]]:
         for _ in range(number):
