@@ -14,7 +14,6 @@ import http.client
 import json
 import os
 import re
-import socket
 import statistics
 import subprocess
 import sys
@@ -29,7 +28,15 @@ from typing import NamedTuple
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
 from gateway_users import GatewayUsers, Place, gateway_users
-from simulated_pumps import FIRST_READING, POLLED, UNPOLLED, SimulatedPumps, simulated_pumps, write_plant
+from simulated_pumps import (
+    FIRST_READING,
+    POLLED,
+    UNPOLLED,
+    SimulatedPumps,
+    free_ports,
+    simulated_pumps,
+    write_plant,
+)
 
 from bench.support import tables
 from bench.support.programs import module
@@ -41,7 +48,7 @@ RUN_S = 1.0  # for which motors run before they are stopped
 STOPS_IN_A_ROW = 3
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 PATIENCE_S = 60.0
-AHEAD = ("nice", "-n", "-15")
+AHEAD = ("chrt", "--rr", "10")
 BROKER_CONF = "listener {} 127.0.0.1\nallow_anonymous true\n"
 SERVE = """[serve]
 listen = "127.0.0.1:{http}"
@@ -194,12 +201,6 @@ def broker(folder: Path, port: int) -> Iterator[None]:
             process.terminate()
 
 
-def free_ports(count: int) -> list[int]:
-    with ExitStack() as stack:
-        found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
-        return [one.getsockname()[1] for one in found]
-
-
 # ---- slices ----
 
 HEAD = ("slice", "exchanges/s", "values/s", "missed", "CPU %", "children %", "MB begin", "middle", "end")
@@ -339,7 +340,9 @@ def main() -> None:
     parser.add_argument("--stops", type=int, default=15, help="of all drives, of each kind")
     parser.add_argument("--minutes", type=int, default=0, help="beside the users, instead of all that")
     parser.add_argument("--rotate", default="1 min", help="after which a segment of the history is compacted")
-    parser.add_argument("--ahead", action="store_true", help="let simulator and polling go before others")
+    parser.add_argument(
+        "--ahead", action="store_true", help="run simulator and polling by SCHED_RR"
+    )
     parser.add_argument("--poll", nargs=2, type=Path, metavar=("PLANT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.poll:

@@ -1,18 +1,20 @@
 """A simulated plant of pumps on several lines, in a process of its own, which notes each drive's stop.
 
-The pumps have Delta's words and ten readings side by side, at 115200 bit/s: one request reads all ten.
+The pumps have Delta's words and ten readings side by side, at 115200 bit/s: one request reads all ten. Their
+lines are sockets: what goes through a pty waits for a thread of the kernel, which a busy machine holds up.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +71,19 @@ RAMP_S = 0.2  # of a motor that stops: short, for a stop's answer waits for it
 WAVE_S = 0.1  # between changes of load and speed
 
 
+def free_ports(count: int) -> list[int]:
+    """Return TCP ports that nobody listens on."""
+    with ExitStack() as stack:
+        found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
+        return [one.getsockname()[1] for one in found]
+
+
 def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
-    """Write a plant file of so many drives on each line, with this table `[serve]`; its ports are links."""
+    """Write a plant file of so many drives on each line, with this table `[serve]`; return its path."""
     (folder / "pump.toml").write_text(FAMILY)
     tables, number = [], 0
-    for line, count in enumerate(drives, 1):
-        tables.append(f'[[line]]\nname = "line-{line}"\nport = "{folder}/line-{line}"\n')
+    for line, (count, port) in enumerate(zip(drives, free_ports(len(drives)), strict=True), 1):
+        tables.append(f'[[line]]\nname = "line-{line}"\nport = "socket://127.0.0.1:{port}"\n')
         for address in range(1, count + 1):
             number += 1
             tables.append(
