@@ -43,6 +43,7 @@ from bench.support.programs import module
 from multidrop import Poller, SegmentWriter, load_plant
 
 LINES = (8, 8, 8, 7)  # drives on each, at 115200 bit/s: `multidrop plan` says 78 % of the time
+LOOK_S = 0.05  # between looks at counters
 SETTLE_S = 3.0  # after a start: delays are learnt, and users have come
 RUN_S = 1.0  # for which motors run before they are stopped
 STOPS_IN_A_ROW = 3
@@ -66,8 +67,9 @@ units = {{ {units} }}
 
 
 class Counts(NamedTuple):
-    """Counters of the polling since it began."""
+    """Counters of the polling since it began, and the moment, in s, at which they were those."""
 
+    at: float
     exchanges: float
     samples: float
     misses: Mapping[str, float]  # by reason
@@ -122,7 +124,7 @@ class PlainPoll(Polling):
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(file=self._process.stdin, flush=True)
-        return Counts(*json.loads(self._process.stdout.readline()))
+        return Counts(time.monotonic(), *json.loads(self._process.stdout.readline()))
 
 
 class Gateway(Polling):
@@ -143,6 +145,14 @@ class Gateway(Polling):
         return said
 
     def counts(self) -> Counts:
+        """Return the counts when they change, which is once a second."""
+        before, now = self._counts(), self._counts()
+        while now.exchanges == before.exchanges:
+            time.sleep(LOOK_S)
+            now = self._counts()
+        return now
+
+    def _counts(self) -> Counts:
         text = self.ask("GET", "/metrics")
 
         def total(name: str) -> float:
@@ -151,7 +161,8 @@ class Gateway(Polling):
         misses: dict[str, float] = {}
         for reason, number in re.findall(r'^multidrop_misses_total{.*reason="(.*)"} (\S+)$', text, re.M):
             misses[reason] = misses.get(reason, 0.0) + float(number)
-        return Counts(total("multidrop_line_exchanges"), total("multidrop_line_samples"), misses)
+        at = time.monotonic()
+        return Counts(at, total("multidrop_line_exchanges"), total("multidrop_line_samples"), misses)
 
 
 def poll(plant: Path, folder: Path) -> None:
@@ -208,16 +219,18 @@ HEAD = ("slice", "exchanges/s", "values/s", "missed", "CPU %", "children %", "MB
 
 def slice_of(name: str, polling: Polling, seconds: float) -> tuple[object, ...]:
     """Measure for so many seconds."""
-    begun, counts, before = time.monotonic(), polling.counts(), used(polling.pid)
+    counts = polling.counts()
+    begun, before = time.monotonic(), used(polling.pid)
     time.sleep(seconds / 2)
     middle = used(polling.pid).resident
     time.sleep(max(0.0, begun + seconds - time.monotonic()))
-    now, took = polling.counts(), time.monotonic() - begun
-    after = used(polling.pid)
+    after, took = used(polling.pid), time.monotonic() - begun
+    now = polling.counts()
+    counted = now.at - counts.at
     return (
         name,
-        f"{(now.exchanges - counts.exchanges) / took:.1f}",
-        f"{(now.samples - counts.samples) / took:.0f}",
+        f"{(now.exchanges - counts.exchanges) / counted:.1f}",
+        f"{(now.samples - counts.samples) / counted:.0f}",
         f"{sum(now.misses.values()) - sum(counts.misses.values()):.0f}",
         f"{(after.own - before.own) / took * 100:.1f}",
         f"{(after.children - before.children) / took * 100:.1f}",
@@ -340,9 +353,7 @@ def main() -> None:
     parser.add_argument("--stops", type=int, default=15, help="of all drives, of each kind")
     parser.add_argument("--minutes", type=int, default=0, help="beside the users, instead of all that")
     parser.add_argument("--rotate", default="1 min", help="after which a segment of the history is compacted")
-    parser.add_argument(
-        "--ahead", action="store_true", help="run simulator and polling by SCHED_RR"
-    )
+    parser.add_argument("--ahead", action="store_true", help="run simulator and polling by SCHED_RR")
     parser.add_argument("--poll", nargs=2, type=Path, metavar=("PLANT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.poll:
