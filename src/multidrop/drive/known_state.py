@@ -23,14 +23,26 @@ class StateReader:
 
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
+        self._shown: tuple[dict[str, float], State | None] | None = None  # by these values, the last time
         self.has_state = type(drive).state is not Drive.state
         """True where the family's document has a state at all."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
         """Return the state that these values by register's name show; None where others are needed.
 
-        A value is as in a row: in the register's unit, or the raw count where it has names.
+        A value is as in a row: in the register's unit, or the raw count where it has names. The family is
+        asked again only where one of the values that it read has changed, or where it noted something.
         """
+        if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
+            return self._shown[1]
+        notes, read = dict(vars(self._drive)), dict[str, float]()
+        found = self._look(values, read)
+        is_all_there_was = found is not None and notes == vars(self._drive)
+        self._shown = (read, found) if is_all_there_was else None
+        return found
+
+    def _look(self, values: Mapping[str, float], read: dict[str, float]) -> State | None:
+        """Return the state, and put the values that it is made of into `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -40,7 +52,7 @@ class StateReader:
                 register: Register[Any] = step.register
                 if register.name not in values:
                     return None
-                value = values[register.name]
+                value = read[register.name] = values[register.name]
                 step = script.send(value if register.values is None else register.decode(value))
         except StopIteration as end:
             return end.value if isinstance(end.value, State) else None

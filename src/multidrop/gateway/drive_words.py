@@ -12,7 +12,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable
 from enum import Enum
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 from multidrop import Carrier, NumberFormat, PolledDrive, Register, Table
 
@@ -164,7 +164,10 @@ class DriveWords:
                 if place not in fresh:
                     row = newest(place.register.name)
                     fresh[place] = row if is_fresh(row, place.fresh_ns, now_ns, since_ns) else None
-            word = _newest_word([(fresh[place], place, at) for place, at in found])
+            if len(found) == 1:
+                word = _word_of(fresh[found[0][0]], *found[0])
+            else:
+                word = _newest_word([(fresh[place], place, at) for place, at in found])
             if isinstance(word, Lack):
                 lacks.append(word)
             else:
@@ -174,13 +177,21 @@ class DriveWords:
         return words
 
 
+def _word_of(row: NewestRow | None, place: _Place, at: int) -> int | Lack:
+    """Return the word of a row; the reason where it has none."""
+    if row is None or row.value is None:
+        return Lack.STALE
+    word = place.word(row.value, at)
+    return Lack.UNPOLLED if word is None else word
+
+
 def _newest_word(found: list[tuple[NewestRow | None, _Place, int]]) -> int | Lack:
     """Return the word of the newest row that tells it; several registers may lie at one address."""
     lack = Lack.STALE
     rows = [(row, place, at) for row, place, at in found if row is not None and row.value is not None]
     for row, place, at in sorted(rows, key=lambda one: -one[0].monotonic_ns):
-        word = place.word(cast(float, row.value), at)
-        if word is not None:
+        word = _word_of(row, place, at)
+        if not isinstance(word, Lack):
             return word
         lack = Lack.UNPOLLED
     return lack

@@ -13,7 +13,8 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop.gateway.events import Events
-from multidrop.gateway.hub import FAULT, SILENT, Hub, Known
+from multidrop.gateway.hub import FAULT, SILENT, Hub
+from multidrop.gateway.kept_rows import Known
 from multidrop.gateway.lately import Lately
 
 LEAST_S = 0.1  # between two frames, on the whole
@@ -60,19 +61,21 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
         "fault": words if state == FAULT else None,
         "why": words if state == SILENT else None,
         "seen": None if seen is None else seen // 1_000_000,
-        "values": {known.register: _value(known, time_ns) for known in hub.known(name)},
+        "values": {known[0]: _value(hub, known, time_ns) for known in hub.known(name)},
     }
 
 
-def _value(known: Known, time_ns: int) -> list[Any]:
+def _value(hub: Hub, known: Known, time_ns: int) -> list[Any]:
     """Return value, time and status; of what is not known now null, and then the last value and its time."""
-    newest, good = known.newest, known.good
+    _, newest, good, is_fresh = known
     if newest is None:
         return [None, time_ns // 1_000_000, "not asked yet"]
-    last = [] if good is None or good.value is None else [_finite(good.value), good.time // 1_000_000]
-    if newest.value is None:
-        return [None, newest.time // 1_000_000, newest.status, *last]
-    return [*last, "ok"] if known.is_fresh else [None, time_ns // 1_000_000, "overdue", *last]
+    if newest is good and is_fresh:
+        return [_finite(good[2]), good[0] // 1_000_000, "ok"]
+    last = [] if good is None else [_finite(good[2]), good[0] // 1_000_000]
+    if newest[3]:
+        return [None, newest[0] // 1_000_000, hub.status(newest[3]), *last]
+    return [None, time_ns // 1_000_000, "overdue", *last]
 
 
 def _finite(value: float) -> float | None:
@@ -84,15 +87,16 @@ def lost_of(hub: Hub, line: str) -> str | None:
 
     Of a port that could not be opened it is what the system said.
     """
-    rows = [
-        row
-        for polled in hub.plant.find_line(line).drives
-        for poll in polled.polls
-        if (row := hub.newest(polled.drive.name, poll.register.name))
-    ]
-    if any(row.status not in LOST for row in rows):
-        return None
-    return hub.unopened.get(line) or max((row.status for row in rows), default=None)
+    statuses = set()
+    for polled in hub.plant.find_line(line).drives:
+        for poll in polled.polls:
+            row = hub.newest(polled.drive.name, poll.register.name)
+            if row is None:
+                continue
+            if row.status not in LOST:
+                return None
+            statuses.add(row.status)
+    return hub.unopened.get(line) or max(statuses, default=None)
 
 
 class Frames:

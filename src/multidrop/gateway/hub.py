@@ -9,13 +9,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, PolledDrive, Register, StateReader
+from multidrop.gateway.kept_rows import FreshValues, KeptRow, Known, RegisterRows
 
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 
 NOT_ASKED = "not asked lately"  # words of an unknown state: nothing is known of it at present
-
-STALE_NS = 1_000_000_000  # a value is never stale before that,
-STALE_PERIODS = 3  # nor before so many of its periods have passed
 
 _STATES = {
     Condition.STOPPED: STANDS,
@@ -45,68 +43,23 @@ class Shown(NamedTuple):
     words: str | None
 
 
-class _Cell:
-    """One register of one drive."""
-
-    __slots__ = ("good", "interval_ns", "least_ns", "newest")
-
-    def __init__(self, least_ns: int) -> None:
-        self.newest: tuple[int, int, float, int] | None = None  # time, monotonic, value, code of status
-        self.good: tuple[int, int, float, int] | None = None
-        self.least_ns = least_ns  # of its intervals, as planned
-        self.interval_ns = 0  # between its latest two samples, with no miss between them
-
-    @property
-    def stale_ns(self) -> int:
-        """The age from which its value is no longer the present one."""
-        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
-
-
-class _Fresh(Mapping[str, float]):
-    """Values of one drive's registers that are young enough, looked up when they are asked for."""
-
-    def __init__(self, cells: Mapping[str, _Cell], now_ns: int) -> None:
-        self._cells = cells
-        self._now_ns = now_ns
-
-    def __getitem__(self, register: str) -> float:
-        cell = self._cells[register]
-        if cell.good is None or self._now_ns - cell.good[1] > cell.stale_ns:
-            raise KeyError(register)
-        return cell.good[2]
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name in self._cells if name in self)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-class Known(NamedTuple):
-    """All that is known of one polled register."""
-
-    register: str
-    newest: Newest | None
-    good: Newest | None
-    is_fresh: bool
-
-
 class _Watched:
     """One drive of the plant."""
 
     def __init__(self, polled: PolledDrive, cycle_ns: int) -> None:
         self.polled = polled
+        self.names = tuple(poll.register.name for poll in polled.polls)
         self.cycle_ns = cycle_ns  # of its line, as planned
         self.reader = StateReader(polled.drive)
-        self.cells: dict[str, _Cell] = {}
+        self.cells: dict[str, RegisterRows] = {}
         self.seen: tuple[int, int, Shown] | None = None  # at which batch and time
 
-    def cell(self, register: str) -> _Cell:
+    def cell(self, register: str) -> RegisterRows:
         """Return the cell of a register, which is new where it was not known."""
         if register not in self.cells:
             every = next((poll.every for poll in self.polled.polls if poll.register.name == register), None)
             least_ns = self.cycle_ns if every is None else max(self.cycle_ns, round(every * 1e9))
-            self.cells[register] = _Cell(least_ns)
+            self.cells[register] = RegisterRows(least_ns)
         return self.cells[register]
 
 
@@ -119,7 +72,7 @@ class Hub:
         self.time = 0  # of the newest row, UTC in ns
         self.taken = 0  # batches
         self.unopened: dict[str, str] = {}  # lines whose port could not be opened, and why
-        self._cells: dict[int, _Cell | None] = {}  # by both codes; None: no drive of the plant
+        self._cells: dict[int, RegisterRows | None] = {}  # by both codes; None: no drive of the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
@@ -178,7 +131,7 @@ class Hub:
                 self.time = time
         self.taken += 1
 
-    def _cell(self, drive: str, register: str) -> _Cell | None:
+    def _cell(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)
         return watched.cell(register) if watched else None
 
@@ -201,7 +154,7 @@ class Hub:
     def is_fresh(self, drive: str, register: str) -> bool:
         """Return True while the newest value is young: a single miss after it makes it no older."""
         cell = self._known(drive, register)
-        return cell is not None and self._fresh(cell)
+        return cell is not None and cell.is_fresh(self.now_ns)
 
     def polled(self, drive: str) -> tuple[Register[Any], ...]:
         """Return the registers of a drive that are polled, in the plant file's order."""
@@ -216,15 +169,18 @@ class Hub:
     def known(self, drive: str) -> Iterator[Known]:
         """Yield what is known of each polled register of a drive, in the plant file's order."""
         watched = self._watched.get(drive)
-        for poll in watched.polled.polls if watched else ():
-            assert watched is not None
-            cell = watched.cells.get(poll.register.name)
-            if cell is None or cell.newest is None:
-                yield Known(poll.register.name, None, None, False)
-                continue
-            newest = self._row(cell.newest)
-            good = newest if cell.good is cell.newest else self._row(cell.good) if cell.good else None
-            yield Known(poll.register.name, newest, good, self._fresh(cell))
+        if watched is None:
+            return
+        for name in watched.names:
+            cell = watched.cells.get(name)
+            if cell is None:
+                yield Known(name, None, None, False)
+            else:
+                yield Known(name, cell.newest, cell.good, cell.is_fresh(self.now_ns))
+
+    def status(self, code: int) -> str:
+        """Return the words of a row's status."""
+        return self._statuses[code]
 
     def seen_at(self, drive: str) -> int | None:
         """Return when the newest value of a drive was asked for, UTC in ns; None: it never answered."""
@@ -232,16 +188,13 @@ class Hub:
         cells = watched.cells.values() if watched else ()
         return max((cell.good[0] for cell in cells if cell.good), default=None)
 
-    def _known(self, drive: str, register: str) -> _Cell | None:
+    def _known(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)
         return watched.cells.get(register) if watched else None
 
-    def _row(self, row: tuple[int, int, float, int]) -> Newest:
+    def _row(self, row: KeptRow) -> Newest:
         time, monotonic_ns, value, status = row
         return Newest(time, monotonic_ns, None if status else value, self._statuses[status])
-
-    def _fresh(self, cell: _Cell) -> bool:
-        return cell.good is not None and self.now_ns - cell.good[1] <= cell.stale_ns
 
     # ---- what they say of the drive ----
 
@@ -264,7 +217,7 @@ class Hub:
         return watched.seen[2]
 
     def _look(self, watched: _Watched) -> Shown:
-        fresh = _Fresh(watched.cells, self.now_ns)
+        fresh = FreshValues(watched.cells, self.now_ns)
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or "it shows a fault"

@@ -26,6 +26,7 @@ class Lately:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
         self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
+        self._figures: dict[str, dict[str, Any]] = {}  # of the lines, as of the newest reading
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=MINUTES + 1)
         self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
@@ -43,6 +44,7 @@ class Lately:
         self.newest = _of_lines(self.newest, goes_on)
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
+        self._figures = {name: self._line_figures(name, self._last_minute(name)) for name in self._lines}
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
         """Take a reading; `now` is of the monotonic clock, in s."""
@@ -52,16 +54,20 @@ class Lately:
             self._recent.popleft()
         if not self._minutes or utc_ms - self._minutes[-1][0] >= 60_000:
             self._minutes.append((utc_ms, reading))
+        minutes = {line: self._last_minute(line) for line in reading}
         self._drives = {
             name: _of_minute(statistics)
-            for line in reading
-            for name, statistics in (self._last_minute(line) or reading[line]).drives.items()
+            for line, minute in minutes.items()
+            for name, statistics in (minute or reading[line]).drives.items()
         }
+        self._figures = {line: self._line_figures(line, minute) for line, minute in minutes.items()}
 
     def line(self, name: str) -> dict[str, Any]:
         """Return how much of a line is used and planned, its rate, and the misses of the last minute."""
+        return self._figures.get(name) or self._line_figures(name, None)
+
+    def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
         lately = self._since(self._recent[0][1] if self._recent else {}, name)
-        minute = self._last_minute(name)
         return {
             "used": None if lately is None else round(lately.utilisation, 4),
             "planned": round(self._planned.get(name, 0.0), 4),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import repeat
 from pathlib import Path
@@ -149,26 +150,47 @@ def _valid(columns: RecordedColumns) -> Iterator[bool]:
 
 
 @lru_cache(maxsize=64)
-def _codes(drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]) -> frozenset[int]:
-    return frozenset(
-        drive << 16 | register
+def _codes(
+    drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
+) -> Mapping[int, frozenset[int]]:
+    """Return the codes of the series' registers by those of their drives."""
+    return {
+        drive: frozenset(code for code, other in enumerate(registers) if (name, other) in series)
         for drive, name in enumerate(drives)
-        for register, other in enumerate(registers)
-        if (name, other) in series
-    )
+        if any(name == wanted for wanted, _ in series)
+    }
 
 
-def _rows(columns: RecordedColumns, wanted: frozenset[int] | None, begin: int, end: int) -> Iterator[Row]:
-    for at, (time, drive, register, valid) in enumerate(
-        zip(columns.time, columns.drive, columns.register, _valid(columns), strict=False)
-    ):
-        if (wanted is None or drive << 16 | register in wanted) and begin <= time < end:
+def _places(columns: RecordedColumns, wanted: Mapping[int, frozenset[int]] | None) -> Sequence[int]:
+    """Return the places of the wanted rows: found by search, since they are a few of many."""
+    if wanted is None:
+        return range(len(columns.time))
+    found: list[int] = []
+    drives, size = columns.drive.tobytes(), columns.drive.itemsize
+    for drive, registers in wanted.items():
+        code = drive.to_bytes(size, sys.byteorder)
+        at = drives.find(code)
+        while at >= 0:
+            place, rest = divmod(at, size)
+            if rest == 0 and columns.register[place] in registers:
+                found.append(place)
+            at = drives.find(code, at + 1)
+    return sorted(found)
+
+
+def _rows(
+    columns: RecordedColumns, wanted: Mapping[int, frozenset[int]] | None, begin: int, end: int
+) -> Iterator[Row]:
+    for at in _places(columns, wanted):
+        time = columns.time[at]
+        if begin <= time < end:
+            is_valid = columns.valid is None or columns.valid[at >> 3] >> (at & 7) & 1
             yield Row(
                 time,
                 columns.monotonic_ns[at],
-                columns.uncertainty_ns[at] if valid else None,
-                columns.drives[drive],
-                columns.registers[register],
-                columns.value[at] if valid else None,
+                columns.uncertainty_ns[at] if is_valid else None,
+                columns.drives[columns.drive[at]],
+                columns.registers[columns.register[at]],
+                columns.value[at] if is_valid else None,
                 columns.statuses[columns.status[at]],
             )

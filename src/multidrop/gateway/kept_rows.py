@@ -1,0 +1,64 @@
+"""Kept rows: the newest rows of each register, as the hub keeps them, and how young they are. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+STALE_NS = 1_000_000_000  # a value is never stale before that,
+STALE_PERIODS = 3  # nor before so many of its periods have passed
+
+KeptRow = tuple[int, int, float, int]  # time, monotonic, value (of a miss without meaning), status
+
+
+class RegisterRows:
+    """One register of one drive."""
+
+    __slots__ = ("good", "interval_ns", "least_ns", "newest")
+
+    def __init__(self, least_ns: int) -> None:
+        self.newest: KeptRow | None = None
+        self.good: KeptRow | None = None
+        self.least_ns = least_ns  # of its intervals, as planned
+        self.interval_ns = 0  # between its latest two samples, with no miss between them
+
+    @property
+    def stale_ns(self) -> int:
+        """The age from which its value is no longer the present one."""
+        return max(STALE_NS, STALE_PERIODS * max(self.least_ns, self.interval_ns))
+
+    def is_fresh(self, now_ns: int) -> bool:
+        """Return True while its newest value is the present one."""
+        if self.good is None:
+            return False
+        age = now_ns - self.good[1]
+        return age <= STALE_NS or age <= self.stale_ns
+
+
+class FreshValues(Mapping[str, float]):
+    """Values of one drive's registers that are young enough, looked up when they are asked for."""
+
+    def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int) -> None:
+        self._cells = cells
+        self._now_ns = now_ns
+
+    def __getitem__(self, register: str) -> float:
+        cell = self._cells[register]
+        if cell.good is None or not cell.is_fresh(self._now_ns):
+            raise KeyError(register)
+        return cell.good[2]
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._cells if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+class Known(NamedTuple):
+    """All that is known of one polled register, its rows as the hub keeps them."""
+
+    register: str
+    newest: KeptRow | None
+    good: KeptRow | None
+    is_fresh: bool

@@ -1,0 +1,72 @@
+"""A drive's state out of values that somebody has: the family is asked again where it may say another one."""
+
+from __future__ import annotations
+
+import math
+
+from multidrop import Condition, StateReader
+from multidrop.drive import Drive
+from multidrop.drive.declare import reading
+from multidrop.drive.script import Script, read
+from multidrop.drive.state import State
+from multidrop.drive.verbs import verb
+
+RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
+
+
+class Counting(Drive):
+    """It counts how often it is asked, where no copy of it does."""
+
+    looks: list[float] = []
+    speed = reading(0x10)
+    temperature = reading(0x11)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Running while it turns."""
+        speed = yield from read(self.speed)
+        self.looks.append(speed)
+        return RUNS if speed else STANDS
+
+
+class Noting(Drive):
+    """It stands only when it has shown 0 twice, and so must be asked each time."""
+
+    speed = reading(0x10)
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.zeros = 0
+
+    @verb
+    def state(self) -> Script[State]:
+        """Standing when it has stood for two looks."""
+        speed = yield from read(self.speed)
+        self.zeros = 0 if speed else self.zeros + 1
+        return STANDS if self.zeros > 1 else RUNS
+
+
+def test_equal_values_are_one_look() -> None:
+    Counting.looks.clear()
+    reader = StateReader(Counting(1))
+    for temperature in range(5):
+        assert reader.state({"speed": 25.0, "temperature": float(temperature)}) == RUNS
+    assert Counting.looks == [25.0]
+    assert reader.state({"speed": 0.0}) == STANDS
+    assert reader.state({}) is None
+    assert reader.state({"speed": 0.0}) == STANDS
+    assert reader.state({"speed": 25.0}) == RUNS
+    assert Counting.looks[-1] == 25.0
+
+
+def test_a_value_that_is_no_number_is_no_equal() -> None:
+    Counting.looks.clear()
+    reader = StateReader(Counting(1))
+    assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]
+    assert len(Counting.looks) == 2
+
+
+def test_a_family_that_notes_something_is_asked_each_time() -> None:
+    reader = StateReader(Noting(1))
+    shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
+    assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]

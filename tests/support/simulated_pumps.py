@@ -1,0 +1,190 @@
+"""A simulated plant of pumps on several lines, in a process of its own, which notes each drive's stop.
+
+The pumps have Delta's words and ten readings side by side, at 115200 bit/s: one request reads all ten. Their
+lines are sockets: what goes through a pty waits for a thread of the kernel, which a busy machine holds up.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from multidrop import load_plant
+from multidrop.profiles.delta import DeltaControl
+from multidrop.sim import MotorDrive, Wire, serve, simulated
+
+FAMILY = """[family]
+title = "A pump with Delta's words"
+manual = "none: it is simulated"
+profile = "delta"
+counts_from = 0
+addresses = [1, 247]
+baudrates = [115200]
+formats = ["8N1"]
+together = { holding = 20 }
+[command]
+control = { at = "2000H", kept = "ram", place = "none" }
+reset = { at = "2002H", kept = "ram", place = "none" }
+[command.reference]
+at = "2001H"
+unit = "Hz"
+step = 0.01
+span = [0, 599]
+kept = "ram"
+place = "none"
+[reading]
+fault = { at = "2100H", place = "none" }
+status = { at = "2101H", place = "none" }
+reference_in_force = { at = "2102H", unit = "Hz", step = 0.01, place = "none" }
+output_frequency = { at = "2103H", unit = "Hz", step = 0.01, place = "none" }
+output_current = { at = "2104H", unit = "A", step = 0.01, place = "none" }
+dc_bus_voltage = { at = "2105H", unit = "V", step = 0.1, place = "none" }
+output_voltage = { at = "2106H", unit = "V", step = 0.1, place = "none" }
+output_power = { at = "2107H", unit = "kW", step = 0.001, number_format = "I16", place = "none" }
+motor_speed = { at = "2108H", unit = "rpm", place = "none" }
+heatsink_temperature = { at = "2109H", unit = "°C", step = 0.1, place = "none" }
+station = { at = "0900H", place = "none" }
+"""
+POLLED = (
+    "fault",
+    "status",
+    "reference_in_force",
+    "output_frequency",
+    "output_current",
+    "dc_bus_voltage",
+    "output_voltage",
+    "output_power",
+    "motor_speed",
+    "heatsink_temperature",
+)
+FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses
+RAMP_S = 0.2  # of a motor that stops: short, for a stop's answer waits for it
+WAVE_S = 0.1  # between changes of load and speed
+
+
+def free_ports(count: int) -> list[int]:
+    """Return TCP ports that nobody listens on."""
+    with ExitStack() as stack:
+        found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
+        return [one.getsockname()[1] for one in found]
+
+
+def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
+    """Write a plant file of so many drives on each line, with this table `[serve]`; return its path."""
+    (folder / "pump.toml").write_text(FAMILY)
+    tables, number = [], 0
+    for line, (count, port) in enumerate(zip(drives, free_ports(len(drives)), strict=True), 1):
+        tables.append(f'[[line]]\nname = "line-{line}"\nport = "socket://127.0.0.1:{port}"\n')
+        for address in range(1, count + 1):
+            number += 1
+            tables.append(
+                f'[[line.drive]]\nname = "pump-{number}"\nmodel = "pump.toml"\naddress = {address}\n'
+                f'every = "{every}"\npoll = {[*POLLED]}\n'
+            )
+    path = folder / "plant.toml"
+    path.write_text("".join(tables) + serve)
+    return path
+
+
+class SimulatedPumps:
+    """The running process, as its parent sees it."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def _ask(self, word: str) -> Any:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        print(word, file=self._process.stdin, flush=True)
+        return json.loads(self._process.stdout.readline())
+
+    def run(self) -> None:
+        """Let all motors run, and forget all stops."""
+        self._ask("run")
+
+    def stops(self) -> dict[str, tuple[float | None, bool]]:
+        """Return for each drive when the first frame of a stop had come, in s of CLOCK_MONOTONIC.
+
+        And True where its motor turns, or is to turn.
+        """
+        return {name: (at, turns) for name, (at, turns) in self._ask("stops").items()}
+
+
+@contextmanager
+def simulated_pumps(plant: Path, *before: str) -> Iterator[SimulatedPumps]:
+    """Simulate the drives of a plant file in a process of its own, which ends with this context.
+
+    `before` are words that the command begins with, such as `nice`.
+    """
+    words = [*before, sys.executable, __file__, str(plant)]
+    with subprocess.Popen(
+        words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            if process.stdout.readline() != "ready\n":
+                raise OSError("the simulator did not start")
+            yield SimulatedPumps(process)
+        finally:
+            process.terminate()
+
+
+# ---- the process ----
+
+
+def _stop_of(sim: MotorDrive) -> tuple[float | None, bool]:
+    control = sim.drive.registers["control"].address
+    stops = [at.time for at in sim.counters.writes if (at.address, at.raw) == (control, DeltaControl.STOP)]
+    return min(stops, default=None), bool(sim.motor.goal) or sim.motor.energised
+
+
+def _serve_words(sims: dict[str, MotorDrive]) -> None:
+    for word in sys.stdin:
+        if word.strip() == "run":
+            for sim in sims.values():
+                sim.counters.writes.clear()
+                sim.motor.run(1)
+            print("null", flush=True)
+        else:
+            print(json.dumps({name: _stop_of(sim) for name, sim in sims.items()}), flush=True)
+
+
+def _make_waves(sims: dict[str, MotorDrive]) -> None:
+    while True:
+        now = time.monotonic()
+        for phase, sim in enumerate(sims.values()):
+            sim.motor.load = 0.5 + 0.4 * math.sin(now / 3 + phase)
+            sim.motor.target = 40.0 + 5.0 * math.sin(now / 7 + phase)
+        time.sleep(WAVE_S)
+
+
+def main(path: str) -> None:
+    """Simulate until terminated."""
+    wires, sims = [], {}
+    for line in load_plant(path).lines:
+        here = [simulated(polled.drive) for polled in line.drives]
+        for sim in here:
+            assert isinstance(sim, MotorDrive)
+            sim.motor.deceleration_time = RAMP_S
+            sims[sim.drive.name] = sim
+        wires.append(Wire(here, name=line.name, port=str(line.port)))
+    for work in (_serve_words, _make_waves):
+        threading.Thread(target=work, args=(sims,), daemon=True).start()
+    serve(wires, lambda simulator: print("ready", flush=True))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
