@@ -8,7 +8,8 @@
 enum {
     WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to look away */
     HELD_UP_NS = 200000,      /* no write takes so long by itself */
-    MOST_SPINNING = 4         /* ports; with more of them the processor has better to do */
+    MOST_SPINNING = 4,        /* ports; with more of them the processor has better to do */
+    NO_SLEEP_NS = 1000        /* to come back for so little costs more, however many ports there are */
 };
 static const int64_t RETRY_WRITE_NS = 1000000;
 
@@ -101,8 +102,8 @@ static int is_sent(const struct md_port *port)
  * exchange. A look at a reply may be early, and is not spun for. */
 static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
 {
-    if (until_ns - *now_ns > MD_MOST_LATENESS || port->engine->count > MOST_SPINNING ||
-        port->turn.progress.lost)
+    int64_t most_ns = port->engine->count > MOST_SPINNING ? NO_SLEEP_NS : MD_MOST_LATENESS;
+    if (until_ns - *now_ns > most_ns || port->turn.progress.lost)
         return 0;
     if (!port->is_empty) /* what came meanwhile is looked for now, not when the request must leave */
         *now_ns = md_port_receive(port);
