@@ -12,17 +12,28 @@ import pytest
 from examples import every_other, usually
 from lines import proof
 from motors import MAKE, ReceivedRequests
-from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
+from paths import (
+    TAIL,
+    TURNS,
+    Delay,
+    Path,
+    PathLine,
+    PathWire,
+    S,
+    bus_over,
+    constant,
+    jittering,
+    read_truly,
+    stalling,
+)
 from variants import LINES, of_all_variants, of_one_variant
 
-from multidrop import bus
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
 from multidrop.core import Framing, Message
 from multidrop.drives import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
-from multidrop.transport import clock
 
 pytestmark = pytest.mark.story
 
@@ -58,17 +69,7 @@ def test_a_stall_costs_time_and_no_truth(name: str, longest: float) -> None:
 @pytest.fixture
 def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLine]]:
     def made(sims: list[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
-        wire = PathWire(sims, Faults())
-        wire.delay = delay
-        wire.open()
-        line = PathLine(wire)
-        monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
-        monkeypatch.setattr(clock, "now_ns", lambda: line.now)
-        monkeypatch.setattr(clock, "sleep", line.sleep)
-        opened = Bus("world")
-        for sim in sims:
-            opened.attach(sim.drive)
-        return opened, line
+        return bus_over(PathWire(sims, Faults()), delay, sims, monkeypatch)
 
     return made
 
@@ -83,19 +84,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     path, seconds = slow
     drives = of_one_variant(LINES[name])
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
-    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
-    read: Counter[str] = Counter()
-    with opened:
-        for _ in range(24):
-            for drive, register in asked:
-                try:
-                    value = opened.read(drive, register)
-                except BusError:
-                    line.sleep(0.05)
-                else:
-                    assert value == proof(drive, register)
-                    read[drive.name] += 1
-    assert set(read) == {drive.name for drive in drives}
+    read_truly(opened, line, drives)
 
 
 @pytest.mark.parametrize(("name", "slow"), ASKED)

@@ -5,17 +5,26 @@ A reply with its request's id needs no proof; a gateway with ids of its own is d
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import pytest
 from examples import every_other, usually
-from lines import proof
 from motors import MAKE, ReceivedRequests
-from paths import TAIL, TURNS, Delay, Path, PathLine, PathWire, S, constant, jittering, stalling
+from paths import (
+    TAIL,
+    TURNS,
+    Delay,
+    Path,
+    PathLine,
+    PathWire,
+    S,
+    bus_over,
+    constant,
+    jittering,
+    read_truly,
+    stalling,
+)
 
-from multidrop import bus
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
 from multidrop.core import Framing, Message, Status, TransactionIds
@@ -23,7 +32,6 @@ from multidrop.drive import Drive
 from multidrop.drives import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.errors import BusError
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
-from multidrop.transport import clock
 
 pytestmark = pytest.mark.story
 
@@ -115,17 +123,7 @@ def path_of(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., tuple[Bus, PathLine]]:
     def made(sims: Sequence[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
-        wire: Any = request.param(sims, Faults(), port=TCP)
-        wire.delay = delay
-        wire.open()
-        line = PathLine(wire)
-        monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
-        monkeypatch.setattr(clock, "now_ns", lambda: line.now)
-        monkeypatch.setattr(clock, "sleep", line.sleep)
-        opened = Bus(TCP)
-        for sim in sims:
-            opened.attach(sim.drive)
-        return opened, line
+        return bus_over(request.param(sims, Faults(), port=TCP), delay, sims, monkeypatch)
 
     return made
 
@@ -139,19 +137,7 @@ def test_what_a_bus_reads_over_a_slow_path_is_true(
     path, seconds = slow
     drives = two_of(name)
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
-    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
-    read: Counter[str] = Counter()
-    with opened:
-        for _ in range(24):
-            for drive, register in asked:
-                try:
-                    value = opened.read(drive, register)
-                except BusError:
-                    line.sleep(0.05)
-                else:
-                    assert value == proof(drive, register)
-                    read[drive.name] += 1
-    assert set(read) == {drive.name for drive in drives}
+    read_truly(opened, line, drives)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.6, 4.0])

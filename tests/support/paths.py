@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
+import pytest
+from lines import proof
 from stories import Story
 from worlds import BEGIN_NS, NEVER, WorldPort, WorldWire, transactions_of
 
+from multidrop import bus
+from multidrop.bus import Bus
 from multidrop.core import Completion, Exchange
+from multidrop.drive import Drive
 from multidrop.drive.network import speaks_tcp
+from multidrop.errors import BusError
+from multidrop.sim import SimulatedDrive
+from multidrop.transport import clock
 
 Delay = Callable[[float], float]  # in s, of what enters the path at a time in s
 
@@ -123,3 +131,36 @@ class PathLine:
             arrival = NEVER if at is None else -int(-at * S // 1)
             if not (is_awaited and self.queue.granted):
                 self.now = min(max(min(wake, arrival), self.now + 1), end_ns)
+
+
+def bus_over(
+    wire: PathWire, delay: Delay, sims: Sequence[SimulatedDrive], monkeypatch: pytest.MonkeyPatch
+) -> tuple[Bus, PathLine]:
+    """Open a bus over such a path, with the drives of these simulations."""
+    wire.delay = delay
+    wire.open()
+    line = PathLine(wire)
+    monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
+    monkeypatch.setattr(clock, "now_ns", lambda: line.now)
+    monkeypatch.setattr(clock, "sleep", line.sleep)
+    opened = Bus(line.port)
+    for sim in sims:
+        opened.attach(sim.drive)
+    return opened, line
+
+
+def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
+    """Read four registers of each drive in turn, again and again: each value is the register's own."""
+    asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
+    read: Counter[str] = Counter()
+    with opened:
+        for _ in range(24):
+            for drive, register in asked:
+                try:
+                    value = opened.read(drive, register)
+                except BusError:
+                    line.sleep(0.05)
+                else:
+                    assert value == proof(drive, register)
+                    read[drive.name] += 1
+    assert set(read) == {drive.name for drive in drives}

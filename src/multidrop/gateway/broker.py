@@ -50,16 +50,16 @@ class Login(NamedTuple):
 
 
 class Speaker(Protocol):
-    """A user of a connection: what it says, and what it is told. All of it is called in the loop."""
+    """The user of a connection: it has messages to send, and takes those that come. Called in the loop."""
 
     def will(self) -> Publication:
-        """Return what the broker is to say when this connection breaks."""
+        """Return the message that the broker sends when this connection breaks."""
 
     def topics(self) -> list[tuple[str, int]]:
         """Return the topics to listen to, with their QoS."""
 
     def connected(self) -> None:
-        """Say what is to be said first."""
+        """Send what comes first on a new connection."""
 
     def received(self, topic: str, payload: bytes, *, is_retained: bool) -> None:
         """Take a message."""
@@ -95,14 +95,14 @@ class Broker:
         self._why = ""
 
     def open(self) -> None:
-        """Begin to connect, and go on with it."""
+        """Begin to connect; every failure is followed by another attempt."""
         self._loop = asyncio.get_running_loop()
         self._set_will()
         self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
         self._client.loop_start()
 
     async def close(self) -> None:
-        """Wait a moment until all is said, and let go."""
+        """Send what waits, for a second at most, and disconnect."""
         begun = asyncio.get_running_loop().time()
         while self.is_connected and not self.outbox.is_idle:
             if asyncio.get_running_loop().time() - begun > FAREWELL_S:

@@ -1,4 +1,4 @@
-"""Connections: how many may be open, and how long one may take to say what it wants.
+"""Connections: how many may be open, and how long one may take over its request.
 
 Clients that are slow or silent cost nobody else anything: where there are too many connections, the one that
 has been idle for longest is closed, and a new one, which may bring a stop, always gets in.
@@ -84,7 +84,7 @@ class Connections:
 
 
 class CountingSocket(socket.socket):
-    """A listening socket that tells `connections` of each one."""
+    """A listening socket that notes each connection in `connections`."""
 
     connections: Connections | None = None
 
@@ -97,7 +97,7 @@ class CountingSocket(socket.socket):
 
 
 class Watched:
-    """An application whose requests are told to connections."""
+    """An application that notes in `connections` when a request is complete and when it is answered."""
 
     def __init__(self, app: ASGIApp, connections: Connections) -> None:
         self._app = app

@@ -1,4 +1,4 @@
-"""The words of a drive, made again of the values that were polled: exactly its own, or none.
+"""DriveWords: the words that a drive sent, made again from the values that were polled, or none.
 
 A row has a value in its unit; a Modbus client wants the count in the drive's words. A value is turned back
 only where one count alone has it: the count is packed, read again by the register's own coding, and must be
@@ -96,7 +96,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
-    """Return the counts on both sides, whose values are those most like it."""
+    """Return the next counts below and above: no other value is nearer."""
     if number_format not in _FLOATS:
         return (raw - 1, raw + 1)
     as_float, as_bits = _FLOATS[number_format]
@@ -186,7 +186,7 @@ def _word_of(row: NewestRow | None, place: _Place, at: int) -> int | Lack:
 
 
 def _newest_word(found: list[tuple[NewestRow | None, _Place, int]]) -> int | Lack:
-    """Return the word of the newest row that tells it; several registers may lie at one address."""
+    """Return the word that the newest row gives; several registers may lie at one address."""
     lack = Lack.STALE
     rows = [(row, place, at) for row, place, at in found if row is not None and row.value is not None]
     for row, place, at in sorted(rows, key=lambda one: -one[0].monotonic_ns):

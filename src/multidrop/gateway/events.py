@@ -1,4 +1,4 @@
-"""Events: faults and silence of drives, from when to when. Pure."""
+"""Events: faults and silences of drives, each with its begin and end. Pure."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Events:
             self._end(time, drive, FAULT)
 
     def forget(self, drive: str, time: int) -> None:
-        """End what lasts of a drive that is no longer there."""
+        """End the alarms of a drive that is no longer there."""
         self._end(time, drive, SILENT)
         self._end(time, drive, FAULT)
 

@@ -137,7 +137,7 @@ class Frames:
         self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
-        """Return a frame other than the n-th, as soon as there is one; None when there is none for long.
+        """Return a frame other than the n-th as soon as there is one; None after 20 s without one.
 
         Raises OverflowError when too many wait already.
         """
@@ -161,7 +161,7 @@ class Frames:
         return self._newest if self._newest is not None and self._newest.n != n else None
 
     def close(self) -> None:
-        """Let all go who wait."""
+        """Let all waiting viewers go, without a frame."""
         self._is_closed = True
         self._wake()
 

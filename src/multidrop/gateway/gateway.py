@@ -1,4 +1,4 @@
-"""Gateway: its life, from the ports' opening to the last batch."""
+"""Gateway: opens a plant's ports, polls and serves, until the last batch is handed out."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch to the hub and to all parts; the failure of one is nobody else's."""
+        """Give each batch to the hub and to all parts; where one fails, the others get it all the same."""
         is_new = False
         self.hub.pass_time(time.monotonic_ns())
         while batch := poller.take():
@@ -185,7 +185,7 @@ class Gateway:
             del self.hub.unopened[line]  # it came: should it go again, that has another reason
 
     def forget(self, drive: str) -> None:
-        """End what lasts of a drive that is no longer there."""
+        """End the alarms of a drive that is no longer there."""
         self.events.forget(drive, _utc_ms())
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
@@ -218,7 +218,7 @@ class Gateway:
         self.lately.tick(self.clock(), _utc_ms(), self.poller.statistics())
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
-        """Tell which ports are not there, and why."""
+        """Log and keep the lines whose ports are not there, and why."""
         for line, failure in failures.items():
             _log.warning("line %s is lost, and tried again: %s", line, failure)
         there = [line.name for line in self.plant.lines]

@@ -1,4 +1,4 @@
-"""Guard: what a request must be before any route sees it: whose page it comes from, and who sends it."""
+"""Guard: checks a request before any route sees it: the page it comes from, and its sender."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Guard:
         return self._admit(scope, headers, needed.right)
 
     def _find(self, path: str) -> Needed:
-        """Return what the longest prefix that is listed needs."""
+        """Return what is needed for the longest listed prefix of a path."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
             if not slash:
@@ -176,7 +176,7 @@ class Guard:
 
 
 def _secret(headers: Headers) -> tuple[str, str]:
-    """Return the token that was sent, and the way: of a program or of the page."""
+    """Return the token that was sent, and who sent it: a program or the page."""
     scheme, _, secret = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return secret.strip(), "http"

@@ -1,4 +1,4 @@
-"""The historian: a feed that records all rows, and may fail without anybody else's failing."""
+"""The historian: a feed that records all rows; where it fails, all else goes on."""
 
 from __future__ import annotations
 

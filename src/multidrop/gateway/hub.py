@@ -80,7 +80,8 @@ class Hub:
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
         """Go on with another plant; what is known of drives that stay as they are is kept.
 
-        `planned` is what its metadata plan: that takes seconds for hundreds of lines.
+        `planned` is `plant.metadata()["planned"]`, for callers that have it: it takes seconds for hundreds
+        of lines.
         """
         before = self._watched
         self.plant = plant
@@ -136,7 +137,7 @@ class Hub:
         return watched.cell(register) if watched else None
 
     def pass_time(self, monotonic_ns: int) -> None:
-        """Note that it is so late: values grow old, also where no row comes."""
+        """Take the present time: values grow old even where no row comes."""
         self.now_ns = max(self.now_ns, monotonic_ns)
 
     # ---- values ----

@@ -63,7 +63,7 @@ class Lately:
         self._figures = {line: self._line_figures(line, minute) for line, minute in minutes.items()}
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return how much of a line is used and planned, its rate, and the misses of the last minute."""
+        """Return a line's use, as measured and as planned, its rate, and the misses of the last minute."""
         return self._figures.get(name) or self._line_figures(name, None)
 
     def _line_figures(self, name: str, minute: LineStatistics | None) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class Lately:
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:
-        """Return what came in the last one to two minutes."""
+        """Return a line's statistics over the last one to two minutes."""
         earlier = self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}
         return self._since(earlier, line)
 
@@ -119,7 +119,7 @@ def _of_lines(reading: Reading, names: set[str]) -> Reading:
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:
-    """Return the misses by reason, without those that never came."""
+    """Return the misses by reason; reasons without a miss are left out."""
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 

@@ -243,7 +243,7 @@ class ModbusPort:
         self._server: asyncio.Server | None = None
 
     async def open(self, listener: Any) -> None:
-        """Let clients come to a listening socket."""
+        """Begin to accept clients on a listening socket."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
@@ -271,7 +271,7 @@ class ModbusPort:
         return True
 
     def forget(self, client: ModbusClient) -> None:
-        """Take a client out that is gone."""
+        """Remove a client that is gone."""
         self.clients.discard(client)
 
     def sweep(self) -> None:

@@ -72,7 +72,7 @@ class ModbusServer:
     # ---- life ----
 
     def listen(self) -> None:
-        """Have all ports, or none: raises OSError with the one that cannot be had."""
+        """Open all ports, or none. Raises OSError with the one that cannot be opened."""
         for line, number in {MAIN: self.settings.port, **self.settings.ports}.items():
             try:
                 self._sockets[line] = listen(self.settings.host, number)
@@ -82,7 +82,7 @@ class ModbusServer:
             self.ports[line] = self._sockets[line].getsockname()[1]
 
     async def start(self) -> None:
-        """Let clients come."""
+        """Begin to accept clients."""
         if not self._sockets:
             self.listen()
         clock = asyncio.get_running_loop().time
@@ -101,7 +101,7 @@ class ModbusServer:
                 port.sweep()
 
     def take(self, batch: Batch) -> None:
-        """Leave the rows to the hub, which has them already."""
+        """Do nothing: the hub has the rows already."""
 
     def _close_sockets(self) -> None:
         for listener in self._sockets.values():

@@ -28,7 +28,7 @@ def _utc_ms() -> int:
 
 
 class Mqtt:
-    """All that speaks by MQTT, each with a connection: a connection has one last will."""
+    """The speakers of MQTT, each with a connection of its own, since a connection has only one will."""
 
     def __init__(self, settings: MqttSettings, inside: Inside, speakers: list[Any]) -> None:
         address, login = parse_broker(settings.broker), settings.login(inside.plant)
@@ -64,7 +64,7 @@ class Mqtt:
             await sleep(self._every)
 
     async def close(self) -> None:
-        """Say goodbye, and let go of the broker."""
+        """Send the last messages and disconnect."""
         for broker, speaker in zip(self._brokers, self._speakers, strict=True):
             if broker.is_connected:
                 speaker.leave()

@@ -60,7 +60,7 @@ class MqttSettings:
 
     @property
     def caller(self) -> Caller:
-        """Everybody who may publish to the broker, as the audit log says it."""
+        """The caller that stands for everybody who may publish to the broker."""
         return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
 
     def check(self, plant: Plant) -> list[str]:
@@ -78,7 +78,7 @@ class MqttSettings:
         ]
 
     def login(self, plant: Plant) -> Login:
-        """Return what the broker wants to know. Raises OSError where the password cannot be read."""
+        """Return user, password and certificates. Raises OSError where the password cannot be read."""
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
 

@@ -14,7 +14,7 @@ MOST_WAITING = 4096  # topics; more than any plant has
 
 
 class Publication(NamedTuple):
-    """A topic, and what it says at the moment when it is sent."""
+    """A topic, and a function that makes its message when it is sent."""
 
     topic: str
     make: Callable[[], bytes]

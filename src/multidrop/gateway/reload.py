@@ -115,7 +115,7 @@ class Reload:
         return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
-        """Go on with the plant that is polled now, and with what of its settings needs no restart."""
+        """Go on with the plant that is polled now, and with those of its settings that need no restart."""
         gateway, plant = self._gateway, poller.plant
         gateway.hand_out(poller)  # rows of those that left
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
@@ -152,7 +152,7 @@ class Reload:
 
 
 async def _beside(work: Callable[[], R]) -> R:
-    """Return what work returns, in a thread of its own: all others may be busy."""
+    """Do the work in a thread of its own, as all others may be busy, and return its result."""
     own = ThreadPoolExecutor(1, "multidrop reload")
     try:
         return await asyncio.get_running_loop().run_in_executor(own, work)

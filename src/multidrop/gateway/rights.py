@@ -1,4 +1,4 @@
-"""Rights: who calls, by which way, and what he may do. Pure: texts and times come in."""
+"""Rights: callers, the ways they come by, and what each may do. Pure: texts and times come in."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Caller(NamedTuple):
 
 
 class Token(NamedTuple):
-    """One line of the tokens' file: nothing that is there opens anything."""
+    """One line of the tokens' file; it holds a digest, so that the file itself lets nobody in."""
 
     name: str
     right: Right
@@ -58,7 +58,7 @@ class Token(NamedTuple):
 
 
 def digest(token: str) -> str:
-    """Return what the file has of a token: tokens are long and random, and need no slow hash."""
+    """Return a token's digest. Tokens are long and random, and need no slow hash."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
@@ -89,7 +89,7 @@ def read_tokens(text: str) -> tuple[list[Token], list[str]]:
 
 
 class Tokens:
-    """The tokens that are good, and how often an address came with a wrong one."""
+    """The valid tokens, and how often each address came with a wrong one."""
 
     def __init__(self, tokens: Iterable[Token] = ()) -> None:
         self._tokens = tuple(tokens)
@@ -127,7 +127,7 @@ class Tokens:
 
 
 class May(NamedTuple):
-    """The table [serve.may]: what those may who have no token, and which writes and verbs anybody may."""
+    """The table [serve.may]: the right of callers without a token, and which writes and verbs are allowed."""
 
     look: str = "anyone"  # or "token"
     on_loopback: Right = Right.LOOK  # without a token

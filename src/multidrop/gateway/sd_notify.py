@@ -16,13 +16,13 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """Seconds within which the manager wants to hear; None where it does not."""
+        """Seconds within which the manager expects a sign of life; None where it expects none."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
 
     def tell_reloading(self) -> None:
-        """Say that a reload begins now; READY=1 ends it. The time tells it from an older one."""
+        """Say that a reload begins now; READY=1 ends it. Its time shows that it is no older one."""
         self.tell("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def tell(self, *lines: str) -> None:

@@ -144,7 +144,7 @@ def _with_periods(polled: PolledDrive, cycle_s: float) -> PolledDrive:
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
-    """Yield a sentence for each number that is two drives' or none's, and one with those that are free."""
+    """Yield a sentence for each unit id of two drives, or of none, and one with the ids that are free."""
     where = "" if port == MAIN else f" on the port of line {port}"
     wrong: list[str] = []  # drives
     for number, found in sorted(units.items()):

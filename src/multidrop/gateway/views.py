@@ -38,12 +38,17 @@ def _delays(statistics: Statistics | None) -> dict[str, Any] | None:
         return None
     delays = statistics.delays
     return {
-        "p50": round(delays.p50 * 1e3, 3),
-        "p99": round(delays.p99 * 1e3, 3),
+        **_usual_delays(statistics),
         "longest": round(delays.longest * 1e3, 3),
         "replies": delays.replies,
         "counts": [[round(least * 1e3, 3), count] for least, count in statistics.delay_counts],
     }
+
+
+def _usual_delays(statistics: Statistics) -> dict[str, float]:
+    """Return the median and the 99th percentile of the response delays, in ms."""
+    delays = statistics.delays
+    return {"p50": round(delays.p50 * 1e3, 3), "p99": round(delays.p99 * 1e3, 3)}
 
 
 def _wear(ledger: Ledger, port: str, address: int) -> list[dict[str, Any]]:
@@ -141,10 +146,8 @@ def figures_of(gateway: Gateway) -> Figures:
 def _drive_figures(statistics: Statistics | None) -> dict[str, Any] | None:
     if statistics is None:
         return None
-    delays = statistics.delays
     return {
-        "p50": round(delays.p50 * 1e3, 3),
-        "p99": round(delays.p99 * 1e3, 3),
+        **_usual_delays(statistics),
         "asked": statistics.exchanges,
         "missed": sum(statistics.misses.values()),
     }

@@ -30,7 +30,7 @@ class HistoryFile(NamedTuple):
     end: int
 
     def may_have(self, begin: int, end: int) -> bool:
-        """Tell whether rows from `begin` to `end`, in ns, may be in it."""
+        """Return True where rows from `begin` to `end`, in ns, may be in the file."""
         return self.begin * SECOND_NS < end and begin <= self.end * SECOND_NS
 
 
@@ -63,7 +63,7 @@ def parquet_files(directory: Path) -> list[HistoryFile]:
 
 
 def widest(files: list[HistoryFile]) -> list[HistoryFile]:
-    """Return the files that are in no other one's range; they are in order."""
+    """Return, in order, the files whose range of segments lies in no other file's."""
     found: list[HistoryFile] = []
     for file in files:
         if not found or file.first > found[-1].last:

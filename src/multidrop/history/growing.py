@@ -1,4 +1,4 @@
-"""A segment that is not compacted yet: each batch is looked at once, and tens are reckoned of it."""
+"""A segment that is not compacted yet: each batch is read once, and its tens are computed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class IndexedBatch(NamedTuple):
 
 
 class GrowingSegment:
-    """A segment that is read as far as it is there; `damage` says why no more of it can be read.
+    """A segment, read as far as it is written; `damage` says why no more of it can be read.
 
     Raises as ArrowsTail does.
     """
@@ -47,12 +47,12 @@ class GrowingSegment:
         self.damage: str | None = None
 
     def hold(self) -> None:
-        """Keep it open until one more `let_go`."""
+        """Keep the segment open until one more `let_go`."""
         with self._changing:
             self._holders += 1
 
     def let_go(self) -> None:
-        """Close it, when nobody holds it any more."""
+        """Close the segment when nobody holds it any more."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -70,7 +70,7 @@ class GrowingSegment:
         return self._tail.left_out
 
     def look(self) -> None:
-        """Take in what came since the last look."""
+        """Read what was written since the last look."""
         with self._changing:
             try:
                 for columns, place in self._tail.new() if self.damage is None else ():

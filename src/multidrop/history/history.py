@@ -59,7 +59,7 @@ class History:
         self.close()
 
     def close(self) -> None:
-        """Give files and memory back. The history may be used again."""
+        """Close all files and free memory. The history may be used again."""
         self._sources.close()
 
     @property

@@ -54,7 +54,7 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Give a segment as far as it is there, open until the block is left.
+        """Give a segment, as far as it is written, open until the block is left.
 
         None where nothing of it is in this range, or can be read. Raises Replaced.
         """
@@ -77,7 +77,7 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment that is to be let go of. What was learnt of the newest ones is kept."""
+        """Return a segment for the caller to let go of. The indexes of the newest ones are kept."""
         segment = self._growing.get(number)
         if segment is None:
             try:

@@ -95,7 +95,7 @@ class HistoryWriter:
             self._metadata = metadata
 
     def state(self) -> HistoryState:
-        """Return how it goes."""
+        """Return rows written and lost so far, and what is wrong now."""
         return HistoryState(self._segments.rows, self._dropped, self._trouble)
 
     def close(self) -> None:
