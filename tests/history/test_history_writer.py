@@ -218,15 +218,14 @@ def test_closed_segments_are_compacted_and_what_is_too_old_goes(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
-    record(tmp_path, [random_rows(number, NOON + number * DAY, 20) for number in range(4)])
+    begin = time.time_ns() - 10 * DAY
+    record(tmp_path, [random_rows(number, begin + number * DAY, 20) for number in range(4)])
     writer = writers(tmp_path)
     until(lambda: len(parquet_files(tmp_path / "rows")) == 4 and not listing(tmp_path).segments)
     writer.take(some(0))
     writer.close()
     assert [*listing(tmp_path).segments] == [5]
-    end = parquet_files(tmp_path / "rows")[2].end
-    keep = time.time() - end - 3600  # of the third day at least a part is younger
-    writer = writers(tmp_path, keep=keep)
+    writer = writers(tmp_path, keep=7.5 * DAY / SECOND)
     until(lambda: min(listing(tmp_path).rows, default=9) == 4)
     assert {file.first for file in parquet_files(tmp_path / "tens")} == {4}
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, nats, publish, without_fan
+from brokers import FAN, Broker, Listener, Published, Running, inside, mosquitto, publish, without_fan
 from gateways import served
 from lines import until
 from peers import require_module
@@ -143,18 +143,6 @@ def test_a_broker_that_comes_back_is_told_anew(broker: Broker, listener: Listene
     again.wait_for(has("multidrop/gateway", b"online"))
     again.wait_for(has("multidrop/pump-1"))
     again.close()
-
-
-def test_nats_takes_it_too(tmp_path: Path) -> None:
-    require_module("paho.mqtt.client")
-    with nats(tmp_path) as broker:
-        listener = Listener(broker)
-        running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
-        try:
-            listener.wait_for(has("multidrop/pump-1"))
-        finally:
-            running.close()
-            listener.close()
 
 
 # ---- commands ----

@@ -8,69 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import (
-    FAN,
-    Broker,
-    Listener,
-    Published,
-    Running,
-    inside,
-    mosquitto,
-    publish,
-    sparkplug_messages,
-    without_fan,
-)
+from brokers import FAN, Broker, Running, inside, mosquitto, without_fan
 from peers import require_module
+from sparkplug_host import ROOT, Host, command
 
 from multidrop.gateway.mqtt import MqttSettings, build
-
-ROOT = "spBv1.0/works/{}/line"
-
-
-class Host:
-    """A host: it checks that the sequence numbers of a node go up by one."""
-
-    def __init__(self, broker: Broker) -> None:
-        self._listener = Listener(broker, "spBv1.0/#")
-        self._messages = sparkplug_messages()
-        self.seq: int | None = None
-        self.aliases: dict[int, str] = {}
-        self.kinds: list[str] = []
-
-    def wait_for(self, kind: str, device: str = "") -> Any:
-        wanted = ROOT.format(kind) + (f"/{device}" if device else "")
-        return self._decoded(self._listener.wait_for(lambda received: self._take(received) == wanted))
-
-    def _decoded(self, received: Published) -> Any:
-        return self._messages.Payload.FromString(received.payload)
-
-    def _take(self, received: Published) -> str:
-        kind = received.topic.split("/")[2]
-        if kind.endswith("CMD"):
-            return received.topic
-        self.kinds.append(kind)
-        found = self._decoded(received)
-        if kind == "NBIRTH":
-            self.seq = 0
-            assert found.seq == 0
-        elif kind != "NDEATH":
-            assert self.seq is not None
-            self.seq = (self.seq + 1) % 256
-            assert found.seq == self.seq
-        if kind == "DBIRTH":
-            self.aliases |= {metric.alias: metric.name for metric in found.metrics}
-        return received.topic
-
-    def values(self, found: Any) -> dict[str, Any]:
-        return {
-            metric.name or self.aliases[metric.alias]: None
-            if metric.is_null
-            else getattr(metric, metric.WhichOneof("value"))
-            for metric in found.metrics
-        }
-
-    def close(self) -> None:
-        self._listener.close()
+from multidrop.gateway.outbox import Outbox, Publication
+from multidrop.gateway.sparkplug_node import SparkplugNode
 
 
 @pytest.fixture
@@ -144,12 +88,6 @@ def test_sequence_numbers_begin_again_after_255(host: Host, node: tuple[Any, Run
     assert host.seq < 256
 
 
-def command(broker: Broker, topic: str, **metric: Any) -> None:
-    sent = sparkplug_messages().Payload(timestamp=metric.pop("time_ms", time.time_ns() // 1_000_000))
-    sent.metrics.add(**metric)
-    publish(broker, topic, sent.SerializeToString())
-
-
 def test_rebirth(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
     host.wait_for("DBIRTH", FAN.name)
     command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
@@ -166,6 +104,36 @@ def test_a_lost_connection_is_a_death_and_a_birth_of_the_next_number(
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 1
     host.wait_for("DBIRTH", "pump-1")
+
+
+def test_a_drive_that_died_again_while_nothing_was_sent_is_dead_in_the_end(tmp_path: Path) -> None:
+    known, sent, is_open = inside(tmp_path), [], [True]
+
+    def send(message: Publication) -> int | None:
+        if not is_open[0]:
+            return None
+        sent.append((message.topic.split("/")[2], message.make()))
+        return len(sent)
+
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
+    node.outbox = outbox = Outbox(send)  # fewer than may be under way
+    node.will()
+    node.connected()
+    assert [kind for kind, _ in sent] == ["NBIRTH", "DBIRTH", "DBIRTH"]
+    is_open[0] = False
+    for state in ("silent", "runs", "fault", "silent"):
+        known.hub.states["pump-1"] = state
+        node.publish()
+    is_open[0] = True
+    outbox.flush()
+    assert [kind for kind, _ in sent[3:]] == ["DDEATH"]
+    is_open[0] = False
+    for state in ("runs", "silent", "runs", "fault"):
+        known.hub.states["pump-1"] = state
+        node.publish()
+    is_open[0] = True
+    outbox.flush()
+    assert [kind for kind, _ in sent[4:]] == ["DBIRTH", "DDATA"]
 
 
 def test_the_end_is_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:

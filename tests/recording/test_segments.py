@@ -206,6 +206,26 @@ def test_outlived() -> None:
     assert gone(5.0, 1.0, None) == []  # the clock was set back: nothing is old
 
 
+def test_a_clock_that_jumps_empties_nothing() -> None:
+    week = [StoredFile(Path(str(number)), number, number * DAY, 100) for number in range(1, 8)]
+
+    def left(now: float, files: list[StoredFile]) -> list[int]:
+        gone = outlived(files, now, 5 * DAY, None)
+        return [file.number for file in files if file not in gone]
+
+    assert left(8 * DAY, week) == [3, 4, 5, 6, 7]
+    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # as if no time had passed
+    ahead = [*week, *(StoredFile(Path(str(n)), n, (4000 + n) * DAY, 100) for n in (8, 9))]
+    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # and goes on from there
+    corrected = [*ahead, StoredFile(Path("10"), 10, 10 * DAY, 100)]
+    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # those that are 5 days old at most, again
+    assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # it was off for longer than is kept
+    booted_in_1970 = [*week, StoredFile(Path("8"), 8, 60.0, 100)]
+    assert left(9 * DAY, booted_in_1970) == [1, 2, 3, 4, 5, 6, 7, 8]
+    two = [file._replace(path=Path(f"tens/{file.number}"), end=file.end + 5) for file in week]
+    assert left(8 * DAY, sorted(week + two, key=lambda file: file.number)) == [3, 3, 4, 4, 5, 5, 6, 6, 7, 7]
+
+
 @pytest.mark.parametrize(
     ("text", "seconds"),
     [("30 days", 30 * DAY), ("1 day", DAY), ("1.5 h", 5400.0), ("10min", 600.0), ("2 weeks", 14 * DAY)],

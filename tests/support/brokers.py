@@ -175,19 +175,20 @@ def sparkplug_messages() -> ModuleType:
 
 
 PUMP, FAN = InvtCHE(1, name="pump-1"), InvtCHE(2, name="вентилятор 2")
+PLAIN_FAN = InvtCHE(2, name="вентилятор-2")  # for nats-server, which takes no topic with a space
 
 
 class SaidHub:
     """A hub that says what a test wants; values are by drive and register."""
 
-    def __init__(self) -> None:
+    def __init__(self, fan: str) -> None:
         self.values: dict[tuple[str, str], float | None] = {
             ("pump-1", "output_frequency"): 49.5,
             ("pump-1", "status"): 1.0,
         }
-        self.states = {PUMP.name: "runs", FAN.name: "runs"}
+        self.states = {PUMP.name: "runs", fan: "runs"}
         self.faults: dict[str, str | None] = {}
-        self.names = [PUMP.name, FAN.name]
+        self.names = [PUMP.name, fan]
 
     @property
     def drives(self) -> Iterator[str]:
@@ -233,12 +234,12 @@ class NotedCommands:
         return Told(True, "done")
 
 
-def inside(folder: Path) -> Any:
+def inside(folder: Path, fan: InvtCHE = FAN) -> Any:
     """Return what a part is given: two drives, a hub and commands of this test."""
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
-    drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, FAN))
+    drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
-    hub: Any = SaidHub()
+    hub: Any = SaidHub(fan.name)
     commands: Any = NotedCommands()
     return Inside(plant, hub, commands, SimpleNamespace(), folder, "0.2")  # type: ignore[arg-type]
 

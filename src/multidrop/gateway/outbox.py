@@ -43,6 +43,10 @@ class Outbox:
             self._waiting[message.topic] = message
         self.flush()
 
+    def withdraw(self, topic: str) -> None:
+        """Drop what waits of a topic, if anything does: something else was said since."""
+        self.dropped += self._waiting.pop(topic, None) is not None
+
     def flush(self) -> None:
         """Send what waits, as far as there is room."""
         while self._waiting and len(self._under_way) < MOST_UNDER_WAY:

@@ -89,20 +89,20 @@ class SparkplugNode:
         there = {polled.drive.name for line in plant.lines for polled in line.drives}
         for drive in [drive for drive in self._said if drive not in there]:
             del self._said[drive]
-            self.outbox.put(Publication(self._topic("DDEATH", drive), self._device_death, qos=0))
+            self._begin_anew(drive, "DDEATH", self._device_death)
 
     def publish(self) -> None:
         """Say what changed of each drive, and which came and went."""
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
                 if self._said.pop(drive, None) is not None:
-                    self.outbox.put(Publication(self._topic("DDEATH", drive), self._device_death, qos=0))
+                    self._begin_anew(drive, "DDEATH", self._device_death)
                 continue
             values = self._values(drive)
             before = self._said.get(drive)
             self._said[drive] = values
             if before is None:
-                self._put(drive, "DBIRTH", self._device_birth)
+                self._begin_anew(drive, "DBIRTH", self._device_birth)
                 continue
             changed = {name: value for name, value in values.items() if value != before[name]}
             if changed:
@@ -121,6 +121,12 @@ class SparkplugNode:
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
 
     # ---- payloads, each made when it is sent: their numbers go up by one ----
+
+    def _begin_anew(self, drive: str, kind: str, make: Any) -> None:
+        """Say that a drive is born or dead, and nothing any more of what waited to be said of it."""
+        for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
+            self.outbox.withdraw(self._topic(other, drive))
+        self._put(drive, kind, make)
 
     def _put(self, drive: str, kind: str, make: Any) -> None:
         self.outbox.put(Publication(self._topic(kind, drive), lambda: make(drive), qos=0))
@@ -153,7 +159,7 @@ class SparkplugNode:
             metrics.append(Metric(DataType.BOOLEAN, False, now, STOP, self._alias(drive, STOP)))
         return payload(now, metrics, self._next())
 
-    def _device_death(self) -> bytes:
+    def _device_death(self, drive: str) -> bytes:
         return payload(self._utc_ms(), [], self._next())
 
     def _data(self, drive: str) -> bytes:

@@ -23,13 +23,17 @@ class StoredFile(NamedTuple):
 def outlived(
     files: Iterable[StoredFile], now: float, keep: float | None, most: int | None
 ) -> list[StoredFile]:
-    """Return the files to remove: those that ended `keep` s before `now`, and the oldest beyond `most`.
+    """Return the files to remove: those that are older than `keep` s, and the oldest beyond `most`.
 
     `now` is in s since 1970, `most` is the number of bytes that may stay. The oldest is the one with the
     lowest number, whatever the clock said. None is no limit.
+
+    An age is the sum of the times from each file's end to the next one's, and to `now`. Of those a time that
+    is longer than `keep` is left out: the clock jumped, or nothing was recorded. Neither empties a history.
     """
     in_order = sorted(files, key=lambda file: file.number)
-    gone = [file for file in in_order if keep is not None and file.end < now - keep]
+    ages = {} if keep is None else _ages(in_order, now, keep)
+    gone = [file for file in in_order if keep is not None and ages[file.number] > keep]
     left = [file for file in in_order if file not in gone]
     total = sum(file.size for file in left)
     for file in left:
@@ -38,6 +42,20 @@ def outlived(
         gone.append(file)
         total -= file.size
     return gone
+
+
+def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
+    """Return the age in s of each number, without steps that are longer than this, or back in time."""
+    ends: dict[int, float] = {}
+    for file in files:
+        ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may say later
+    ages, age, later = {}, 0.0, now
+    for number in sorted(ends, reverse=True):
+        step = later - ends[number]
+        if 0.0 < step <= longest:
+            age += step
+        ages[number], later = age, min(later, ends[number])
+    return ages
 
 
 def parse_age(text: str) -> float:
