@@ -27,16 +27,8 @@ from typing import NamedTuple
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
-from gateway_users import GatewayUsers, Place, gateway_users
-from simulated_pumps import (
-    FIRST_READING,
-    POLLED,
-    UNPOLLED,
-    SimulatedPumps,
-    free_ports,
-    simulated_pumps,
-    write_plant,
-)
+from gateway_users import GatewayUsers, Place, gateway_users, place_of, serve_tables
+from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps, write_plant
 
 from bench.support import tables
 from bench.support.programs import module
@@ -51,19 +43,6 @@ TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 PATIENCE_S = 60.0
 AHEAD = ("chrt", "--rr", "10")
 BROKER_CONF = "listener {} 127.0.0.1\nallow_anonymous true\n"
-SERVE = """[serve]
-listen = "127.0.0.1:{http}"
-[serve.may]
-stop = "anyone"
-[serve.history]
-rotate = "{rotate}"
-[serve.mqtt]
-broker = "mqtt://127.0.0.1:{broker}"
-home_assistant = true
-[serve.modbus]
-listen = "127.0.0.1:{modbus}"
-units = {{ {units} }}
-"""
 
 
 class Counts(NamedTuple):
@@ -320,13 +299,9 @@ def _spread(times: Sequence[float]) -> tuple[float, float, float]:
 def hall(rotate: str, before: Sequence[str]) -> Iterator[Hall]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="multidrop-load-")))
-        web, modbus, mqtt = free_ports(3)
-        units = ", ".join(f"pump-{number} = {number}" for number in range(1, sum(LINES) + 1))
-        serve = SERVE.format(http=web, modbus=modbus, broker=mqtt, rotate=rotate, units=units)
-        plant = write_plant(folder, LINES, serve)
-        series = [f"pump-{number}.{name}" for number in range(1, sum(LINES) + 1) for name in POLLED]
-        place = Place(web, modbus, mqtt, sum(LINES), FIRST_READING, UNPOLLED, series)
-        stack.enter_context(broker(folder, mqtt))
+        place = place_of(sum(LINES), *free_ports(3))
+        plant = write_plant(folder, LINES, serve_tables(place, rotate))
+        stack.enter_context(broker(folder, place.broker))
         yield Hall(stack.enter_context(simulated_pumps(plant, *before)), plant, place, before)
 
 

@@ -12,6 +12,7 @@ from examples import examples
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 
 from multidrop import History, open_reader
+from multidrop.history import kept_series
 from multidrop.history.buckets import grid_of
 from multidrop.history.compact import compact
 from multidrop.polling.batch import Row
@@ -290,3 +291,23 @@ def test_without_duckdb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         for ask in (lambda: rows_in(history), lambda: history.buckets("pump-0.speed", NOON, NOON + DAY)):
             with pytest.raises(ImportError, match=r"needs duckdb.*pip install 'multidrop\[history\]'"):
                 ask()
+
+
+@pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
+def test_plots_of_a_segment_that_grows_are_of_all_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Asked again and again for other series and ranges, among them such as begin before or far behind."""
+    monkeypatch.setattr(kept_series, "MOST_KEPT", most)
+    dice = random.Random(most)
+    rows = random_rows(5, NOON, 400) + random_rows(6, NOON + 20 * SECOND, 200)  # the clock was set back
+    with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
+        for at in range(0, len(rows), 40):
+            writer.write(from_rows(rows[at : at + 40]))
+            for _ in range(5):
+                begin = NOON + dice.randrange(-5, 120) * SECOND
+                end = begin + dice.randrange(1, 100) * SECOND
+                series = dice.sample(SERIES, dice.randrange(1, 4))
+                for name, found in history.buckets(series, begin, end, points=97).items():
+                    assert not grid_of(begin, end, 97).is_of_tens
+                    check_buckets(found, rows[: at + 40], name)

@@ -20,6 +20,8 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from typing import Any, NamedTuple
 
+from simulated_pumps import FIRST_READING, POLLED, UNPOLLED
+
 VIEWERS, STALLED, MASTERS = 5, 10, 2
 SCRAPE_S = QUERY_S = 1.0
 MASTER_S = 0.02  # between a master's requests
@@ -28,6 +30,20 @@ ASKED_ONES = 200  # requests that a stalled viewer sends before it stops reading
 PATIENCE_S = 30.0
 ROUND_S = 1.0  # before a user whose connection broke comes again
 WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # what masters read
+
+SERVE = """[serve]
+listen = "127.0.0.1:{http}"
+[serve.may]
+stop = "anyone"
+[serve.history]
+rotate = "{rotate}"
+[serve.mqtt]
+broker = "mqtt://127.0.0.1:{broker}"
+home_assistant = true
+[serve.modbus]
+listen = "127.0.0.1:{modbus}"
+units = {{ {units} }}
+"""
 
 
 class Place(NamedTuple):
@@ -40,6 +56,18 @@ class Place(NamedTuple):
     first: int  # address of the words that are polled
     unpolled: int  # address of one that is not
     series: list[str]
+
+
+def place_of(drives: int, http: int, modbus: int, broker: int) -> Place:
+    """Return the place of a gateway of so many simulated pumps, with these ports."""
+    series = [f"pump-{number}.{name}" for number in range(1, drives + 1) for name in POLLED]
+    return Place(http, modbus, broker, drives, FIRST_READING, UNPOLLED, series)
+
+
+def serve_tables(place: Place, rotate: str) -> str:
+    """Return the tables `[serve]` of its plant file, with all parts."""
+    units = ", ".join(f"pump-{number} = {number}" for number in range(1, place.drives + 1))
+    return SERVE.format(http=place.http, modbus=place.modbus, broker=place.broker, units=units, rotate=rotate)
 
 
 class Users:

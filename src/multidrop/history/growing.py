@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
+from multidrop.history.kept_series import KeptSeries, Series, SeriesRow
 from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows_tail import ArrowsTail, BatchPlace
 
-Series = tuple[str, str]  # drive and register
 Ten = list[float]  # values, misses, their sum, least, most
 Tens = dict[int, Ten]  # by number since 1970
 
@@ -40,6 +40,7 @@ class GrowingSegment:
         self._holders = 1
         self._changing = threading.RLock()
         self._batches: list[IndexedBatch] = []
+        self._kept = KeptSeries(self._read)
         self._tens: dict[Series, Tens] = {}
         self._by_code: dict[int, Tens] = {}
         self._names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
@@ -127,14 +128,28 @@ class GrowingSegment:
                 self._gather_rows(found, grid)
 
     def _gather_rows(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
-        for batch in self.batches(grid.begin, grid.end):
-            for row in self.rows_of(batch, frozenset(found), grid.begin, grid.end):
-                bucket, value = (row.time - grid.begin) // grid.step, row.value
-                into = found[row.drive, row.register]
+        for series, rows in self._kept.rows_of(found, self._batches_between(grid.begin, grid.end)).items():
+            into = found[series]
+            for time, value in rows.between(grid.begin, grid.end):
+                bucket = (time - grid.begin) // grid.step
                 if value is None:
                     into.add(bucket, 0, 1, 0.0, 0.0, 0.0)
                 else:
                     into.add(bucket, 1, 0, value, value, value)
+
+    def _batches_between(self, begin: int, end: int) -> range:
+        """Return the numbers of all batches from the first to the last that may have rows of this range."""
+        found = [
+            number for number, batch in enumerate(self._batches) if batch.least < end and begin <= batch.most
+        ]
+        return range(found[0], found[-1] + 1) if found else range(0)
+
+    def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
+        """Yield a batch's rows of these series."""
+        columns = self._tail.again(self._batches[number].place)
+        for at in _places(columns, _codes(columns.drives, columns.registers, series)):
+            name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
+            yield SeriesRow(name, columns.time[at], columns.value[at] if _is_valid(columns, at) else None)
 
     def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
         for series, into in found.items():
@@ -147,6 +162,10 @@ def _valid(columns: RecordedColumns) -> Iterator[bool]:
     if columns.valid is None:
         return repeat(True)
     return (bool(byte >> bit & 1) for byte in columns.valid for bit in range(8))
+
+
+def _is_valid(columns: RecordedColumns, at: int) -> bool:
+    return columns.valid is None or bool(columns.valid[at >> 3] >> (at & 7) & 1)
 
 
 @lru_cache(maxsize=64)
@@ -184,7 +203,7 @@ def _rows(
     for at in _places(columns, wanted):
         time = columns.time[at]
         if begin <= time < end:
-            is_valid = columns.valid is None or columns.valid[at >> 3] >> (at & 7) & 1
+            is_valid = _is_valid(columns, at)
             yield Row(
                 time,
                 columns.monotonic_ns[at],

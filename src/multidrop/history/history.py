@@ -11,7 +11,7 @@ from pathlib import Path
 from multidrop.history.buckets import Accumulator, Buckets, Grid, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import Listing, listing
-from multidrop.history.growing import Series
+from multidrop.history.kept_series import Series
 from multidrop.history.queries import (
     OF_ROWS,
     OF_TENS,

@@ -10,7 +10,7 @@ from typing import Any
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.database import copy_out, files_of, insert, quoted, rows_of
 from multidrop.history.folder import HistoryFile
-from multidrop.history.growing import Series
+from multidrop.history.kept_series import Series
 from multidrop.history.sources import Sources, while_there
 from multidrop.polling.batch import Rows
 from multidrop.recording.format import METADATA_KEY, Metadata
