@@ -1,4 +1,4 @@
-"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a clock of the test's own.
+"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a test's clock.
 
 A reply with its request's id needs no proof; a gateway with ids of its own is dealt with as RTU is.
 """
