@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from conftest import SIZES, Opener, missing
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/log", "settings", "stop")
 SHORT = {("desk", "light"), ("phone", "dark")}
 TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
