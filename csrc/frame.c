@@ -34,8 +34,8 @@ static int open_text(int framing, const uint8_t *text, size_t len, const struct 
         return MD_NO_START;
     size_t have = 0;
     int byte = 0;
-    for (; have <= MD_MOST_BODY && 2 * have + 2 < len && (byte = md_hex_byte(text + 2 * have + 1)) >= 0; have++)
-        body[have] = (uint8_t)byte;
+    while (have <= MD_MOST_BODY && 2 * have + 2 < len && (byte = md_hex_byte(text + 2 * have + 1)) >= 0)
+        body[have++] = (uint8_t)byte;
     int length = md_body_length(framing, body, have, request);
     if (length < 0)
         return length;

@@ -34,10 +34,11 @@ void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *blo
 
 enum { MD_MOST_BODY = 253 }; /* 125 registers read; the standard has room for 254 */
 
-/* Return the length of the body that begins there: a request's, or a reply's to `request`. MD_INCOMPLETE where
- * its first bytes do not tell yet. */
+/* Return the length of the body that begins there: a request's, or that of the reply to `request`;
+ * MD_INCOMPLETE where its first bytes do not tell yet. */
 int md_body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request);
-int md_body_reply_length(int framing, const struct md_message *request); /* of the good reply; 0: none comes */
+/* Return the length of the good reply's body; 0 where none comes. */
+int md_body_reply_length(int framing, const struct md_message *request);
 /* Write what follows on address and function, and return the whole length; MD_BAD_REQUEST where no body can
  * say it. */
 int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);

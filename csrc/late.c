@@ -117,9 +117,11 @@ static int is_sent_alone(const struct md_exchange *exchange)
 
 static int is_free(const struct md_drive *drive, const struct md_exchange *proof)
 {
-    for (uint32_t i = 0; i < drive->owed_count; i++)
-        if (is_open(drive, &drive->history->owed[i]) && md_owed_is_mistakable(&drive->history->owed[i], proof))
+    for (uint32_t i = 0; i < drive->owed_count; i++) {
+        const struct md_owed *owed = &drive->history->owed[i];
+        if (is_open(drive, owed) && md_owed_is_mistakable(owed, proof))
             return 0;
+    }
     return 1;
 }
 

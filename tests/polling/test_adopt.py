@@ -8,9 +8,9 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire, S
 from lines import line, plant, polled, rows_of
 from toy import Toy
-from worlds import S, World, WorldWire
 
 from multidrop.core import Echo
 from multidrop.drive import Drive
@@ -32,11 +32,11 @@ def toy(name: str, address: int, every: float | None = 0.1) -> PolledDrive:
     return polled(Toy(address, name=name), ALL, every)
 
 
-def wire(*drives: Drive) -> WorldWire:
-    return WorldWire([EncodedDrive(drive) for drive in drives], Faults())
+def wire(*drives: Drive) -> ClockedWire:
+    return ClockedWire([EncodedDrive(drive) for drive in drives], Faults())
 
 
-def toys() -> WorldWire:
+def toys() -> ClockedWire:
     """A wire with toys at the addresses 1 to 4."""
     return wire(*(Toy(address) for address in range(1, 5)))
 
@@ -57,10 +57,10 @@ def fans(every: float | None = 0.1) -> tuple[PolledDrive, ...]:
     return tuple(toy(f"fan-{address}", address, every) for address in (1, 2))
 
 
-def world(*lines: PlantLine) -> World:
+def clocked(*lines: PlantLine) -> ClockedLines:
     """A plant on wires of toys, and a wire to which no line goes yet."""
     names = {*(each.name for each in lines), "hall", "yard", "roof"}
-    return World.of_lines({f"port of {name}": toys() for name in names}, plant(*lines))
+    return ClockedLines.of_lines({f"port of {name}": toys() for name in names}, plant(*lines))
 
 
 def values(rows: Sequence[Row]) -> Counter[tuple[str, str]]:
@@ -93,7 +93,7 @@ def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
     """Its exchanges leave at the very nanoseconds at which they leave without any adoption."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
-        with world(hall(*pumps(every)), yard(*fans(every))) as made:
+        with clocked(hall(*pumps(every)), yard(*fans(every))) as made:
             rows = made.run(5)
             for others in OTHERS * 2:
                 if adopts:  # of a plant that was loaded anew: its drives are other objects
@@ -112,7 +112,7 @@ def test_an_untouched_line_loses_no_slot(every: float | None) -> None:
 
 
 def test_what_is_the_same_stays_the_same() -> None:
-    with world(hall(*pumps()), yard(*fans())) as made:
+    with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         before = made.poller.plant
         assert made.poller.adopt(plant(hall(*pumps()), yard(*fans()))) == {}
@@ -127,7 +127,7 @@ def test_what_is_the_same_stays_the_same() -> None:
 
 
 def test_rates_and_registers_change_on_the_open_port() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(2)
         first, second = made.poller.bus("hall").drives
         slow = replace(hall(), drives=(toy("pump-1", 1, 0.5), toy("pump-2", 2)))
@@ -152,7 +152,7 @@ def test_rates_and_registers_change_on_the_open_port() -> None:
 
 
 def test_drives_come_go_and_move_to_another_address() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(2)
         stays = made.poller.bus("hall").drives[0]
         made.poller.adopt(plant(hall(toy("pump-1", 1), toy("pump-3", 3))))
@@ -176,7 +176,9 @@ def test_a_drive_becomes_one_of_another_family() -> None:
     drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
     registers = [drive.readings()[:4] for drive in drives]
     wires = {"port of hall": wire(drives[0], Toy(1))}
-    with World.of_lines(wires, plant(hall(polled(drives[0], registers[0], 0.1), toy("fan", 1)))) as made:
+    with ClockedLines.of_lines(
+        wires, plant(hall(polled(drives[0], registers[0], 0.1), toy("fan", 1)))
+    ) as made:
         rows = made.run(3)
         assert statuses(rows, "pump") == {"ok"}
         made.wires["port of hall"] = wire(drives[1], Toy(1))
@@ -191,7 +193,7 @@ def test_a_drive_becomes_one_of_another_family() -> None:
 
 
 def test_a_line_with_a_new_name_keeps_its_port() -> None:
-    with world(hall(*pumps()), yard(*fans())) as made:
+    with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
         assert made.poller.adopt(plant(*names)) == {}
@@ -206,7 +208,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
 
 
 def test_lines_come_and_go() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(2)
         assert made.poller.adopt(plant(yard(*fans()))) == {}
         rows = made.run(10)
@@ -222,7 +224,7 @@ def test_lines_come_and_go() -> None:
 
 
 def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
-    with world(hall(*pumps()), yard(*fans())) as made:
+    with clocked(hall(*pumps()), yard(*fans())) as made:
         rows = made.run(2.05)
         made.poller.remove_line("yard")
         rows += made.run(3)
@@ -233,7 +235,7 @@ def test_every_slot_of_a_line_that_goes_has_a_row() -> None:
 
 
 def test_one_line_is_added_and_removed() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         made.poller.add_line(yard(*fans()))
         made.run(1)
@@ -253,7 +255,7 @@ def test_one_line_is_added_and_removed() -> None:
 
 
 def test_all_lines_may_go_and_others_come() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         assert made.poller.adopt(plant()) == {}
         rows_of(made.poller)
@@ -263,7 +265,7 @@ def test_all_lines_may_go_and_others_come() -> None:
 
 
 def test_a_plant_is_adopted_before_the_polling_too() -> None:
-    made = world(hall(*pumps()))
+    made = clocked(hall(*pumps()))
     made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
     with made:
         made.run(1)
@@ -276,7 +278,7 @@ def test_a_plant_is_adopted_before_the_polling_too() -> None:
 def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
     """A reply that is late may come on the port as it is opened next."""
     wires = {"port of hall": wire(Toy(1))}
-    with World.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
+    with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
         made.run(2)
         ours = made.poller.bus("hall")
         peers = [ours.peer(drive) for drive in ours.drives]
@@ -292,7 +294,7 @@ def test_what_was_learnt_on_a_port_is_kept_when_it_is_opened_anew() -> None:
 def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> None:
     """Requests that are queued yet are made before the next drive comes, which knows what may be late."""
     wires = {"port of hall": wire(Toy(1))}
-    with World.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
+    with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
         ours = made.poller.bus("hall")
         before = ours.peer(ours.drives[1])
@@ -312,7 +314,7 @@ def test_a_drive_that_takes_another_s_place_knows_what_that_is_asked_yet() -> No
 
 
 def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
         failures = made.poller.adopt(
@@ -332,7 +334,7 @@ def test_a_port_that_is_not_there_is_told_and_waited_for() -> None:
 
 
 def test_one_line_whose_port_is_not_there_is_not_added() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
         with pytest.raises(LineError, match="port of yard: it is not there"):
@@ -380,7 +382,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
 @pytest.mark.parametrize("mistake", broken())
 def test_a_broken_plant_changes_nothing(mistake: str) -> None:
     wrong, sentence = broken()[mistake]
-    with world(hall(*pumps()), yard(*fans())) as made:
+    with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         before = made.poller.plant
         with pytest.raises(PlantError) as found:
@@ -396,13 +398,13 @@ def test_a_broken_plant_changes_nothing(mistake: str) -> None:
 
 def test_all_mistakes_are_told_at_once() -> None:
     pump, _ = pumps()
-    with world(hall(*pumps())) as made, pytest.raises(PlantError) as found:
+    with clocked(hall(*pumps())) as made, pytest.raises(PlantError) as found:
         made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3, 0.0))))
     assert len(found.value.mistakes) == 5
 
 
 def test_a_name_that_no_port_can_have_changes_nothing() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         with pytest.raises(NoSuchPort, match="it needs a host and a port number"):
             made.poller.adopt(plant(line("socket://nowhere", toy("v", 1))))
@@ -410,7 +412,7 @@ def test_a_name_that_no_port_can_have_changes_nothing() -> None:
 
 
 def test_an_audit_log_that_cannot_be_opened_changes_nothing() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.poller._lines._audit = "/proc/none/audit"
         with pytest.raises(OSError, match="No such file"):
             made.poller.adopt(plant(yard(*fans())))
@@ -419,15 +421,15 @@ def test_an_audit_log_that_cannot_be_opened_changes_nothing() -> None:
 
 
 def test_another_poller_s_drives_are_left_to_it() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         sentence = "it is on another bus: detach it there first, or make another"
-        with world(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
+        with clocked(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
             made.poller.adopt(other.poller.plant)
         assert list(made.poller.buses) == ["hall"]
 
 
 def test_more_names_than_a_batch_can_number() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
         assert made.poller.adopt(plant(hall(*pumps()))) == {}
@@ -462,7 +464,7 @@ def test_what_is_no_plant() -> None:
 
 
 def test_a_name_s_code_stays_the_same() -> None:
-    with world(hall(*pumps())) as made:
+    with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}
         for others in (*OTHERS, (yard(toy("pump-2", 3)),)):
@@ -482,7 +484,7 @@ def test_a_name_s_code_stays_the_same() -> None:
 
 
 def test_memory_is_bounded_over_many_adoptions() -> None:
-    with world(hall(*pumps()), yard(*fans())) as made:
+    with clocked(hall(*pumps()), yard(*fans())) as made:
 
         def kept() -> tuple[int, ...]:
             lines = made.poller._lines
@@ -520,15 +522,15 @@ def test_drives_that_join_are_asked_in_the_best_order() -> None:
         rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}
         return [polled(Toy(at, name=f"p-{at}", baudrate=rates[at]), [CURRENT]) for at in rates]
 
-    def round_of(made: World) -> list[str]:
+    def round_of(made: ClockedLines) -> list[str]:
         return [job.owner.name for job in made.poller._lines.find("hall")._schedule._round]
 
-    def quick() -> WorldWire:
+    def quick() -> ClockedWire:
         return wire(*(each.drive for each in drives()))
 
-    with World.of_lines({"port of hall": quick()}, plant(hall(*drives()))) as made:
+    with ClockedLines.of_lines({"port of hall": quick()}, plant(hall(*drives()))) as made:
         at_start = round_of(made)
-    with World.of_lines({"port of hall": quick()}, plant(hall(*drives()[:1]))) as made:
+    with ClockedLines.of_lines({"port of hall": quick()}, plant(hall(*drives()[:1]))) as made:
         made.run(1)
         made.poller.adopt(plant(hall(*drives())))
         joined = round_of(made)

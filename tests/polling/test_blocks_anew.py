@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled
 from toy import Toy
-from worlds import S, World, WorldWire
 
 from multidrop.drive.declare import reading
 from multidrop.drive.table import HOLDING
@@ -45,13 +45,13 @@ def test_blocks_are_those_of_the_response_delay_that_was_measured(
     drive = Wide(1, name="pump-1")
     drive.response_delay = document
     sim = SimulatedDrive(Wide(1), response_delay=truth)
-    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far], every)]) as world:
-        first = world.run(0.7)
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far], every)]) as clocked:
+        first = clocked.run(0.7)
         assert asked_together(first) == {document == LATE}
-        between = world.run(3.0)
-        after = world.run(9.0)
+        between = clocked.run(3.0)
+        after = clocked.run(9.0)
         assert asked_together(after) == {truth == LATE}
-        summary = world.poller.summary()["lines"]["line"]
+        summary = clocked.poller.summary()["lines"]["line"]
     assert summary["misses"] == {}
     if every:
         assert summary["overrun_slots"] == 0
@@ -65,9 +65,11 @@ def test_other_drives_keep_their_place_in_the_round() -> None:
     drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
     drives[1].response_delay = LATE
     sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
-    with World(WorldWire(sims, Faults()), [polled(each, [Wide.near, Wide.far]) for each in drives]) as world:
-        world.run(5.0)
-        rows = [(row.drive, row.register) for row in world.run(2.0)]
+    with ClockedLines(
+        ClockedWire(sims, Faults()), [polled(each, [Wide.near, Wide.far]) for each in drives]
+    ) as clocked:
+        clocked.run(5.0)
+        rows = [(row.drive, row.register) for row in clocked.run(2.0)]
     at = rows.index(("pump-1", "near"))
     assert rows[at : at + 6] == [(drive.name, name) for drive in drives for name in NAMES]
 
@@ -75,12 +77,12 @@ def test_other_drives_keep_their_place_in_the_round() -> None:
 def test_a_drive_that_answers_now_soon_and_now_late_costs_no_memory() -> None:
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
-    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
-        (line,) = world.poller._lines
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as clocked:
+        (line,) = clocked.poller._lines
         seen = set()
         for _ in range(6):
             for sim.response_delay in (SOON, LATE):
-                world.run(6.0)
+                clocked.run(6.0)
                 seen.add(len(line._maker._made))
     assert seen == {2, 3}
 
@@ -91,10 +93,10 @@ def test_nothing_is_chosen_anew_where_nothing_else_would_be_quicker(monkeypatch:
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
     choose, chosen = JobMaker.plan, []
     monkeypatch.setattr(JobMaker, "plan", lambda *given: chosen.append(given) or choose(*given))
-    with World(WorldWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as world:
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as clocked:
         for sim.response_delay in (SOON / 20, 2 * SOON, SOON / 5, SOON):
-            assert asked_together(world.run(6.0)) == {False}
+            assert asked_together(clocked.run(6.0)) == {False}
         assert len(chosen) == 1
         sim.response_delay = LATE
-        world.run(6.0)
+        clocked.run(6.0)
         assert len(chosen) == 2

@@ -1,6 +1,6 @@
 """Every fault on a line of every family: nothing is misattributed, every miss is explained, and it ends.
 
-On a world's clock, so that a seed is a story that can be told again. For hours, with new seeds:
+On a clock of the test's own, so that a seed is a story that can be told again. For hours, with new seeds:
 `HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
 """
 
@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from leftovers import descriptors, threads
 from lines import polled, rows_of
 from stories import HEALTHY, Story
 from variants import LINES, VARIANTS, of_all_variants, of_one_variant
-from worlds import World, WorldWire
 
 from multidrop.core import Framing
 from multidrop.drive import Drive
@@ -86,9 +86,9 @@ def test_a_fault_and_its_end(name: str, kind: str) -> None:
 def test_an_adapter_that_always_echoes_is_known_for_it(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
-    with story.world:
+    with story.clocked:
         story.run(HEALTHY)
-    story.rows += rows_of(story.world.poller)
+    story.rows += rows_of(story.clocked.poller)
     story.judge()
     assert {row.status for row in story.rows} <= {"ok", "poll ended"}
 
@@ -99,8 +99,8 @@ def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) ->
     """Nothing else is polled on the line: what is asked for may have the value that its query says."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [drive.register(register)])
-    with World(WorldWire([simulated(drive)], Faults(echo=echo)), [asked]) as world:
-        rows = world.run(HEALTHY)
+    with ClockedLines(ClockedWire([simulated(drive)], Faults(echo=echo)), [asked]) as clocked:
+        rows = clocked.run(HEALTHY)
     assert len(rows) > 10
     assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 

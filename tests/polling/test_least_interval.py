@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled
 from picky import Picky, family
 from simulated_bus import SimulatedBus
 from toy import Toy
-from worlds import S, World, WorldWire
 
 from multidrop.control.call import Call
 from multidrop.control.stop_all import stop_together
@@ -68,10 +68,10 @@ def test_it_is_asked_no_sooner_and_all_its_registers_share_its_turns(
         polled(drive, drive.registers.values(), every),
         *(polled(one, one.readings()) for one, _ in rest),
     ]
-    with World(WorldWire([sim, *(one for _, one in rest)], Faults()), drives) as world:
-        world.run(2)
+    with ClockedLines(ClockedWire([sim, *(one for _, one in rest)], Faults()), drives) as clocked:
+        clocked.run(2)
         del sim.times[:]
-        rows = world.run(12)
+        rows = clocked.run(12)
     counts = [sum(row.register == f"r{at}" and row.drive == "slow" for row in rows) for at in range(3)]
     assert sim.early == 0
     assert {row.status for row in rows} == {"ok"}
@@ -86,9 +86,9 @@ def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> 
 
     def exchanges(*drives: Drive) -> int:
         before = [polled(drive, drive.readings()) for drive in drives]
-        with World(WorldWire([sim, its_sim], Faults()), before) as world:
-            world.run(2)
-            return sum(row.drive == other.name for row in world.run(10))
+        with ClockedLines(ClockedWire([sim, its_sim], Faults()), before) as clocked:
+            clocked.run(2)
+            return sum(row.drive == other.name for row in clocked.run(10))
 
     alone, together = exchanges(other), exchanges(drive, other)
     assert together >= 0.75 * alone  # 3 exchanges of 130 ms each take less than a quarter of the line
@@ -98,20 +98,20 @@ def test_the_others_are_polled_as_fast_as_before_but_for_its_own_exchanges() -> 
 def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     drives = [polled(drive, drive.readings()), polled(other, other.readings())]
-    with World(WorldWire([sim, its_sim], Faults()), drives) as world:
-        world.run(1)
+    with ClockedLines(ClockedWire([sim, its_sim], Faults()), drives) as clocked:
+        clocked.run(1)
         for _ in range(20):
-            world.run(0.037)
-            assert world.port is not None
-            called, asked = world.now / S, len(its_sim.asked)
-            bus = world.poller.bus("line")
+            clocked.run(0.037)
+            assert clocked.port is not None
+            called, asked = clocked.now / S, len(its_sim.asked)
+            bus = clocked.poller.bus("line")
             stop = make_exchange(
                 drive, Message(1, 0x06, 0x20, data=b"\0\0"), bus.peer(drive), NO_ROWS, insists=True
             )
-            world.port.begin_urgent(stop)
+            clocked.port.begin_urgent(stop)
             before = len(sim.times)
             while len(sim.times) == before:
-                world.run(0.001)
+                clocked.run(0.001)
             assert len(its_sim.asked) - asked <= 1  # the one that was under way
             assert sim.times[-1] <= called + INTERVAL + 0.06  # and two exchanges, its own one
     assert sim.early == 0
@@ -119,18 +119,18 @@ def test_a_stop_waits_for_the_interval_at_most_and_all_else_waits_for_it() -> No
 
 def test_reads_by_hand_wait_their_turn_while_others_are_polled() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
-    with World(WorldWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as world:
-        bus = world.poller.bus("line")
+    with ClockedLines(ClockedWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as clocked:
+        bus = clocked.poller.bus("line")
         bus.attach(drive)
-        world.run(1)
+        clocked.run(1)
         for _ in range(3):
-            world.command(drive, Message(1, 0x03, 0, 1))
-            world.run(0.3)
+            clocked.command(drive, Message(1, 0x03, 0, 1))
+            clocked.run(0.3)
         for _ in range(3):
-            world.command(drive, Message(1, 0x03, 0, 1))
+            clocked.command(drive, Message(1, 0x03, 0, 1))
             asked = len(its_sim.asked)
-            world.command(drive, Message(1, 0x03, 1, 1))
-            world.run(0.3)
+            clocked.command(drive, Message(1, 0x03, 1, 1))
+            clocked.run(0.3)
             assert len(its_sim.asked) > asked + 3
     assert len(sim.times) == 9
     assert sim.early == 0
@@ -148,9 +148,9 @@ def test_the_prediction_knows_it() -> None:
     drive, sim = slow()
     wanted = planned(drive, [(register, None) for register in drive.readings()])
     found = predict(wanted, lateness=0.0)
-    with World(WorldWire([sim], Faults()), [polled(drive, drive.readings())]) as world:
-        world.run(2)
-        rows = world.run(20)
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.readings())]) as clocked:
+        clocked.run(2)
+        rows = clocked.run(20)
     measured = sum(row.register == "r0" for row in rows) / 20
     assert found.rates[0].reached == pytest.approx(measured, rel=0.03)
     assert found.cycle == pytest.approx(1 / measured, rel=0.03)

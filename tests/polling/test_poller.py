@@ -17,11 +17,11 @@ from typing import Any
 
 import checksums
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from leftovers import descriptors, threads
 from lines import HOST_LATE, PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
 from serial import Serial
 from toy import Toy
-from worlds import World, WorldWire
 
 from multidrop import poller as poller_module
 from multidrop.core import RowQueue, Status
@@ -171,9 +171,9 @@ def test_neither_starves_the_other(port: str) -> None:
 )
 def test_drives_of_one_kind_are_asked_side_by_side(kinds: list[dict[str, Any]]) -> None:
     drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
-    wire = WorldWire([simulated(drive) for drive in drives], Faults())
-    with World(wire, [polled(drive, [Toy.fault]) for drive in drives]) as world:
-        rows = world.run(1)[: len(drives)]
+    wire = ClockedWire([simulated(drive) for drive in drives], Faults())
+    with ClockedLines(wire, [polled(drive, [Toy.fault]) for drive in drives]) as clocked:
+        rows = clocked.run(1)[: len(drives)]
     asked = [int(row.drive.removeprefix("drive-")) for row in rows]
     assert sorted(asked) == [1, 2, 3, 4, 5, 6]
     assert len(list(itertools.groupby(asked, lambda at: at % 2))) == 2
@@ -589,10 +589,10 @@ def test_rows_can_be_taken_when_all_is_closed(port: str) -> None:
 def test_a_line_is_closed_on_a_port_that_was_opened_just_now() -> None:
     """Nothing was queued on it yet, whatever was carried out on the one before."""
     sim = simulated(drive())
-    with World(WorldWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as world:
-        world.run(1.0)
-        (tended,) = world.poller._lines
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive(), READINGS, 0.1)]) as clocked:
+        clocked.run(1.0)
+        (tended,) = clocked.poller._lines
         assert tended._queue._done
-        assert world.port
-        tended._lose(world.port, world.now)
+        assert clocked.port
+        tended._lose(clocked.port, clocked.now)
         tended.bus.line.reopen()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from lines import patient, polled
 from toy import Toy
-from worlds import World, WorldWire
 
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
@@ -72,15 +72,17 @@ def test_what_is_read_after_all_is_polled_as_before(
 ) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive, moody = Toy(1, name="pump-1"), Moody(Toy(1))
-    with World(WorldWire([moody], Faults()), [polled(drive, [Toy.output_current, Toy.fault])]) as world:
-        before = len(world.run(1.0))
+    with ClockedLines(
+        ClockedWire([moody], Faults()), [polled(drive, [Toy.output_current, Toy.fault])]
+    ) as clocked:
+        before = len(clocked.run(1.0))
         moody.says = says
-        world.run(2.0)
-        line = world.poller.summary()["lines"]["line"]
+        clocked.run(2.0)
+        line = clocked.poller.summary()["lines"]["line"]
         assert bool(line["set_aside"]) is is_set_aside
         moody.says = None
-        world.run(2.0)
-        rows = world.run(1.0)
-        assert world.poller.summary()["lines"]["line"]["set_aside"] == []
+        clocked.run(2.0)
+        rows = clocked.run(1.0)
+        assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
     assert {row.status for row in rows} == {"ok"}
     assert len(rows) > before / 4

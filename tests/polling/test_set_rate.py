@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire, S
 from lines import plant, polled, rows_of
 from toy import Toy
-from worlds import S, World, WorldWire
 
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
@@ -30,14 +30,14 @@ def toy(address: int = 1) -> Toy:
     return Toy(address, name=f"pump-{address}")
 
 
-def world(*drives: PolledDrive) -> World:
-    return World(WorldWire([EncodedDrive(each.drive) for each in drives], Faults()), list(drives))
+def clocked(*drives: PolledDrive) -> ClockedLines:
+    return ClockedLines(ClockedWire([EncodedDrive(each.drive) for each in drives], Faults()), list(drives))
 
 
 @pytest.fixture
-def two() -> Iterator[World]:
+def two() -> Iterator[ClockedLines]:
     """Two drives, four registers of each once in 100 ms."""
-    with world(*(polled(toy(address), ALL, 0.1) for address in (1, 2))) as made:
+    with clocked(*(polled(toy(address), ALL, 0.1) for address in (1, 2))) as made:
         made.run(2)
         yield made
 
@@ -46,12 +46,12 @@ def values(rows: list[Row]) -> Counter[tuple[str, str]]:
     return Counter((row.drive, row.register) for row in rows if row.value is not None)
 
 
-def only_line(made: World) -> PolledLine:
+def only_line(made: ClockedLines) -> PolledLine:
     (line,) = made.poller._lines
     return line
 
 
-def test_one_register_s_rate_is_changed_and_no_other_s(two: World) -> None:
+def test_one_register_s_rate_is_changed_and_no_other_s(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
     two.run(1)  # what was queued is asked
     counts = values(two.run(10))
@@ -60,7 +60,7 @@ def test_one_register_s_rate_is_changed_and_no_other_s(two: World) -> None:
     assert all(count in (99, 100, 101) for count in counts.values())
 
 
-def test_all_registers_of_a_drive_get_a_rate(two: World) -> None:
+def test_all_registers_of_a_drive_get_a_rate(two: ClockedLines) -> None:
     pump = two.poller.bus("line").drives[0]
     two.poller.set_rate(pump, None, 0.5)
     two.run(1)
@@ -69,7 +69,7 @@ def test_all_registers_of_a_drive_get_a_rate(two: World) -> None:
     assert {counts["pump-2", register.name] for register in ALL} <= {99, 100, 101}
 
 
-def test_from_a_rate_to_as_fast_as_possible_and_back(two: World) -> None:
+def test_from_a_rate_to_as_fast_as_possible_and_back(two: ClockedLines) -> None:
     for drive in ("pump-1", "pump-2"):
         two.poller.set_rate(drive, None, None)
     two.run(1)
@@ -81,7 +81,7 @@ def test_from_a_rate_to_as_fast_as_possible_and_back(two: World) -> None:
     assert set(values(two.run(10)).values()) <= {10, 11}
 
 
-def test_the_first_value_at_a_new_rate_comes_at_once(two: World) -> None:
+def test_the_first_value_at_a_new_rate_comes_at_once(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "fault", 3600.0)
     two.run(1)
     assert values(two.run(10))["pump-1", "fault"] == 0
@@ -91,7 +91,7 @@ def test_the_first_value_at_a_new_rate_comes_at_once(two: World) -> None:
 
 def test_registers_that_stay_keep_their_slots() -> None:
     """Also where their block is another one without the register that left it."""
-    with world(polled(toy(), ALL, 0.1)) as made:
+    with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
         rows = [row for row in made.run(3) if row.register == "status" and row.value is not None]
@@ -106,7 +106,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
     """And each change leaves each register with rows: nothing is lost."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
-    with world(*drives) as made:
+    with clocked(*drives) as made:
         rows = made.run(1)
         for _ in range(150):
             pump = chance.choice(drives).drive
@@ -132,7 +132,7 @@ def test_every_value_is_its_own_register_s_while_rates_change() -> None:
 
 
 def test_memory_is_bounded_over_many_rates() -> None:
-    with world(polled(toy(), ALL, 0.1)) as made:
+    with clocked(polled(toy(), ALL, 0.1)) as made:
         line = only_line(made)
 
         def kept() -> tuple[int, ...]:
@@ -152,7 +152,7 @@ def test_memory_is_bounded_over_many_rates() -> None:
 
 
 def test_skipped_slots_stay_counted_when_their_job_goes() -> None:
-    with world(polled(toy(), ALL, 0.001)) as made:
+    with clocked(polled(toy(), ALL, 0.001)) as made:
         made.run(2)
         (before,) = (line["overrun_slots"] for line in made.poller.summary()["lines"].values())
         made.poller.set_rate("pump-1", None, 1.0)
@@ -172,7 +172,7 @@ class Stubborn(EncodedDrive):
 
 def test_a_register_that_is_refused_costs_the_others_nothing_at_a_new_rate() -> None:
     pump = toy()
-    with World(WorldWire([Stubborn(pump)], Faults()), [polled(pump, ALL, 0.1)]) as made:
+    with ClockedLines(ClockedWire([Stubborn(pump)], Faults()), [polled(pump, ALL, 0.1)]) as made:
         made.run(3)
         assert only_line(made).summary()["set_aside"] == ["pump-1.fault"]
         made.poller.set_rate(pump, None, 0.2)
@@ -188,7 +188,7 @@ def test_a_silent_drive_s_rate_is_changed_while_it_rests() -> None:
     pump, silent = toy(1), SimulatedDrive(toy(2))
     silent.deaf_until = float("inf")
     drives = [polled(pump, ALL, 0.1), polled(silent.drive, ALL, 0.1)]
-    with World(WorldWire([EncodedDrive(pump), silent], Faults()), drives) as made:
+    with ClockedLines(ClockedWire([EncodedDrive(pump), silent], Faults()), drives) as made:
         made.run(5)
         made.poller.set_rate("pump-2", None, 0.2)
         rows = made.run(5)
@@ -204,7 +204,7 @@ def test_a_silent_drive_s_rate_is_changed_while_it_rests() -> None:
 
 def test_rates_are_set_before_the_polling_too() -> None:
     pump = toy()
-    made = world(polled(pump, ALL, 0.1))
+    made = clocked(polled(pump, ALL, 0.1))
     made.poller.set_rate(pump, CURRENT, 1.0)
     with made:
         counts = values(made.run(10))
@@ -214,7 +214,7 @@ def test_rates_are_set_before_the_polling_too() -> None:
 
 def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> None:
     pump = polled(toy(), ALL, 0.1)
-    with world(pump) as made:
+    with clocked(pump) as made:
         made.poller.set_rate("pump-1", None, 1.0)
         made.poller.remove("line", "pump-1")
         made.poller.add("line", pump)
@@ -239,14 +239,14 @@ def test_a_drive_that_left_and_comes_back_has_the_rates_it_is_added_with() -> No
     ],
 )
 def test_what_is_no_rate_changes_nothing(
-    two: World, drive: str, register: str | None, every: float, sentence: str
+    two: ClockedLines, drive: str, register: str | None, every: float, sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):
         two.poller.set_rate(drive, register, every)
     assert set(values(two.run(10)).values()) <= {99, 100, 101}
 
 
-def test_another_plant_s_drive_of_the_same_name_is_not_taken_for_one_s_own(two: World) -> None:
+def test_another_plant_s_drive_of_the_same_name_is_not_taken_for_one_s_own(two: ClockedLines) -> None:
     with pytest.raises(ValueError, match="pump-1 is not polled here"):
         two.poller.set_rate(toy(1), None, 1.0)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire, S
 from examples import usually
 from lines import polled, rows_of
 from toy import Toy
-from worlds import S, World, WorldWire
 
 from multidrop.drives import InvtCHE
 from multidrop.sim import Faults, simulated
@@ -21,14 +21,14 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
     silent.deaf_until = float("inf")
-    with World(WorldWire([silent], Faults()), [polled(toy, [Toy.fault], 0.01)]) as world:
-        world.run(5)
+    with ClockedLines(ClockedWire([silent], Faults()), [polled(toy, [Toy.fault], 0.01)]) as clocked:
+        clocked.run(5)
         for _ in range(100):
-            rows = world.run(0.05)
-            assert world.now - 0.02 * S <= rows[-1].monotonic_ns <= world.now
-            assert all(row.monotonic_ns <= world.now for row in rows)
-    assert all(row.monotonic_ns <= world.now for row in rows_of(world.poller))
-    assert world.poller.summary()["lines"]["line"]["misses"]["not asked: drive is silent"] > 400
+            rows = clocked.run(0.05)
+            assert clocked.now - 0.02 * S <= rows[-1].monotonic_ns <= clocked.now
+            assert all(row.monotonic_ns <= clocked.now for row in rows)
+    assert all(row.monotonic_ns <= clocked.now for row in rows_of(clocked.poller))
+    assert clocked.poller.summary()["lines"]["line"]["misses"]["not asked: drive is silent"] > 400
 
 
 @pytest.mark.story
@@ -39,25 +39,27 @@ def test_a_slot_that_is_not_asked_has_its_row_when_it_has_come() -> None:
 def test_silent_drives_cost_the_others_little_and_are_soon_back(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
-    world = World(WorldWire(sims, Faults()), [polled(each, each.readings()[:1]) for each in drives])
+    clocked = ClockedLines(
+        ClockedWire(sims, Faults()), [polled(each, each.readings()[:1]) for each in drives]
+    )
     gone = {each.name for each in drives[:dead]}
 
     def answered(seconds: float) -> int:
-        return sum(1 for row in world.run(seconds) if row.value is not None)
+        return sum(1 for row in clocked.run(seconds) if row.value is not None)
 
-    with world:
-        world.run(5)  # until delays are learnt
+    with clocked:
+        clocked.run(5)  # until delays are learnt
         healthy = answered(10)
         for sim in sims[:dead]:
             sim.deaf_until = float("inf")
-        world.run(10)  # until it is known
+        clocked.run(10)  # until it is known
         assert answered(50) >= 0.97 * 5 * healthy
         for sim in sims[:dead]:
             sim.deaf_until = 0.0
-        revived, back = world.now, set()
+        revived, back = clocked.now, set()
         while not gone <= back:
-            assert world.now <= revived + back_s * S
-            back |= {row.drive for row in world.run(0.5) if row.value is not None}
+            assert clocked.now <= revived + back_s * S
+            back |= {row.drive for row in clocked.run(0.5) if row.value is not None}
 
 
 @pytest.mark.slow
@@ -77,14 +79,14 @@ def test_drives_that_are_dead_from_the_start_cost_the_others_little_at_once(
         sims = [simulated(drive) for drive in drives]
         for sim in sims:
             sim.deaf_until = float("inf") if sim.drive.address in gone else 0.0
-        world = World(
-            WorldWire(sims, Faults()), [polled(each, each.readings()[:1], every) for each in drives]
+        clocked = ClockedLines(
+            ClockedWire(sims, Faults()), [polled(each, each.readings()[:1], every) for each in drives]
         )
-        with world:
-            found = [sum(row.value is not None for row in world.run(span)) for span in (FIRST, LATER)]
+        with clocked:
+            found = [sum(row.value is not None for row in clocked.run(span)) for span in (FIRST, LATER)]
             for sim in sims:
                 sim.deaf_until = 0.0
-            back = {row.drive for row in world.run(BACK) if row.value is not None}
+            back = {row.drive for row in clocked.run(BACK) if row.value is not None}
             assert back == {each.name for each in drives}
             return found
 

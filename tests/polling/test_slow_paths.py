@@ -1,6 +1,6 @@
 """Stories of a path that holds everything up and keeps the order: a modem, a gateway, a stalled network.
 
-No value is another register's, and values keep coming; on a world's clock.
+No value is another register's, and values keep coming; on a clock of the test's own.
 """
 
 from __future__ import annotations

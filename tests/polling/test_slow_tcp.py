@@ -1,4 +1,4 @@
-"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a world's clock.
+"""Stories of Modbus TCP behind a path that delays: late, doubled and reordered replies, on a test's clock.
 
 A reply with its request's id needs no proof; a gateway with ids of its own is dealt with as RTU is.
 """
@@ -109,10 +109,10 @@ def test_what_is_provably_late_holds_nothing_up() -> None:
     """No request waits for a late reply, and none is sent to prove anything."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.tell_of(stalling(3.0))
-    told = story.world.poller.summary()["lines"]["line"]
+    told = story.clocked.poller.summary()["lines"]["line"]
     assert told["late_replies"] > 0
     assert str(Status.LATE_ANSWER_DUE) not in told["misses"]
-    assert {drive for drive, peer in story.world.poller.bus("line").peers.items() if peer.proofs} == set()
+    assert {drive for drive, peer in story.clocked.poller.bus("line").peers.items() if peer.proofs} == set()
 
 
 # ---- by hand ----

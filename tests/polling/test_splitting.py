@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from examples import examples, usually
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lines import polled
 from picky import Picky, family
 from simulated_bus import SimulatedBus
-from worlds import World, WorldWire
 
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive
@@ -26,8 +26,8 @@ from multidrop.sim import Faults
 WIDE = 24
 
 
-def world_of(drive: Drive, sim: Picky, every: float | None = None) -> World:
-    return World(WorldWire([sim], Faults()), [polled(drive, drive.registers.values(), every)])
+def clocked_line_of(drive: Drive, sim: Picky, every: float | None = None) -> ClockedLines:
+    return ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.registers.values(), every)])
 
 
 def values(rows: list[Row]) -> dict[str, float]:
@@ -71,11 +71,11 @@ def test_registers_at_the_same_addresses_and_groups_stay_together() -> None:
 def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(every: float | None) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, refused={7})
-    with world_of(drive, sim, every) as world:
-        world.run(15)
+    with clocked_line_of(drive, sim, every) as clocked:
+        clocked.run(15)
         sim.asked.clear()
-        rows = world.run(10)
-        told = world.poller.summary()["lines"]["line"]["set_aside"]
+        rows = clocked.run(10)
+        told = clocked.poller.summary()["lines"]["line"]["set_aside"]
     assert values(rows) == right(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
@@ -86,11 +86,11 @@ def test_one_refused_register_costs_its_neighbours_a_few_requests_and_no_more(ev
 def test_a_device_that_takes_fewer_is_read_in_blocks_that_it_takes() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=8)
-    with world_of(drive, sim) as world:
-        world.run(10)
+    with clocked_line_of(drive, sim) as clocked:
+        clocked.run(10)
         sim.asked.clear()
-        rows = world.run(5)
-        assert world.poller.summary()["lines"]["line"]["set_aside"] == []
+        rows = clocked.run(5)
+        assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
     assert values(rows) == right(range(WIDE))
     assert {row.status for row in rows} == {"ok"}
     assert {count for _, count in sim.asked} == {6}
@@ -100,16 +100,16 @@ def test_what_was_refused_for_a_while_is_read_as_a_whole_again(monkeypatch: pyte
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
-    with world_of(drive, sim) as world:
-        world.run(3)
+    with clocked_line_of(drive, sim) as clocked:
+        clocked.run(3)
         sim.missing = set(range(WIDE))
-        world.run(10)
-        assert len(world.poller.summary()["lines"]["line"]["set_aside"]) == WIDE
+        clocked.run(10)
+        assert len(clocked.poller.summary()["lines"]["line"]["set_aside"]) == WIDE
         sim.missing = set()
-        world.run(10)
+        clocked.run(10)
         sim.asked.clear()
-        rows = world.run(3)
-        assert world.poller.summary()["lines"]["line"]["set_aside"] == []
+        rows = clocked.run(3)
+        assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
     assert values(rows) == right(range(WIDE))
     assert set(sim.asked) == {(0, WIDE)}
 
@@ -118,10 +118,10 @@ def test_trials_of_the_whole_make_no_rows(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=12)
-    with world_of(drive, sim) as world:
-        world.run(5)
+    with clocked_line_of(drive, sim) as clocked:
+        clocked.run(5)
         sim.asked.clear()
-        rows = world.run(10)
+        rows = clocked.run(10)
     assert 5 <= Counter(sim.asked)[0, WIDE] <= 12
     assert {row.status for row in rows} == {"ok"}
 
@@ -136,10 +136,10 @@ def test_a_device_that_is_silent_to_long_requests_is_read_in_shorter_ones(
 ) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=longest)
-    with world_of(drive, sim, every) as world:
-        world.run(120)
+    with clocked_line_of(drive, sim, every) as clocked:
+        clocked.run(120)
         sim.asked.clear()
-        rows = world.run(10)
+        rows = clocked.run(10)
     assert values(rows) == right(range(WIDE))
     assert {row.status for row in rows} == {"ok"}
     assert {count for _, count in sim.asked} == ({1} if longest == 1 else {6})
@@ -149,12 +149,12 @@ def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> N
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     sim.deaf_until = float("inf")
-    with world_of(drive, sim) as world:
-        world.run(120)
+    with clocked_line_of(drive, sim) as clocked:
+        clocked.run(120)
         sim.deaf_until = 0.0
-        world.run(10)
+        clocked.run(10)
         sim.asked.clear()
-        rows = world.run(5)
+        rows = clocked.run(5)
     assert set(sim.asked) == {(0, WIDE)}
     assert values(rows) == right(range(WIDE))
 
@@ -162,29 +162,29 @@ def test_a_dead_drive_is_never_split_and_is_read_as_a_whole_when_it_comes() -> N
 def test_a_drive_that_falls_silent_is_not_split() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
-    with world_of(drive, sim) as world:
-        world.run(3)
+    with clocked_line_of(drive, sim) as clocked:
+        clocked.run(3)
         sim.deaf_until = float("inf")
-        world.run(60)
+        clocked.run(60)
         sim.deaf_until = 0.0
-        world.run(10)
+        clocked.run(10)
         sim.asked.clear()
-        world.run(5)
+        clocked.run(5)
     assert set(sim.asked) == {(0, WIDE)}
 
 
 def test_a_noisy_line_splits_nothing_that_was_answered_once() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
-    with World(WorldWire([sim], Faults()), [polled(drive, drive.registers.values())]) as world:
-        world.run(3)
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.registers.values())]) as clocked:
+        clocked.run(3)
         sim.silent_beyond = 1
-        world.run(60)
+        clocked.run(60)
         assert {count for _, count in sim.asked} <= {
             WIDE,
             1,
         }  # a proof that no late reply is taken for another
-        (line,) = world.poller._lines
+        (line,) = clocked.poller._lines
         assert len(line._maker._made) == 1
 
 
@@ -197,11 +197,11 @@ def test_no_register_is_lost_that_can_be_read_by_itself(refused: set[int], most:
     that no late answer is due. Otherwise each silence holds the next question up for two minutes."""
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)
-    with world_of(drive, sim, every=5.0) as world:
-        world.run(900)
+    with clocked_line_of(drive, sim, every=5.0) as clocked:
+        clocked.run(900)
         sim.asked.clear()
-        rows = world.run(20)
-        (line,) = world.poller._lines
+        rows = clocked.run(20)
+        (line,) = clocked.poller._lines
         assert len(line._maker._made) <= 2 * 6
     assert values(rows) == right(set(range(6)) - refused)
 

@@ -8,9 +8,9 @@ from random import Random
 from typing import Any
 
 import pytest
+from clocked_lines import BEGIN_NS, NEVER, ClockedPort, ClockedWire, transactions_of
 from lines import proof
 from stories import Story
-from worlds import BEGIN_NS, NEVER, WorldPort, WorldWire, transactions_of
 
 from multidrop import bus
 from multidrop.bus import Bus
@@ -29,7 +29,7 @@ TAIL = 20.0  # s at its end, and TURNS times the delay, in which every drive mus
 TURNS = 20
 
 
-class PathWire(WorldWire):
+class PathWire(ClockedWire):
     """A hostile wire at the far end of a path that delays what the drives say."""
 
     delay: Delay
@@ -70,7 +70,7 @@ def stalling(longest: float) -> Delay:
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
 
     def delay(now: float) -> float:
-        now -= 1000.0  # when a world begins
+        now -= 1000.0  # when clocked lines begin
         return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
 
     return delay
@@ -84,7 +84,7 @@ class Path(Story):
     def tell_of(self, delay: Delay, tail_s: float = TAIL) -> set[str]:
         """Judge every row; the drives of which values came in the end."""
         self.wire.delay = delay
-        with self.world:
+        with self.clocked:
             self.run(SECONDS)
             tail = self.run(tail_s)
         self.judge_values()
@@ -100,7 +100,7 @@ class PathLine:
         self.wire = wire
         self.has_echo = self.is_lost = False
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
-        self.queue = WorldPort(self, transactions_of(self))
+        self.queue = ClockedPort(self, transactions_of(self))
 
     def require(self, settings: tuple[int, str]) -> None:
         pass

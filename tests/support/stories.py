@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+from clocked_lines import ClockedLines, ClockedWire
 from lines import polled, proofs, rows_of
 from variants import REASONS
-from worlds import World, WorldWire
 
 from multidrop import poller
 from multidrop.core import Message, Status
@@ -30,7 +30,7 @@ UNASKED = {str(each) for each in (Status.NOT_ASKED, Status.LINE_LOST, Status.LAT
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
 
 
-class PieceWire(WorldWire):
+class PieceWire(ClockedWire):
     """A hostile wire whose bytes come as they do from a serial port, a few at a time."""
 
     chunk = 4e-3
@@ -39,7 +39,7 @@ class PieceWire(WorldWire):
 class Story:
     """A line in health, under a fault, and afterwards; all its rows are kept and judged."""
 
-    wires: type[WorldWire] = PieceWire
+    wires: type[ClockedWire] = PieceWire
 
     def __init__(
         self, drives: Sequence[Drive], *, seed: int = 1, every: float | None = EVERY, port: str = "pty"
@@ -50,26 +50,26 @@ class Story:
         sims = [*(EncodedDrive(drive) for drive in drives), simulated(self.motor)]
         self.wire: Any = self.wires(sims, Faults(seed=seed), port=port)
         motor = polled(self.motor, self.motor.readings()[:1], every)
-        self.world = World(self.wire, [*self.asked, motor])
+        self.clocked = ClockedLines(self.wire, [*self.asked, motor])
         self.truth = proofs(*self.asked)
         self.rows: list[Row] = []
         self.drives = [*drives, self.motor]
 
     def run(self, seconds: float) -> list[Row]:
         first = len(self.rows)
-        self.rows += self.world.run(seconds)
+        self.rows += self.clocked.run(seconds)
         return self.rows[first:]
 
     def run_motor(self, seconds: float) -> None:
         """So many seconds, in each of which the motor starts and stops."""
         for _ in range(round(seconds)):
             for command in (START, STOP):
-                self.world.command(self.motor, command)
+                self.clocked.command(self.motor, command)
                 self.run(0.5)
 
     def tell(self, faults: Faults) -> None:
         """Health, the fault, and its end, after which the rate must be back."""
-        with self.world:
+        with self.clocked:
             cycle = _longest_gap([row for row in self.run(HEALTHY) if row.value is not None])
             healthy = [row for row in self.run(CYCLES * cycle) if row.value is not None]
             self.wire.faults = faults
@@ -78,11 +78,11 @@ class Story:
             self.run(2 * faults.late)  # what is on its way comes
             begin = self.back_off_is_over() + round(cycle * S)
             end = begin + round(CYCLES * cycle * S)
-            self.run((end - self.world.now) / S)
+            self.run((end - self.clocked.now) / S)
             again = [row for row in self.rows if begin <= row.monotonic_ns < end]
             assert len(again) >= len(healthy) * (CYCLES - 1) / CYCLES
             assert {row.status for row in again} == {"ok"}
-        self.rows += rows_of(self.world.poller)
+        self.rows += rows_of(self.clocked.poller)
         self.judge()
 
     def back_off_is_over(self) -> int:
@@ -93,10 +93,10 @@ class Story:
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # and rarely more
         longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_S
-        ended = self.world.now
+        ended = self.clocked.now
         asked: dict[str, int] = {}
         while len(asked) < len(self.drives):
-            assert self.world.now <= ended + longest * S
+            assert self.clocked.now <= ended + longest * S
             for row in self.run(0.5):
                 if row.monotonic_ns >= ended and row.status not in UNASKED:
                     asked.setdefault(row.drive, row.monotonic_ns)
@@ -114,12 +114,12 @@ class Story:
         self.judge_values()
         misses = Counter(row.status for row in self.rows if row.value is None)
         assert {why for why in misses if not why.startswith("exception ")} <= REASONS
-        told = self.world.poller.summary()
+        told = self.clocked.poller.summary()
         line = told["lines"]["line"]
         assert told["dropped"] == 0
         assert told["samples"] + misses.total() == len(self.rows)
         assert Counter(line["misses"]) == misses
-        slots = int(self.world.seconds / self.every) - 1 if self.every else 0
+        slots = int(self.clocked.seconds / self.every) - 1 if self.every else 0
         rows = Counter((row.drive, row.register) for row in self.rows)
         missing = sum(
             max(0, slots - rows[each.drive.name, each.polls[0].register.name]) for each in self.asked

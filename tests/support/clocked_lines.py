@@ -1,8 +1,8 @@
 """A poller and a simulated line on a clock of their own: an hour of the line takes seconds.
 
 The poller is the real one with its thread, plan and schedule; line and turns are the core's own code
-(csrc/line.c, csrc/port_turn.c). In place of the descriptor, the core's thread and the clock is a world,
-in which time passes only while the test lets it, and never because the machine is busy.
+(csrc/line.c, csrc/port_turn.c). In place of the descriptor, the core's thread and the clock are stand-ins:
+time passes only while the test lets it, and never because the machine is busy.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def transactions_of(line: Any) -> Transactions:
     return Transactions.MATCHED if line.ids is TransactionIds.MATCH else Transactions.IGNORED
 
 
-class WorldWire(FaultyWire):
+class ClockedWire(FaultyWire):
     """A hostile wire whose port is nothing that the system knows."""
 
     ids = TransactionIds.MATCH  # of its gateway, on tcp://
@@ -65,7 +65,7 @@ class WorldWire(FaultyWire):
         self.port = port
 
 
-class WorldRowQueue(RowQueue):
+class ClockedRowQueue(RowQueue):
     """A row queue whose client lets time pass while it waits for a call."""
 
     pass_time: Callable[[float], None]
@@ -86,7 +86,7 @@ class WorldRowQueue(RowQueue):
         return called
 
 
-class PortWorld(Protocol):
+class PortSurroundings(Protocol):
     """The time and the wire of a port."""
 
     @property
@@ -95,14 +95,14 @@ class PortWorld(Protocol):
     def send(self, request: bytes, baudrate: int) -> None: ...
 
 
-class WorldPort:
-    """A port (core.Port) on which the core takes its turns, with the world's time and wire for its I/O."""
+class ClockedPort:
+    """A port (core.Port) on which the core takes its turns, with a test's time and wire for its I/O."""
 
     room = 256
     switching = 0.0
 
-    def __init__(self, world: PortWorld, transactions: Transactions = Transactions.NONE) -> None:
-        self._world = world
+    def __init__(self, clocked: PortSurroundings, transactions: Transactions = Transactions.NONE) -> None:
+        self._clocked = clocked
         self._slots = ffi.new("struct md_slot[]", self.room)
         self._turn = ffi.new("struct md_turn *")
         self._wake = ffi.new("int64_t *")
@@ -111,7 +111,7 @@ class WorldPort:
         self._received = b""
         self._guard = threading.RLock()  # as the engine's mutex
         self._is_closed = False
-        lib.md_turn_init(self._turn, self._slots, self.room, world.now)
+        lib.md_turn_init(self._turn, self._slots, self.room, clocked.now)
         self._turn.line.transactions = transactions
         if transactions:
             lib.md_turn_tell_echo(self._turn, lib.MD_NO_ECHO)
@@ -180,7 +180,7 @@ class WorldPort:
 
     def hang_up(self) -> None:
         lib.md_turn_lose(self._turn, ENODEV)
-        lib.md_turn_want(self._turn, self._wake, self._world.now)
+        lib.md_turn_want(self._turn, self._wake, self._clocked.now)
 
     def advance(self, received: bytes) -> int:
         """Carry on until there is nothing to do but wait; return until when."""
@@ -190,7 +190,7 @@ class WorldPort:
     def _advance(self, received: bytes) -> int:
         self._received += received
         for _ in range(10_000):
-            want = lib.md_turn_want(self._turn, self._wake, self._world.now)
+            want = lib.md_turn_want(self._turn, self._wake, self._clocked.now)
             wake = int(self._wake[0])
             if want == lib.MD_DONE:
                 self._receive()
@@ -201,42 +201,42 @@ class WorldPort:
                     return NEVER
             elif want == lib.MD_READ and self._received:
                 self._receive()
-            elif want == lib.MD_WAIT or wake > self._world.now:
+            elif want == lib.MD_WAIT or wake > self._clocked.now:
                 return wake
         raise AssertionError("the line never waits")
 
     def _receive(self) -> None:
         received, self._received = self._received, b""
-        lib.md_line_received(ffi.addressof(self._turn.line), received, len(received), self._world.now)
+        lib.md_line_received(ffi.addressof(self._turn.line), received, len(received), self._clocked.now)
         assert not self._turn.line.is_out_of_step
 
     def _send(self) -> None:
-        line, now = self._turn.line, self._world.now
+        line, now = self._turn.line, self._clocked.now
         request = bytes(ffi.buffer(line.tx, line.tx_len))
         baudrate = int(line.exchange.settings.baudrate)
         lib.md_line_sent(ffi.addressof(line), len(request), now, now)
-        self._world.send(request, baudrate)
+        self._clocked.send(request, baudrate)
 
 
-class WorldLine:
+class ClockedLine:
     """A line as the bus sees it (line.Line)."""
 
     only_settings = None  # a drive may have any
     why_closing = ""
 
-    def __init__(self, world: World, port: str, ids: TransactionIds) -> None:
+    def __init__(self, clocked: ClockedLines, port: str, ids: TransactionIds) -> None:
         self.port = port
         self.is_tcp = speaks_tcp(port)
         self.ids = ids
-        self._world = world
-        self.queue: WorldPort | None = None
+        self._clocked = clocked
+        self.queue: ClockedPort | None = None
 
     @property
     def now(self) -> int:
-        return self._world.now
+        return self._clocked.now
 
     def send(self, request: bytes, baudrate: int) -> None:
-        self._world.send(self.port, request, baudrate)
+        self._clocked.send(self.port, request, baudrate)
 
     def require(self, settings: tuple[int, str]) -> None:
         pass
@@ -249,67 +249,67 @@ class WorldLine:
 
     def drop(self) -> None:
         if self.queue:
-            self.queue = self._world.ports[self.port] = None
+            self.queue = self._clocked.ports[self.port] = None
 
     close = drop
 
     def reopen(self) -> None:
         self.close()
-        wire = self._world.wires.get(self.port)
+        wire = self._clocked.wires.get(self.port)
         if wire is None or wire.port is None:
             raise LineError(self.port, "it is not there")
-        self.queue = self._world.ports[self.port] = WorldPort(self, transactions_of(self))
-        self._world.opened.append(self.port)
+        self.queue = self._clocked.ports[self.port] = ClockedPort(self, transactions_of(self))
+        self._clocked.opened.append(self.port)
 
     regain = reopen  # it is lost: the poller has dropped it
     is_lost = False  # nobody stops a motor here
 
 
-class WorldLines:
-    """Opens lines of a world, in place of the class Line."""
+class ClockedOpener:
+    """Opens clocked lines, in place of the class Line."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, clocked: ClockedLines) -> None:
+        self._clocked = clocked
 
-    def __call__(self, port: str, echo: object, ids: TransactionIds) -> WorldLine:
+    def __call__(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
         line = self.awaited(port, echo, ids)
         line.reopen()
         return line
 
-    def awaited(self, port: str, echo: object, ids: TransactionIds) -> WorldLine:
-        return WorldLine(self._world, port, ids)
+    def awaited(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
+        return ClockedLine(self._clocked, port, ids)
 
 
-class World:
+class ClockedLines:
     """Wires, and a poller of a plant on them: `run` lets time pass, and returns the rows that come of it."""
 
-    def __init__(self, wire: WorldWire, drives: Sequence[PolledDrive]) -> None:
+    def __init__(self, wire: ClockedWire, drives: Sequence[PolledDrive]) -> None:
         wire.open()
         name = wire.where if speaks_tcp(wire.where) else "world"
         declared = line(name, *drives)
         self._begin({name: wire}, plant(replace(declared, ids=wire.ids)))
 
     @classmethod
-    def of_lines(cls, wires: Mapping[str, WorldWire], polled: Plant) -> World:
-        """Return a world of several wires, by the names of their ports."""
-        world = cls.__new__(cls)
+    def of_lines(cls, wires: Mapping[str, ClockedWire], polled: Plant) -> ClockedLines:
+        """Return lines on several wires, by the names of their ports."""
+        clocked = cls.__new__(cls)
         for wire in wires.values():
             wire.open()
-        world._begin(wires, polled)
-        return world
+        clocked._begin(wires, polled)
+        return clocked
 
-    def _begin(self, wires: Mapping[str, WorldWire], polled: Plant) -> None:
+    def _begin(self, wires: Mapping[str, ClockedWire], polled: Plant) -> None:
         self.now = self._limit = BEGIN_NS
         self.wires = dict(wires)
-        self.ports: dict[str, WorldPort | None] = {}
+        self.ports: dict[str, ClockedPort | None] = {}
         self.opened: list[str] = []  # ports, each time that one is
-        self._queue: WorldRowQueue | None = None
+        self._queue: ClockedRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
         self._turn = threading.Condition()
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
-        patch.setattr(bus, "Line", WorldLines(self))
+        patch.setattr(bus, "Line", ClockedOpener(self))
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
         patch.setattr(poller, "RowQueue", self._row_queue)
@@ -317,17 +317,17 @@ class World:
         self.poller = Poller(polled)
 
     @property
-    def wire(self) -> WorldWire:
+    def wire(self) -> ClockedWire:
         """The only wire."""
         (wire,) = self.wires.values()
         return wire
 
     @property
-    def port(self) -> WorldPort | None:
+    def port(self) -> ClockedPort | None:
         """The only port, while it is open."""
         return next(iter(self.ports.values()), None)
 
-    def __enter__(self) -> World:
+    def __enter__(self) -> ClockedLines:
         self.poller.__enter__()
         return self
 
@@ -380,14 +380,14 @@ class World:
 
     _is_waiting = False
 
-    def _row_queue(self) -> WorldRowQueue:
-        self._queue = WorldRowQueue()
+    def _row_queue(self) -> ClockedRowQueue:
+        self._queue = ClockedRowQueue()
         self._queue.pass_time = self._pass_time
         return self._queue
 
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
-            if thread.name == "multidrop reopening":  # in the world that takes no time
+            if thread.name == "multidrop reopening":  # on this clock that takes no time
                 thread.join()
         try:
             with self._turn:

@@ -1,0 +1,51 @@
+"""The two walks through the rooms name files and functions that are there."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from sources import PACKAGE, ROOT, parsed
+
+WALKS = sorted((ROOT / "docs" / "reference").glob("walk-*.md"))
+STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c))`")
+
+
+def steps(walk: Path) -> list[tuple[str, str]]:
+    """Return each file that a walk names, and the function or class in it; "" for a file of C."""
+    return [(file or c_file, name) for file, name, c_file in STEP.findall(walk.read_text("utf-8"))]
+
+
+def defined(path: Path) -> set[str]:
+    """Return the functions and classes of a module, and the methods of its classes as `Class.method`."""
+    names = set()
+    for node in parsed(path).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{each.name}" for each in node.body if isinstance(each, ast.FunctionDef)}
+    return names
+
+
+def missing(walk: Path) -> list[str]:
+    """Return the steps that lead nowhere."""
+    return [
+        f"{file}:{name}"
+        for file, name in steps(walk)
+        if not (ROOT / "csrc" / file if file.endswith(".c") else PACKAGE / file).exists()
+        or (name and name not in defined(PACKAGE / file))
+    ]
+
+
+@pytest.mark.parametrize("walk", WALKS, ids=[walk.stem for walk in WALKS])
+def test_each_step_is_there(walk: Path) -> None:
+    assert len(steps(walk)) > 8
+    assert missing(walk) == []
+
+
+def test_a_step_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+    walk = tmp_path / "walk.md"
+    walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
+    assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]
