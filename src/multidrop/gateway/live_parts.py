@@ -1,4 +1,4 @@
-"""Live parts: those that live, each with its task, and their exchange when the plant file is read again."""
+"""Live parts: those that live, each with its task, and their replacements when the plant file is read again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ END_S = 3.0  # that a part may take to end
 _log = logging.getLogger("multidrop.gateway")
 
 
-class Exchange(NamedTuple):
+class Replacement(NamedTuple):
     """Parts that were built and do not live yet, and the settings of those that ended for them."""
 
     built: dict[str, Feed]
@@ -55,7 +55,7 @@ class LiveParts:
 
     # ---- a plant file that was read again ----
 
-    async def exchange(self, wanted: Mapping[str, Any], plant: Plant) -> Exchange:
+    async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> Replacement:
         """End the parts whose tables changed or are gone, and build those that there are instead.
 
         Raises ValueError with what cannot be opened; the parts from before live on then.
@@ -65,24 +65,24 @@ class LiveParts:
         for name in changed:
             await self._end(name)
         new = {name: settings for name, settings in wanted.items() if name not in self._settings}
-        exchange = Exchange({}, new, before)
+        replacement = Replacement({}, new, before)
         try:
-            self._build(new, plant, exchange.built)
+            self._build(new, plant, replacement.built)
         except ValueError:
-            await self.take_back(exchange)
+            await self.take_back(replacement)
             raise
-        return exchange
+        return replacement
 
-    def take_up(self, exchange: Exchange) -> None:
+    def take_up(self, replacement: Replacement) -> None:
         """Let the parts live that were built: the plant is theirs now."""
-        for name, feed in exchange.built.items():
-            self._take_up(name, feed, exchange.wanted[name])
+        for name, feed in replacement.built.items():
+            self._take_up(name, feed, replacement.wanted[name])
 
-    async def take_back(self, exchange: Exchange) -> None:
+    async def take_back(self, replacement: Replacement) -> None:
         """Go on with the parts from before."""
-        for name, feed in exchange.built.items():
+        for name, feed in replacement.built.items():
             await _closed(name, feed)
-        for name, settings in exchange.before.items():
+        for name, settings in replacement.before.items():
             again: dict[str, Feed] = {}
             try:
                 self._build({name: settings}, self._gateway.plant, again)

@@ -94,16 +94,16 @@ class Reload:
             return Reloaded(False, NO_FILE)
         plant, settings = await _beside(self._read)
         planned = await _beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
-        exchange = await gateway.parts.exchange(settings.parts, plant)
+        replaced = await gateway.parts.replace(settings.parts, plant)
         self._is_settled.clear()
         try:
             unopened = await _beside(partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
-            gateway.parts.take_up(exchange)
+            gateway.parts.take_up(replaced)
         except Exception:
             if poller.plant.lines != gateway.plant.lines:  # it came half way: go on with what there is
                 self._take_up(poller, gateway.settings, None)
-            await gateway.parts.take_back(exchange)
+            await gateway.parts.take_back(replaced)
             raise
         finally:
             self._is_settled.set()
