@@ -1,4 +1,4 @@
-"""Live parts: those that live, each with its task, and their replacements when the plant file is read again."""
+"""Live parts: each with its task, and what replaces them when the plant file is read again."""
 
 from __future__ import annotations
 
