@@ -140,8 +140,8 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
     }
 }
 
-/* A client that reads again and again comes back while the line is still silent. The thread wakes when that is
- * over, and the client need not wake it. */
+/* A client that reads again and again comes back while the line is still silent. The thread wakes when that
+ * is over, and the client need not wake it. */
 static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
 {
     return turn->whose == MD_NOBODYS && turn->last == MD_URGENT &&

@@ -83,8 +83,8 @@ int main(void)
     struct md_port *port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, 4);
     assert(port);
 
-    /* A client that is back before the line is silent finds the thread about to wake. One that was held up for
-     * as long rings, and its request is not taken up before. */
+    /* A client that is back before the line is silent finds the thread about to wake. One that was held up
+     * for as long rings, and its request is not taken up before. */
     struct md_completion before, found;
     asked(port, &exchange, &before);
     int unrung = 0;
