@@ -45,7 +45,7 @@ static void bring_drives(const struct md_turn *turn)
 {
     const struct md_exchange *exchanges[2];
     for (int n = find(turn, exchanges); n-- > 0;)
-        bring(exchanges[n]->drive, sizeof *exchanges[n]->drive);
+        bring(exchanges[n]->drive, offsetof(struct md_drive, delays));
     if (turn->whose != MD_NOBODYS && turn->line.exchange->block)
         bring(turn->line.exchange->block, sizeof *turn->line.exchange->block);
 }

@@ -51,7 +51,8 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
         const struct md_block *block = exchange->block;
         uint64_t lacking = block && block->may_lack ? md_count_lacking(block, &completion->reply) : 0;
         counters->values += values - lacking;
-        history->missed[MD_NO_VALUE] += lacking;
+        if (lacking)
+            history->missed[MD_NO_VALUE] += lacking;
     }
 }
 
@@ -60,10 +61,10 @@ void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_
     struct md_counters *counters = &drive->counters;
     counters->ideal_ns += (uint64_t)ideal_ns;
     counters->longest_ns = later(counters->longest_ns, delay_ns);
-    drive->history->delays[bucket(delay_ns)]++;
+    drive->delays[bucket(delay_ns)]++;
 }
 
 const uint64_t *md_usual_delays(const struct md_drive *drive)
 {
-    return &drive->history->delays[bucket(drive->delay_ns)];
+    return &drive->delays[bucket(drive->delay_ns)];
 }

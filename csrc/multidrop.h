@@ -131,7 +131,6 @@ struct md_unanswered {
 
 /* The same in parts, and requests whose replies may still come. */
 struct md_history {
-    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* values, by status */
     uint64_t exceptions, naks, busies; /* exchanges that ended with an exception; with code 7; with code 6 */
@@ -154,8 +153,9 @@ struct md_drive {
     uint32_t owed_count, unanswered_count, proof_count;
     const struct md_exchange *const *proofs; /* reads whose replies differ from others' */
     struct md_drive *next_late;     /* the next one on this line with late replies due */
-    struct md_history *history;     /* apart: an exchange touches fewer pages */
+    struct md_history *history;     /* apart, for it is seldom needed: an exchange touches fewer pages */
     struct md_counters counters;
+    uint64_t delays[MD_DELAY_BUCKETS]; /* replies by response delay: bucket n begins at md_delay_edge(n) */
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* of a read */

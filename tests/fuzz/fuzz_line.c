@@ -132,7 +132,7 @@ static void check_counters(void)
         for (size_t code = 0; code < 256; code++)
             values += history->refused[code];
         for (size_t bucket = 0; bucket < MD_DELAY_BUCKETS; bucket++)
-            delays += history->delays[bucket];
+            delays += scene.drives[i].delays[bucket];
         must(counters->exchanges == scene.exchanges[i] && values == counters->exchanges &&
              ended == counters->exchanges);
         must(delays == counters->answered && counters->sent <= counters->exchanges);

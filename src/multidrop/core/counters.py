@@ -57,7 +57,7 @@ def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Coun
         _by_status(history.ended),
         _by_status(history.missed) + unasked,
         _by_place(history.refused, "I") if history.exceptions else Counter(),
-        _by_place(history.delays, "Q"),
+        _by_place(drive.delays, "Q"),
     )
 
 
