@@ -62,13 +62,14 @@ def simulator(plant: Path, ports: Path) -> Iterator[None]:
     pipe = subprocess.PIPE
     # A session of its own keeps Ctrl-C from it: it must outlive the polling.
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
+        assert process.stdin is not None
         assert process.stdout is not None
         try:
             if not process.stdout.readline().startswith("ready"):
                 raise OSError("the simulator did not start; see above")
             yield
         finally:
-            process.terminate()
+            process.stdin.close()
 
 
 def simulate(words: Sequence[str]) -> int:
