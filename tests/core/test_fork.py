@@ -299,4 +299,5 @@ def test_a_child_stops_no_motor(end: str) -> None:
             assert [write.raw for write in sim.counters.writes if write.name == "control"] == [1]
             parent.communicate()
         assert parent.returncode == 0
-        assert [write.raw for write in sim.counters.writes if write.name == "control"] == [1, 5]
+        start, *stops = (write.raw for write in sim.counters.writes if write.name == "control")
+        assert (start, set(stops)) == (1, {5})  # a busy machine may have the stop repeated
