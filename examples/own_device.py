@@ -26,9 +26,9 @@ class AirHandler(Drive):
 
 
 def main() -> None:
-    played = simulated(AirHandler(7))
-    played["temperature"], played["pressure"], played["alarms"] = 21.4, 180, Alarm.FILTER
-    with Simulator([Wire([played])]) as line, Bus(line.wires[0].path) as bus:
+    handler = simulated(AirHandler(7))
+    handler["temperature"], handler["pressure"], handler["alarms"] = 21.4, 180, Alarm.FILTER
+    with Simulator([Wire([handler])]) as line, Bus(line.wires[0].path) as bus:
         device = bus.attach(AirHandler, address=7, name="roof")
         for name, value in bus.read_many(device, device.readings()).items():
             print(f"{name:12} {device.register(name).format(value)}")

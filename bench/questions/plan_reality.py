@@ -107,13 +107,13 @@ def paced(seconds: float) -> Iterator[Case]:
         for drives, delay in ((16, 0.002), (1, 0.002), (16, 0.01)):
             with paced_line(baudrate=baudrate, delay_us=round(delay * 1e6)) as line:
                 name = f"{baudrate}, {drives} x {delay * 1e3:g} ms"
-                yield case(name, line.path, played(drives, baudrate, delay, [None]), seconds)
+                yield case(name, line.path, at_pace(drives, baudrate, delay, [None]), seconds)
     with paced_line(baudrate=38400) as line:
-        wanted = played(16, 38400, 0.002, [None, 0.5, 0.1, None])
+        wanted = at_pace(16, 38400, 0.002, [None, 0.5, 0.1, None])
         yield case("38400, 16 x 2 ms, mixed rates", line.path, wanted, seconds)
 
 
-def played(drives: int, baudrate: int, delay: float, every: Sequence[float | None]) -> Wanted:
+def at_pace(drives: int, baudrate: int, delay: float, every: Sequence[float | None]) -> Wanted:
     wanted: Wanted = []
     for address in range(1, drives + 1):
         drive = Played(address, baudrate=baudrate)

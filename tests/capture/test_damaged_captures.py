@@ -186,10 +186,10 @@ def test_pieces_of_a_file_are_one_capture(
 ) -> None:
     path = write(tmp_path / "it.pcapng", RTU[:40])
     path.write_bytes(path.read_bytes() + OTHER_BLOCK)
-    whole, torn = spans(path), rows(path)
+    whole, whole_rows = spans(path), rows(path)
     monkeypatch.setattr("multidrop.capture.pcapng_reader._PIECE", piece)
     assert spans(path) == whole
-    assert rows(path) == torn
+    assert rows(path) == whole_rows
     path.write_bytes(path.read_bytes()[:-3])
     with Capture(path) as capture:
         for _ in capture:

@@ -90,9 +90,9 @@ def test_what_does_not_fit_is_status_1_and_says_what_would_help(run: Run, crowde
     assert "fan:" not in told
     *_, second = json.loads(run("plan", crowded, "--json")[1])["lines"].items()
     assert (second[0], second[1]["fits"]) == ("hall-2", False)
-    (remedy,) = second[1]["remedies"]["every_ms"]
-    assert remedy["asked"] == 20
-    again = crowded.read_text().replace("20 ms", f"{remedy['fits']:g} ms")
+    (suggestion,) = second[1]["remedies"]["every_ms"]
+    assert suggestion["asked"] == 20
+    again = crowded.read_text().replace("20 ms", f"{suggestion['fits']:g} ms")
     crowded.write_text(again)
     assert run("plan", crowded)[0] == 0
 

@@ -190,11 +190,11 @@ def test_a_drive_of_another_family_than_the_plant_says_is_sent_nothing(
     run: Run, plant: Path, there: Drive, is_started: bool
 ) -> None:
     plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
-    played = simulated(there)
-    with Simulator([Wire([played], unpaced=True)]) as simulator:
+    sim = simulated(there)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
         at = f"--port=hall-1={simulator.wires[0].path}"
         status, _, err = run("start", plant, "che-1", at, "--yes", "--frequency", 20)
-    assert (status == 0, bool(played.counters.writes)) == (is_started, is_started), err
+    assert (status == 0, bool(sim.counters.writes)) == (is_started, is_started), err
 
 
 def test_an_interruption_says_how_to_stop_it_by_plant(

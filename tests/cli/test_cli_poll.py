@@ -262,10 +262,10 @@ def test_that_the_end_of_a_recording_is_missing_is_told(run: Run, tmp_path: Path
     with path.open("r+b") as file:
         file.truncate(path.stat().st_size - 7)
     whole = sum(map(len, open_reader(path)))
-    torn = open_reader(path).truncated
-    assert 0 < torn < path.stat().st_size
+    missing = open_reader(path).truncated
+    assert 0 < missing < path.stat().st_size
     sentence = (
-        f"multidrop: the end of {path} is missing: {whole} rows were read, and its last {torn} bytes, "
+        f"multidrop: the end of {path} is missing: {whole} rows were read, and its last {missing} bytes, "
         "which are no whole rows, were left out\n"
     )
     out = tmp_path / "b.parquet"

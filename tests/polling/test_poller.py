@@ -492,7 +492,7 @@ def patient(every: float | None) -> PolledDrive:
 
 
 @pytest.fixture
-def far_end() -> Iterator[tuple[int, str]]:
+def responder() -> Iterator[tuple[int, str]]:
     """A line whose other end is the test's: its descriptor, and the path of the port."""
     master, slave = os.openpty()
     yield master, os.ttyname(slave)
@@ -502,9 +502,9 @@ def far_end() -> Iterator[tuple[int, str]]:
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
 def test_what_is_under_way_at_the_end_is_waited_for(
-    far_end: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
+    responder: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    master, path = far_end
+    master, path = responder
     answers = [checksums.rtu("01 03 02 00 01")]
 
     def answer(seconds: float) -> None:
@@ -521,11 +521,11 @@ def test_what_is_under_way_at_the_end_is_waited_for(
 
 
 def test_what_is_not_answered_by_the_end_has_a_row(
-    far_end: tuple[int, str], monkeypatch: pytest.MonkeyPatch
+    responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request that is under way, and a slot behind it that is over; not one that lasts longer."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
-    master, path = far_end
+    master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
     waiting = polled(Patient(3, name="pump-3"), [Patient.fault], 60.0)
     with Polling(line(path, patient(0.0001), short, waiting)) as polling:
@@ -537,9 +537,9 @@ def test_what_is_not_answered_by_the_end_has_a_row(
 
 
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_that_is_not_over_at_the_end_was_not_missed(far_end: tuple[int, str], leaves: str) -> None:
+def test_a_slot_that_is_not_over_at_the_end_was_not_missed(responder: tuple[int, str], leaves: str) -> None:
     """Every healthy run ends so: the next value is due already, or about to be."""
-    master, path = far_end
+    master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
     with Polling(line(path, first, second)) as polling:

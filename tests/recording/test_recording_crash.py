@@ -56,7 +56,7 @@ def record(path: Path, batches: int) -> list[int]:
     return lengths
 
 
-# ---- torn ends ----
+# ---- truncated ends ----
 
 
 def test_random_cuts_of_arrows_lose_only_what_is_not_whole(tmp_path: Path) -> None:
@@ -149,7 +149,7 @@ def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
 
 
 def test_no_drive_has_a_name_of_two_lines() -> None:
-    """A line of text that is torn within a name would look whole."""
+    """A line of text that is truncated within a name would look whole."""
     with pytest.raises(ValueError, match=r"the name 'pump\\n1' is not one line"):
         Toy(1, name="pump\n1")
 

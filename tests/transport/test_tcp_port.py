@@ -36,7 +36,7 @@ class Meter(Drive):
 
 
 @contextmanager
-def far_end(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
+def responder(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
     """A server that says these bytes to whatever comes first; its place, and what came."""
     came: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -247,7 +247,7 @@ READ = Message(1, 3, 3, 1)
 
 def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
     answer = build_reply(Framing.RTU, Message(1, 3, data=b"\0\7"))
-    with far_end(answer) as (place, came), Bus(f"tcp://{place}") as bus:
+    with responder(answer) as (place, came), Bus(f"tcp://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
         with pytest.raises(PortLost, match=f"has the shape of RTU over TCP: name the port socket://{place}"):
             bus.read(drive, drive.output_current)
@@ -260,7 +260,7 @@ def test_rtu_over_tcp_behind_tcp_is_told_and_ends_the_connection() -> None:
 
 def test_modbus_tcp_behind_socket_is_told() -> None:
     answer = build_reply(Framing.TCP, Message(1, 3, data=b"\0\7", transaction=3))
-    with far_end(answer) as (place, _), Bus(f"socket://{place}") as bus:
+    with responder(answer) as (place, _), Bus(f"socket://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
         with pytest.raises((BadReply, NoReply)) as failure:
             bus._exchanges.values(drive, [drive.output_current], 1)
@@ -268,7 +268,7 @@ def test_modbus_tcp_behind_socket_is_told() -> None:
 
 
 def test_silence_names_the_other_way() -> None:
-    with far_end(None) as (place, _):
+    with responder(None) as (place, _):
         for kind, other in (("tcp", "socket"), ("socket", "tcp")):
             with Bus(f"{kind}://{place}") as bus:
                 drive = bus.attach(InnovertIBD, 1)

@@ -11,7 +11,7 @@ from multidrop.recording import FORMATS, convert, open_reader
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", metavar="A", type=Path, help="a recording; its end may be torn")
+    parser.add_argument("source", metavar="A", type=Path, help="a recording; its end may be missing")
     parser.add_argument("target", metavar="B", type=Path, help=f"a new file: {', '.join(FORMATS)}")
 
 
