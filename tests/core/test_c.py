@@ -43,6 +43,14 @@ def test_a_client_that_is_back_soon_wakes_nobody(tmp_path: Path) -> None:
     build_and_run(tmp_path / "test_wakings", *core)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+def test_a_port_is_read_once_for_an_exchange(tmp_path: Path) -> None:
+    replaced = ("waiter_poll", "port_io")
+    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    build_and_run(tmp_path / "test_looks", *core)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(tmp_path: Path, program: str) -> None:
