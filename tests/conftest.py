@@ -100,7 +100,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--kills", type=int, default=20, help="how many clients test_crash.py kills")
+    parser.addoption("--kills", type=int, default=8, help="how many clients test_crash.py kills")
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from c_programs import ROOT, SANITIZERS, build_and_run
+from examples import usually
 
 
 @pytest.mark.slow
@@ -21,7 +22,9 @@ def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-@pytest.mark.parametrize("sanitizers", [[*SANITIZERS], ["-fsanitize=thread"]], ids=["memory", "threads"])
+@pytest.mark.parametrize(
+    "sanitizers", usually(["-fsanitize=thread"], [*SANITIZERS]), ids=["threads", "memory"]
+)
 def test_ports_come_and_go_on_threads_of_their_own(tmp_path: Path, sanitizers: list[str]) -> None:
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
     build_and_run(tmp_path / "test_engine", *core, sanitizers=sanitizers)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from clocks import Clock
+from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant
 from lines import PATIENCE
 
@@ -43,8 +44,8 @@ def descriptors(pid: int) -> int:
     return sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
 
 
-@pytest.mark.parametrize("sent", SLOW, ids=["silent", "headers", "body"])
-@pytest.mark.parametrize("way", ["http", "https"])
+@pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
+@pytest.mark.parametrize("way", usually("https", "http"))
 def test_a_stop_gets_in_beside_500_slow_clients(tmp_path: Path, sent: bytes, way: str) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")

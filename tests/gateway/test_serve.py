@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
+from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant, written
 from lines import PATIENCE, until
 
@@ -196,9 +197,9 @@ def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [("serve", "--demo", "--no-browser"), ("demo", "--web", "--no-browser")])
-def test_the_demo_is_live_and_everybody_here_may_stop_it(words: tuple[str, ...]) -> None:
-    with subprocess.Popen([*MULTIDROP, *words], stdout=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize("words", usually(["demo", "--web"], ["serve", "--demo"]))
+def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> None:
+    with subprocess.Popen([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])

@@ -14,6 +14,7 @@ from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 import pytest
+from examples import usually
 from lines import until
 from modbus_gateway import in_thread
 from modbus_masters import Master, master_of
@@ -26,7 +27,7 @@ from multidrop.gateway.passing import MAIN, ModbusSettings
 from multidrop.gateway.rights import May
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-MASTERS = ["mbpoll", "libmodbus", "pyModbusTCP"]
+MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]
 METER = Path(__file__).parents[1] / "data" / "families" / "sdm630.toml"
 MODELS = ["innovert-ibd", "invt-che", "delixi-modbus", "yd1000", "erman-er-g-220", str(METER)]
 COMMANDED = 7  # the unit that is written to
@@ -168,7 +169,7 @@ def patiently(ask: Any, *numbers: int) -> Any:
     return found
 
 
-@pytest.fixture(params=MASTERS)
+@pytest.fixture(params=usually(*MASTERS))
 def master(request: pytest.FixtureRequest, rig: Rig, tmp_path: Path) -> Iterator[Master]:
     with master_of(request.param, rig.port, tmp_path) as found:
         yield found

@@ -116,6 +116,7 @@ def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -
     all_clients(gateway, 1_000_000)
 
 
+@pytest.mark.long
 def test_a_reader_that_is_slower_than_its_requests_gets_all_answers(gateway: Gateway) -> None:
     """All is sent before anything is read: the server reads no more while its answers are not taken."""
     requests = 60_000

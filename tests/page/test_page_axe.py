@@ -9,6 +9,8 @@ import pytest
 from conftest import SIZES, Opener, missing
 from fake_gateway import FakeGateway
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 VIEWS = (
     "#/drives",
     "#/drives/pump-1",

@@ -11,6 +11,8 @@ from conftest import Opener
 from fake_gateway import FakeGateway
 from watching import LIVE, STALE, cell, link, until
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 DASH = "\u2013"
 BUSY_S = 20.0  # far beyond the promised 0.5 s and 2 s: those are measured on a quiet machine
 

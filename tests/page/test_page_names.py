@@ -9,6 +9,8 @@ from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
 from watching import AT_ITS_PLACE, VIEWS
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 MARKUP = '<img src=x onerror="window.hit=1"><script>window.hit=1</script>&amp;'
 RIGHT_TO_LEFT = "\u202epots\u202c \u05d0\u05d1\u05d2 \u0645\u0636\u062e\u0629"
 LONG = "w" * 300

@@ -10,6 +10,8 @@ from conftest import SIZES, Opener
 from fake_gateway import FakeGateway
 from watching import AT_ITS_PLACE, LIVE, VIEWS, until
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 
 def title(page: Any) -> Any:
     return page.locator("#ask-title")

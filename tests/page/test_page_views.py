@@ -6,9 +6,12 @@ import re
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
 from watching import cell, until
+
+pytestmark = pytest.mark.long  # Chromium is started for each file
 
 DRAWN = "document.querySelectorAll('#trend-plots canvas').length === 2"
 

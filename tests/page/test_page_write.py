@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
+
+pytestmark = pytest.mark.long  # Chromium is started for each file
 
 
 def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: FakeGateway) -> None:

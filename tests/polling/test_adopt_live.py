@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
+from examples import examples
 from leftovers import descriptors, threads
 from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
@@ -380,7 +381,7 @@ def test_a_hundred_adoptions_leave_nothing_behind(both: Hall) -> None:
             gc.collect()
             tracemalloc.start()
             before = tracemalloc.take_snapshot()
-            for number in range(96):
+            for number in range(examples(96)):
                 adopt_some(number)
             gc.collect()
             grown = tracemalloc.take_snapshot().compare_to(before, "filename")

@@ -99,6 +99,7 @@ def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
     with open_writer(tmp_path / "it.arrows", METADATA) as writer:
         writer.write(example())
@@ -575,7 +576,7 @@ LARGEST_VALUES = [1e308, float("-inf"), 1e149]
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", usually(*LARGEST_VALUES))
-@pytest.mark.parametrize("register", ["output_frequency", "fault", "output_current"])
+@pytest.mark.parametrize("register", usually("output_frequency", "fault", "output_current"))
 def test_values_that_no_axis_can_show(tmp_path: Path, register: str, value: float) -> None:
     drive = "fan" if register == "output_current" else "pump"
     rows = [row(at, drive, register, 1.0 if at % 2 else value) for at in range(40)]
