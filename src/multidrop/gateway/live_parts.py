@@ -20,7 +20,7 @@ END_S = 3.0  # that a part may take to end
 _log = logging.getLogger("multidrop.gateway")
 
 
-class Exchange(NamedTuple):
+class PartExchange(NamedTuple):
     """Parts that were built and do not live yet, and the settings of those that ended for them."""
 
     built: dict[str, Feed]
@@ -57,7 +57,7 @@ class LiveParts:
 
     # ---- a plant file that was read again ----
 
-    async def exchange(self, wanted: Mapping[str, Any], plant: Plant) -> Exchange:
+    async def exchange(self, wanted: Mapping[str, Any], plant: Plant) -> PartExchange:
         """End the parts whose tables changed or are gone, and build those that there are instead.
 
         Raises ValueError with what cannot be opened; the parts from before live on then.
@@ -67,7 +67,7 @@ class LiveParts:
         for name in changed:
             await self._end(name)
         new = {name: settings for name, settings in wanted.items() if name not in self._settings}
-        exchange = Exchange({}, new, before)
+        exchange = PartExchange({}, new, before)
         try:
             await beside(partial(self._build, new, plant, exchange.built))  # a folder may be large
         except ValueError:
@@ -75,12 +75,12 @@ class LiveParts:
             raise
         return exchange
 
-    def take_up(self, exchange: Exchange) -> None:
+    def take_up(self, exchange: PartExchange) -> None:
         """Let the parts live that were built: the plant is theirs now."""
         for name, feed in exchange.built.items():
             self._take_up(name, feed, exchange.wanted[name])
 
-    async def take_back(self, exchange: Exchange) -> None:
+    async def take_back(self, exchange: PartExchange) -> None:
         """Go on with the parts from before."""
         for name, feed in exchange.built.items():
             await _closed(name, feed)
