@@ -3,8 +3,8 @@
 31 drives on three simulated lines, each with ten values every 0.1 s, by `multidrop serve` and the page
 itself. A frame's age is the viewer's clock less the frame's time: when it comes, and while it is shown, which
 is until the next one comes. A value's age is that of the drive whose newest value is the oldest. All is
-looked at every 10 ms. The slow way is Chromium's own (Network.emulateNetworkConditions): it counts whole
-packets of 1500 bytes.
+looked at every 10 ms. The slow way is once Chromium's own (Network.emulateNetworkConditions), which counts
+whole packets of 1500 bytes, and once a relay that counts bytes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from bench.players.slow_way import slow_way
 from bench.support import tables
 from multidrop import InvtCHE
 
@@ -150,8 +151,15 @@ def main() -> None:
                 context = browser.new_context()
                 slow = opened(context, url, SLOW)
                 slow.wait_for_timeout(2000)
-                rows.append(row("1 tab at 8 kB/s", [slow], arguments.seconds))
+                rows.append(row("1 tab at 8 kB/s, by Chromium", [slow], arguments.seconds))
                 context.close()
+                with slow_way(int(url.rstrip("/").rpartition(":")[2])) as way:
+                    context = browser.new_context()
+                    slow = opened(context, f"http://localhost:{way.port}/")
+                    way.rate = SLOW
+                    slow.wait_for_timeout(2000)
+                    rows.append(row("1 tab at 8 kB/s, by bytes", [slow], arguments.seconds))
+                    context.close()
                 print(frame_sizes(url))
             print()
             columns = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ from typing import Any
 import pytest
 from brokers import Listener, free_port, mosquitto
 from gateways import Served, served
-from lines import until
+from lines import PATIENCE, until
 from modbus_gateway import RawClient
 from peers import require_module
 
+from multidrop.gateway import live_parts
 from multidrop.gateway.rights import Right
 
 MODBUS = '[serve.modbus]\nlisten = "127.0.0.1:{}"\nunits = {{ pump-1 = {} }}\n'
@@ -116,6 +118,30 @@ def test_a_part_whose_port_is_lost_meanwhile_is_told(
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
     assert parts(gateway) == {"modbus": "ok"}
+
+
+def test_a_part_that_takes_its_time_to_open_holds_no_stop_up(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opens, goes_on = threading.Event(), threading.Event()
+    build = live_parts.build
+
+    def slow(*given: Any) -> Any:
+        opens.set()
+        assert goes_on.wait(PATIENCE)
+        return build(*given)
+
+    monkeypatch.setattr(live_parts, "build", slow)
+    told: list[Any] = []
+    reloading = threading.Thread(target=lambda: told.append(reload(gateway, "[serve.history]\n")))
+    reloading.start()
+    assert opens.wait(PATIENCE)
+    stopped = gateway.post("/api/stop", authorization=gateway.bearer(Right.STOP)).json
+    assert [one["done"] for one in stopped.values()] == [True, True]
+    assert told == []
+    goes_on.set()
+    reloading.join(PATIENCE)
+    assert told == [IN_EFFECT]
 
 
 def test_a_history_begins_changes_and_ends(gateway: Served, tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ from gateways import Served, served
 from lines import until as until_here
 from watching import LIVE, until
 
+pytestmark = pytest.mark.long  # Chromium is started for each file
+
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
 # Everything by which a page can send, or read what it may not. Each is [what, what came of it].
 ATTACK = """async gateway => {

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from conftest import Opener
 from fake_gateway import FakeGateway
 from gateways import served
 from watching import LIVE, until
 
 from multidrop.gateway.rights import Right
+
+pytestmark = pytest.mark.long  # Chromium is started for each file
 
 READ_AGAIN = "Read the plant file again"
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Plant
 from multidrop.gateway.parts import PARTS, Feed, Inside, build
+from multidrop.gateway.reload import beside
 
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
@@ -67,7 +69,7 @@ class LiveParts:
         new = {name: settings for name, settings in wanted.items() if name not in self._settings}
         replacement = Replacement({}, new, before)
         try:
-            self._build(new, plant, replacement.built)
+            await beside(partial(self._build, new, plant, replacement.built))  # a folder may be large
         except ValueError:
             await self.take_back(replacement)
             raise
@@ -85,7 +87,7 @@ class LiveParts:
         for name, settings in replacement.before.items():
             again: dict[str, Feed] = {}
             try:
-                self._build({name: settings}, self._gateway.plant, again)
+                await beside(partial(self._build, {name: settings}, self._gateway.plant, again))
             except ValueError as failure:  # its port went to another program meanwhile
                 self._gateway.dead[name] = str(failure)
                 _log.error("%s did not come back: %s", name, failure)

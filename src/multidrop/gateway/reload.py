@@ -92,12 +92,12 @@ class Reload:
         gateway, poller = self._gateway, self._gateway.poller
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
-        plant, settings = await _beside(self._read)
-        planned = await _beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
+        plant, settings = await beside(self._read)
+        planned = await beside(lambda: plant.metadata()["planned"])  # long work, which the loop must not do
         replaced = await gateway.parts.replace(settings.parts, plant)
         self._is_settled.clear()
         try:
-            unopened = await _beside(partial(poller.adopt, plant))
+            unopened = await beside(partial(poller.adopt, plant))
             self._take_up(poller, settings, planned)
             gateway.parts.take_up(replaced)
         except Exception:
@@ -151,8 +151,8 @@ class Reload:
         return Reloaded(False, "the plant goes on as before: the file has mistakes", self.mistakes)
 
 
-async def _beside(work: Callable[[], R]) -> R:
-    """Do the work in a thread of its own, as all others may be busy, and return its result."""
+async def beside(work: Callable[[], R]) -> R:
+    """Return what work returns, in a thread of its own: all others may be busy."""
     own = ThreadPoolExecutor(1, "multidrop reload")
     try:
         return await asyncio.get_running_loop().run_in_executor(own, work)
