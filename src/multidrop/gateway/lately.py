@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 from multidrop import LineStatistics, Plant, PlantLine, Statistics
@@ -27,7 +26,8 @@ class Lately:
         self._recent: deque[tuple[float, Reading]] = deque()
         self._drives: dict[str, dict[str, Any]] = {}  # figures of the last minute
         self._figures: dict[str, dict[str, Any]] = {}  # of the lines, as of the newest reading
-        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=MINUTES + 1)
+        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # the newest: one takes much memory
+        self._hours: dict[str, deque[dict[str, Any]]] = {}  # of whole minutes, by line
         self._lines: Mapping[str, PlantLine] = {}
         self.adopt(plant)
 
@@ -41,6 +41,7 @@ class Lately:
             kept = [(time, _of_lines(reading, goes_on)) for time, reading in readings]
             readings.clear()
             readings.extend(kept)  # type: ignore[arg-type]
+        self._hours = {name: minutes for name, minutes in self._hours.items() if name in goes_on}
         self.newest = _of_lines(self.newest, goes_on)
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
@@ -53,6 +54,8 @@ class Lately:
         while now - self._recent[0][0] > SECONDS:
             self._recent.popleft()
         if not self._minutes or utc_ms - self._minutes[-1][0] >= 60_000:
+            for line in reading:
+                self._hours.setdefault(line, deque(maxlen=MINUTES)).extend(self._this_minute(line))
             self._minutes.append((utc_ms, reading))
         minutes = {line: self._last_minute(line) for line in reading}
         self._drives = {
@@ -98,13 +101,13 @@ class Lately:
 
     def hour(self, line: str) -> list[dict[str, Any]]:
         """Return what was asked, and misses by reason, in each of the last 60 minutes, the oldest first."""
-        readings = [*self._minutes, *([(0, self.newest)] if self.newest else [])]
-        found = []
-        for (begin_ms, before), (_, after) in pairwise(readings):
-            if line in before and line in after and before[line] is not after[line]:
-                minute = after[line].since(before[line])
-                found.append({"time": begin_ms, "asked": _asked(minute), "misses": misses_of(minute)})
-        return found
+        return [*self._hours.get(line, ()), *self._this_minute(line)][-MINUTES:]
+
+    def _this_minute(self, line: str) -> list[dict[str, Any]]:
+        """Return the figures since the newest minute began; none where it has just begun."""
+        begin_ms, before = self._minutes[-1] if self._minutes else (0, {})
+        minute = self._since(before, line)
+        return [{"time": begin_ms, "asked": _asked(minute), "misses": misses_of(minute)}] if minute else []
 
 
 def _counts_on(before: PlantLine, line: PlantLine) -> bool:

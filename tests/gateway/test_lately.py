@@ -1,0 +1,54 @@
+"""Figures of the last hour: made of readings, of which only the newest are kept."""
+
+from __future__ import annotations
+
+import weakref
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from gateways import written
+
+from multidrop.core import Counters, Status
+from multidrop.gateway.lately import MINUTES, Lately
+from multidrop.transport.statistics import LineStatistics, line_statistics
+
+MINUTE_MS = 60_000
+
+
+def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
+    """A line's statistics after so many seconds of samples, with a miss each 30 s."""
+    missed = Counter({int(Status.NO_REPLY): seconds // 30})
+    counters = Counters()._replace(values=seconds * per_s, sent=seconds * per_s, missed=missed)
+    return line_statistics(float(seconds), {"pump-1": counters}, None)
+
+
+@pytest.fixture
+def lately(tmp_path: Path) -> Lately:
+    return Lately(written(tmp_path))
+
+
+def test_an_hour_of_minutes_and_no_hour_of_readings(lately: Lately) -> None:
+    alive: list[weakref.ref[LineStatistics]] = []
+    for second in range(0, 70 * 60 + 31, 5):
+        found = reading(second)
+        alive.append(weakref.ref(found))
+        lately.tick(float(second), second * 1000, {"hall": found})
+    del found
+    hour = lately.hour("hall")
+    assert len(hour) == MINUTES
+    assert [one["time"] for one in hour] == [minute * MINUTE_MS for minute in range(11, 71)]
+    assert all(one["asked"] == 602 and one["misses"] == {"no reply": 2} for one in hour[:-1])
+    assert hour[-1] == {"time": 70 * MINUTE_MS, "asked": 301, "misses": {"no reply": 1}}
+    assert sum(one() is not None for one in alive) < 10
+    assert lately.hour("roof") == []
+
+
+def test_figures_of_a_line_are_those_of_the_last_seconds(lately: Lately) -> None:
+    for second in range(200):
+        lately.tick(float(second), second * 1000, {"hall": reading(second)})
+        if second == 100:
+            assert lately.line("hall")["misses"] == 3
+    assert lately.line("hall")["rate"] == 10.0
+    assert lately.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
+    assert lately.line("roof")["rate"] is None
