@@ -327,9 +327,7 @@ def main() -> None:
     parser.add_argument("--slices", type=int, default=5, help="of each kind")
     parser.add_argument("--stops", type=int, default=15, help="of all drives, of each kind")
     parser.add_argument("--minutes", type=int, default=0, help="beside the users, instead of all that")
-    parser.add_argument(
-        "--rotate", help="of the history: 1 min, or 10 with --minutes"
-    )
+    parser.add_argument("--rotate", help="of the history: 1 min, or 10 with --minutes")
     parser.add_argument("--ahead", action="store_true", help="run simulator and polling by SCHED_RR")
     parser.add_argument("--poll", nargs=2, type=Path, metavar=("PLANT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
