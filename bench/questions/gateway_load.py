@@ -327,7 +327,7 @@ def main() -> None:
     parser.add_argument("--slices", type=int, default=5, help="of each kind")
     parser.add_argument("--stops", type=int, default=15, help="of all drives, of each kind")
     parser.add_argument("--minutes", type=int, default=0, help="beside the users, instead of all that")
-    parser.add_argument("--rotate", default="1 min", help="after which a segment of the history is compacted")
+    parser.add_argument("--rotate", help="of the history: 1 min, or 10 with --minutes")
     parser.add_argument("--ahead", action="store_true", help="run simulator and polling by SCHED_RR")
     parser.add_argument("--poll", nargs=2, type=Path, metavar=("PLANT", "FOLDER"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -340,7 +340,8 @@ def main() -> None:
 def run(arguments: argparse.Namespace) -> None:
     tables.heading(f"{sum(LINES)} drives x {len(POLLED)} values x 10 Hz on {len(LINES)} lines at 115200.")
     before = AHEAD if arguments.ahead else ()
-    with hall(arguments.rotate, before) as here:
+    rotate = arguments.rotate or ("10 min" if arguments.minutes else "1 min")
+    with hall(rotate, before) as here:
         head = (*HEAD, "load")
         if arguments.minutes:
             rows = show_as_they_come(head, here.minutes(arguments.minutes, arguments.seconds))
