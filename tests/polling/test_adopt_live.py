@@ -6,8 +6,9 @@ import gc
 import socket
 import threading
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from examples import examples
@@ -323,6 +324,38 @@ def until_sampled(poller: Poller, drive: str) -> None:
             return
         waited.wait(0.01)
     raise AssertionError(f"no samples of {drive}")
+
+
+# ---- while somebody looks ----
+
+
+class Dawdling(dict[object, object]):
+    """Lets others change it, if they can, while somebody goes through its values."""
+
+    def __init__(self, of: dict[object, object], change: Callable[[], object]) -> None:
+        super().__init__(of)
+        self._changing = threading.Thread(target=change)
+
+    def values(self) -> Any:
+        for value in super().values():
+            if self._changing.ident is None:
+                self._changing.start()
+            self._changing.join(0.2)
+            yield value
+
+    def wait(self) -> None:
+        self._changing.join(PATIENCE)
+        assert not self._changing.is_alive()
+
+
+def test_a_summary_is_of_the_plant_before_or_after(both: TwoLines) -> None:
+    with Poller(plant(both.hall())) as poller:
+        (polled_line,) = poller._lines
+        maker = polled_line._maker
+        maker._made = dawdling = Dawdling(maker._made, lambda: poller.adopt(plant(both.hall(1))))
+        assert set(poller.summary()["lines"]["hall"]["drives"]) == {"pump-1", "pump-2"}
+        dawdling.wait()
+        assert [drive.name for drive in poller.bus("hall").drives] == ["pump-1"]
 
 
 # ---- for ever ----

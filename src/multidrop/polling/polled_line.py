@@ -261,13 +261,12 @@ class PolledLine:
         with self._lock:
             seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
             peers = {drive.name: peer for drive, peer in self.bus.peers.items()}
-            found = line_summary(seconds, peers)
-        return {
-            **found,
-            "overrun_slots": self._maker.skipped,
-            "switching_ms": round(self.switching * 1e3, 3),
-            "set_aside": self._refusals.names,
-        }
+            return {
+                **line_summary(seconds, peers),
+                "overrun_slots": self._maker.skipped,
+                "switching_ms": round(self.switching * 1e3, 3),
+                "set_aside": self._refusals.names,
+            }
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
