@@ -21,6 +21,7 @@ from multidrop.gateway.connections import Connections, Watched
 from multidrop.gateway.events import Events
 from multidrop.gateway.frames import Frames, frame_of, lost_of
 from multidrop.gateway.hub import SILENT, Hub
+from multidrop.gateway.identities import Identities
 from multidrop.gateway.lately import Lately
 from multidrop.gateway.listener import BACKLOG, listen
 from multidrop.gateway.live_parts import END_S, LiveParts
@@ -82,6 +83,9 @@ class Gateway:
         self.frames = Frames(self._frame, self.clock)
         self.commands = Commands(self, settings.may)
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, _utc_ms)
+        self.identities = Identities(
+            lambda: self.plant, self.bus, self._is_there, lambda: self.note_failure("identities")
+        )
 
     # ---- life ----
 
@@ -101,6 +105,7 @@ class Gateway:
                     for name, work in (
                         ("take", self._take_all()),
                         ("tick", self._tick()),
+                        ("identities", self.identities.run()),
                     )
                 ]
                 self.parts.start()

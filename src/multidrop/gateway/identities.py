@@ -1,0 +1,56 @@
+"""Identities: each drive is asked what it is while nobody stops it: its first stop is sent at once."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+
+from multidrop import Bus, BusError, Drive, Plant, Refused
+
+PAUSE_S = 0.2  # between two drives: the polling keeps the line
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class Identities:
+    """Asks the drives of the present plant one by one; a bus asks each only once while its port is open.
+
+    `fail` is called within the handling of whatever else goes wrong.
+    """
+
+    def __init__(
+        self,
+        plant: Callable[[], Plant],
+        bus: Callable[[str], Bus],
+        is_there: Callable[[str], bool],
+        fail: Callable[[], object],
+    ) -> None:
+        self._plant = plant
+        self._bus = bus
+        self._is_there = is_there
+        self._fail = fail
+        self._refused: dict[str, str] = {}  # by drive, as it was logged
+
+    async def run(self) -> None:
+        """Ask again and again: a drive may answer again, and a port may be opened again."""
+        while True:
+            drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
+            for line, drive in drives:
+                try:
+                    if self._is_there(drive.name):
+                        await asyncio.to_thread(self._ask, line, drive)
+                except Exception:  # whatever it is, polling and stops go on
+                    self._fail()
+                await asyncio.sleep(PAUSE_S)
+            await asyncio.sleep(PAUSE_S)
+
+    def _ask(self, line: str, drive: Drive) -> None:
+        try:
+            self._bus(line).check_identity(drive)
+        except Refused as refusal:
+            if self._refused.get(drive.name) != str(refusal):
+                _log.warning("%s", refusal)
+            self._refused[drive.name] = str(refusal)
+        except (BusError, ValueError):  # it will be asked again, or it is no longer there
+            pass
