@@ -15,6 +15,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
+from network_changes import changing_network
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 
@@ -90,14 +91,15 @@ def _ip(*words: str) -> None:
 def network() -> Iterator[Network | None]:
     """None where this machine does not let us make one."""
     made = None
-    if shutil.which("ip") and os.geteuid() == 0:
-        with suppress(subprocess.CalledProcessError):
-            made = Network().__enter__()
-    try:
-        yield made
-    finally:
-        if made:
-            made.__exit__()
+    with changing_network():
+        if shutil.which("ip") and os.geteuid() == 0:
+            with suppress(subprocess.CalledProcessError):
+                made = Network().__enter__()
+        try:
+            yield made
+        finally:
+            if made:
+                made.__exit__()
 
 
 def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:

@@ -192,12 +192,14 @@ def test_a_simulator_in_another_process_is_known_until_it_is_killed(tmp_path: Pa
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         device = process.stdout.readline().strip()
+        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # or another test's simulator has the same next
         try:
             assert is_simulated(device)
         finally:
             process.kill()
             process.wait(PATIENCE)
     assert not is_simulated(device)
+    os.close(held)
 
 
 def test_a_real_port_is_not_taken_for_a_simulated_one() -> None:

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 import pytest
 from fake_gateway import FakeGateway
+from network_changes import steady_network
 from watching import LIVE, until
 
 SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844)}
@@ -38,6 +39,12 @@ def browser() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=chromium, args=OPTIONS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(autouse=True)
+def _steady() -> Iterator[None]:
+    with steady_network():
+        yield
 
 
 @pytest.fixture

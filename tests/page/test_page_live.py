@@ -179,3 +179,33 @@ def test_nine_tabs_are_live_at_once(browser: Any, gateway: FakeGateway) -> None:
         assert link(page) == "live"
         assert (time.time() - page.evaluate(shown)) % 1000 < BUSY_S
     context.close()
+
+
+# ---- while it is loaded ----
+
+
+def test_a_network_that_changes_while_the_page_is_loaded_costs_a_moment(opened: Opener) -> None:
+    """Chromium breaks off all requests then."""
+    page, broken = opened(live=False), []
+
+    def break_two_off(route: Any) -> None:
+        if len(broken) < 2:
+            broken.append(route.request.url)
+            route.abort()
+        else:
+            route.continue_()
+
+    page.route("**/page/api.js", break_two_off)
+    page.reload()
+    page.locator("#link").get_by_text("live", exact=True).wait_for()
+    assert len(broken) == 2
+    assert page.evaluate("sessionStorage.getItem('times loaded again')") is None
+    assert page.locator("#stopall").is_enabled()
+
+
+def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Opener) -> None:
+    page = opened(live=False)
+    page.route("**/page/api.js", lambda route: route.abort())
+    page.reload()
+    page.locator("#notice").get_by_text("Stop all does nothing").wait_for()
+    assert page.locator("#stopall").is_disabled()

@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lines import PATIENCE, until
+from network_changes import changing_network
 from serial import SerialException, rfc2217
 from servers.network_server import END, manager
 from toy import Status, Toy
@@ -324,12 +325,13 @@ class FarNetwork:
 def far_network(request: pytest.FixtureRequest) -> Iterator[FarNetwork]:
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("a network of its own needs root and ip")
-    try:
-        network = FarNetwork(request.param)
-    except (subprocess.CalledProcessError, OSError) as failure:
-        pytest.skip(f"this system makes no network namespace: {failure}")
-    yield network
-    network.close()
+    with changing_network():
+        try:
+            network = FarNetwork(request.param)
+        except (subprocess.CalledProcessError, OSError) as failure:
+            pytest.skip(f"this system makes no network namespace: {failure}")
+        yield network
+        network.close()
 
 
 START = "010600140001"  # write 1, which starts it, to the control register of drive 1

@@ -90,6 +90,9 @@ setTimeout(() => {
 }, WHOLE_MS);
 
 find("#stopall").addEventListener("click", stopAll);
+find("#stopall").disabled = false;
+find("#notice").hidden = true;
+find("#notice").classList.remove("loading", "bad");
 addEventListener("keydown", event => {
   // The focus is still in the dialog for some milliseconds after that was closed.
   const isElsewhere = find("#ask").open || event.target.closest?.("input, select, textarea");
