@@ -34,8 +34,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Four for each processor: many tests wait for a line; 12 at most, for each worker collects all."""
-    return min(4 * len(os.sched_getaffinity(0)), 12)
+    """Three for each processor: many tests wait for a line; 12 at most, for each worker collects all."""
+    return min(3 * len(os.sched_getaffinity(0)), 12)
 
 
 def pytest_configure(config: pytest.Config) -> None:
