@@ -37,7 +37,7 @@ def test_hostile_names_are_text_and_break_no_layout(opened: Opener, size: str) -
     for view in VIEWS:
         page.evaluate("view => { location.hash = view }", view)
         page.wait_for_timeout(300)
-        assert elements(page) == [1, 3, 0], view
+        assert elements(page) == [1, 4, 0], view
         assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0], view
         assert page.evaluate("document.querySelector('main').scrollWidth") <= SIZES[size][0], view
         assert page.evaluate(AT_ITS_PLACE)[0], view
