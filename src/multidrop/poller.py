@@ -267,6 +267,11 @@ class Poller(RowSource):
         for line in self._lines:
             line.bus.reset_statistics()
 
+    @property
+    def dropped(self) -> int:
+        """The rows that came too fast for who takes them, so far."""
+        return self._row_queue.dropped
+
     def summary(self) -> dict[str, Any]:
         """Return exchanges, values, misses by reason, rates and utilisation so far, by line and drive."""
         lines = {line.name: line.summary() for line in self._lines}
@@ -274,5 +279,5 @@ class Poller(RowSource):
             "lines": lines,
             "samples": sum(line["samples"] for line in lines.values()),
             "misses": sum(sum(line["misses"].values()) for line in lines.values()),
-            "dropped": self._row_queue.dropped,
+            "dropped": self.dropped,
         }

@@ -224,7 +224,7 @@ def test_an_asyncio_program_needs_no_second_api(port: str) -> None:
 def test_rows_nobody_takes_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poller_module, "RowQueue", lambda: RowQueue(chunk_rows=200, most_chunks=2))
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
-        until(lambda: poller.summary()["dropped"] > 0)
+        until(lambda: poller.dropped > 0)
     rows = rows_of(poller)
     summary = poller.summary()
     assert len(rows) <= 400

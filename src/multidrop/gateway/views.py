@@ -138,7 +138,7 @@ def figures_of(gateway: Gateway) -> Figures:
         if said is not None:
             with contextlib.suppress(Exception):  # a part's failure hides its own figures alone
                 parts[name] = dict(said())
-    dropped = gateway.poller.summary()["dropped"] if gateway.poller else 0
+    dropped = gateway.poller.dropped if gateway.poller else 0
     failures = {name: gateway.failures.get(name, 0) for name in ("hub", *gateway.feeds)} | gateway.failures
     return Figures(gateway.version, gateway.frames.viewers, gateway.frames.made, dropped, failures, parts)
 

@@ -11,6 +11,7 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
+FINE_NS = 2 * SECOND_NS  # shorter times are made of rows; longer ones of tens, which cost a hundredth
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Grid:
 
 
 def grid_of(begin: int, end: int, points: int) -> Grid:
-    """Return at most `points` times that cover the range; from 10 s on, of whole tens, hours or days.
+    """Return at most `points` times that cover the range; from 2 s on, of whole tens, hours or days.
 
     A range that begins within a bucket is covered from that bucket's beginning. Raises ValueError for a
     range without length, or another number of points than 1 to 100000.
@@ -67,7 +68,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     if begin >= end:
         raise ValueError(f"the range ends at {end} ns, and begins not before it, at {begin} ns")
     least = -(-(end - begin) // points)
-    if least <= TEN_NS // 2:
+    if least <= FINE_NS:
         return Grid(begin, least, -(-(end - begin) // least))
     for step in _handy_steps(least):
         first = begin // step * step

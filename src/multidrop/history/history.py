@@ -129,8 +129,8 @@ class History:
     ) -> dict[str, Buckets]:
         """Return least, mean and most of each series in at most `points` equal times that cover the range.
 
-        `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`. From
-        10 s on the times are whole tens of seconds, minutes, hours or days of UTC, so that the first may
+        `end` None is now. Nothing is hidden: a value that stood out for one row is in `most` or `least`.
+        Times above 2 s become whole tens of seconds, minutes, hours or days of UTC, so that the first may
         begin before `begin` and the last end after `end`.
         """
         names = _parsed(series)
