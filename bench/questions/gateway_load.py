@@ -159,8 +159,8 @@ def poll(plant: Path, folder: Path) -> None:
 def plain_poll(plant: Path, before: Sequence[str]) -> Iterator[PlainPoll]:
     with TemporaryDirectory(dir=plant.parent) as folder:
         words = [*before, *module("bench.questions.gateway_load", "--poll", plant, folder)]
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        with subprocess.Popen(words, text=True, **pipes) as process:  # type: ignore[call-overload]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(words, text=True, stdin=pipe, stdout=pipe) as process:
             yield PlainPoll(process)
 
 

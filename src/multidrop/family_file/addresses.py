@@ -36,9 +36,7 @@ class Counting:
         ValueError with what would be right.
         """
         if isinstance(given, bool) or not isinstance(given, (int, str)):
-            raise ValueError(  # noqa: TRY004 (one kind of mistake)
-                f'{given!r} is no address; write 0x2000, 8192, "2000H" or "40001"'
-            )
+            raise ValueError(f'{given!r} is no address; write 0x2000, 8192, "2000H" or "40001"')
         if isinstance(given, int):
             return self._number(given, table or default), table or default
         text = given.strip()

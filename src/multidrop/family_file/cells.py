@@ -45,7 +45,7 @@ def whole(cell: str) -> int:
         raise ValueError(f"{cell!r} is no whole number; write {right}")
     found = number(cell)
     if not isinstance(found, int):
-        raise ValueError(f"{cell!r} has too many digits")  # noqa: TRY004 (one kind of mistake)
+        raise ValueError(f"{cell!r} has too many digits")
     return found
 
 

@@ -100,7 +100,7 @@ def _formats(value: Any) -> Any:
         raise ValueError(f"{shown(value)} is no list of formats")
     for each in value:
         if not isinstance(each, str):
-            raise ValueError(f"{shown(each)} is no format")  # noqa: TRY004
+            raise ValueError(f"{shown(each)} is no format")
         Settings(9600, each)
     return tuple(dict.fromkeys(value))
 

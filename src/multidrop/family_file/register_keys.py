@@ -37,7 +37,7 @@ class RegisterKey:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError("is no text")  # noqa: TRY004 (one kind of mistake for all)
+        raise ValueError("is no text")
     if not value.isprintable():
         raise ValueError("has characters that do not print; leave them out")
     if len(value) > LONGEST_TEXT:
@@ -47,7 +47,7 @@ def _text(value: Any) -> str:
 
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError("is no number")  # noqa: TRY004
+        raise ValueError("is no number")
     if not math.isfinite(value):
         raise ValueError("is no finite number")
     return value
@@ -63,7 +63,7 @@ def _step(value: Any) -> Any:
 
 def _truth(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise ValueError("is neither true nor false")  # noqa: TRY004
+        raise ValueError("is neither true nor false")
     return value
 
 
@@ -118,7 +118,7 @@ def _one_of(known: Mapping[str, Any], spelling: Callable[[str], str] = str) -> C
 
 def _named(value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError("is no table of names with their numbers")  # noqa: TRY004
+        raise ValueError("is no table of names with their numbers")
     return value
 
 

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 from multidrop import written_by
@@ -31,25 +32,21 @@ def in_thread(work: Callable[[], R], caller: Caller) -> asyncio.Future[R]:
     loop = asyncio.get_running_loop()
     future: asyncio.Future[R] = loop.create_future()
 
-    def finish(result: R | None, failure: BaseException | None) -> None:
-        if future.done():
-            return
-        if failure is not None:
-            future.set_exception(failure)
-        else:
-            future.set_result(result)  # type: ignore[arg-type]
+    def finish(settle: Callable[[], None]) -> None:
+        if not future.done():
+            settle()
 
     def run() -> None:
-        result, failure = None, None
+        settle: partial[None]
         try:
             with written_by(*_author(caller)):
-                result = work()
-        except BaseException as error:
-            failure = error
+                settle = partial(future.set_result, work())
+        except BaseException as failure:
+            settle = partial(future.set_exception, failure)
         try:
-            loop.call_soon_threadsafe(finish, result, failure)
+            loop.call_soon_threadsafe(finish, settle)
         except RuntimeError:  # the loop is closed: nobody waits any more
-            _log.warning("a command ended after the gateway: %s", failure or result)
+            _log.warning("a command ended after the gateway: %s", settle.args[0])
 
     threading.Thread(target=run, name="multidrop command", daemon=True).start()
     return future

@@ -168,7 +168,7 @@ def _read_write(payload: bytes) -> tuple[float, int]:
     given = _read(payload, "value")
     value = given["value"]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"value is {value!r}, and not a number")  # noqa: TRY004 (a person's mistake)
+        raise ValueError(f"value is {value!r}, and not a number")
     return value, given["time"]
 
 
@@ -179,7 +179,7 @@ def _read_act(drive: str, payload: bytes) -> tuple[str, dict[str, object], int]:
     if given["drive"] != drive:
         raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
     if not isinstance(options, dict):
-        raise ValueError("options is no table")  # noqa: TRY004 (a person's mistake)
+        raise ValueError("options is no table")
     return str(given["verb"]), options, given["time"]
 
 
@@ -190,10 +190,10 @@ def _read(payload: bytes, *keys: str) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     if not isinstance(given, dict):
-        raise ValueError("it is no JSON object")  # noqa: TRY004 (a person's mistake)
+        raise ValueError("it is no JSON object")
     for key in (*keys, "time"):
         if key not in given:
             raise ValueError(f"{key} is missing")
     if isinstance(given["time"], bool) or not isinstance(given["time"], int):
-        raise ValueError("time is no whole number of ms")  # noqa: TRY004 (a person's mistake)
+        raise ValueError("time is no whole number of ms")
     return given

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop import LineStatistics, Plant, PlantLine, Statistics
 
@@ -16,6 +16,7 @@ SECONDS = 5.0  # over which the use of a line is taken
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
+T = TypeVar("T", float, int)
 
 
 class Lately:
@@ -37,10 +38,8 @@ class Lately:
         goes_on = {
             name for name, line in self._lines.items() if name in before and _counts_on(before[name], line)
         }
-        for readings in (self._recent, self._minutes):
-            kept = [(time, _of_lines(reading, goes_on)) for time, reading in readings]
-            readings.clear()
-            readings.extend(kept)  # type: ignore[arg-type]
+        _keep(self._recent, goes_on)
+        _keep(self._minutes, goes_on)
         self._hours = {name: minutes for name, minutes in self._hours.items() if name in goes_on}
         self.newest = _of_lines(self.newest, goes_on)
         planned = plant.metadata()["planned"] if planned is None else planned
@@ -115,6 +114,12 @@ def _counts_on(before: PlantLine, line: PlantLine) -> bool:
     drives = [[polled.drive for polled in one.drives] for one in (before, line)]
     is_same = len(drives[0]) == len(drives[1]) and all(a is b for a, b in zip(*drives, strict=True))
     return is_same and replace(before, drives=()) == replace(line, drives=())
+
+
+def _keep(readings: deque[tuple[T, Reading]], names: set[str]) -> None:
+    kept = [(time, _of_lines(reading, names)) for time, reading in readings]
+    readings.clear()
+    readings.extend(kept)
 
 
 def _of_lines(reading: Reading, names: set[str]) -> Reading:

@@ -135,10 +135,9 @@ def _is_address(text: str) -> bool:
 
 def _is_network(text: object) -> bool:
     try:
-        ip_network(text, strict=False)  # type: ignore[arg-type]
+        return isinstance(text, str) and bool(ip_network(text, strict=False))
     except ValueError:
         return False
-    return isinstance(text, str)
 
 
 def build(settings: ModbusSettings, inside: Inside) -> ModbusServer:

@@ -36,7 +36,7 @@ def _direction(value: object) -> Direction:
 
 def _hertz(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"hz = {value!r} is no number")  # noqa: TRY004 (a person's mistake)
+        raise ValueError(f"hz = {value!r} is no number")
     return float(value)
 
 
