@@ -168,7 +168,7 @@ class Frames:
     def _build(self) -> None:
         self.made += 1
         plain = json.dumps(self._make(self.made), separators=(",", ":"), allow_nan=False).encode()
-        self._newest = Encoded(self.made, plain, gzip.compress(plain, 5, mtime=0))
+        self._newest = Encoded(self.made, plain, gzip.compress(plain, 6, mtime=0))
         self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
         self._has_news = False
         self._wake()

@@ -15,13 +15,18 @@ from multidrop.gateway.rights import Caller, May, OwnNames, Right, Token, Tokens
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {
-    "content-security-policy": CSP,
+HEADERS = {  # of what is no page: short, since each frame has them
+    "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
-    "cross-origin-opener-policy": "same-origin",
     "x-content-type-options": "nosniff",
+    "cache-control": "no-store",
+}
+PAGE_HEADERS = HEADERS | {
+    "content-security-policy": CSP,
+    "cross-origin-opener-policy": "same-origin",
     "x-frame-options": "DENY",
     "referrer-policy": "no-referrer",
+    "cache-control": "no-cache",  # a page's file is asked for again, by its ETag
 }
 ANYONE = "anyone"
 
@@ -70,14 +75,13 @@ class Guard:
             return  # uvicorn refuses a connection that nobody accepts
 
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
-        kept = "no-cache" if is_page else "no-store"  # a page's file is asked for again, by its ETag
+        added = PAGE_HEADERS if is_page else HEADERS
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
-                    headers[name] = value
-                headers.setdefault("cache-control", kept)
+                for name, value in added.items():
+                    headers.setdefault(name, value)
             await send(message)
 
         try:

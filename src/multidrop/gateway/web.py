@@ -127,7 +127,7 @@ class _Pages:
         page = PAGE / "index.html"
         if not page.exists():
             return _error(404, "this version of multidrop has no page; /api/plant and /metrics are there")
-        return FileResponse(page, headers={"cache-control": "no-cache"})
+        return FileResponse(page)
 
     # ---- looks ----
 
