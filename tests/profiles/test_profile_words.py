@@ -178,12 +178,24 @@ def test_a_jog_has_its_direction() -> None:
     found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
     found.drive.jog()
     assert sent(found) == [DELTA + "00 13"]
-    found = wire("delta-vfd-el", [DELTA_REVERSE])
-    found.drive.jog()
+    found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
+    found.drive.jog(Direction.REVERSE)
     assert sent(found) == [DELTA + "00 23"]
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog(Direction.REVERSE)
     assert sent(found) == [DELTA + "00 04"]
+
+
+@pytest.mark.parametrize(
+    ("model", "status"),
+    [("delta-vfd-el", DELTA_RUNS), ("delta-vfd-el", DELTA_REVERSE), ("invt-goodrive", GD_RUNS)],
+)
+def test_a_motor_that_turns_is_not_jogged(model: str, status: Any) -> None:
+    found = wire(model, [status])
+    for direction in (None, *Direction):
+        with pytest.raises(Refused, match=r"turns, and may go on through a jog: call stop\(\) first"):
+            found.drive.jog(direction)
+    assert sent(found) == []
 
 
 # A setpoint of 25 Hz: half of 50 Hz where it is a percentage.

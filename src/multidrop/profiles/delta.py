@@ -118,9 +118,9 @@ class Delta(Profile):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
+        """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
-        yield from self._may_start(status)
+        yield from self._may_jog(status)
         reverse = self._reverse(direction, status)
         word = DeltaControl.JOG_REVERSE if reverse else DeltaControl.JOG_FORWARD
         yield from write(self.control, self._word(word))

@@ -100,9 +100,9 @@ class Invt(Profile):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction, in the one it turns in, or forward."""
+        """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
-        yield from super()._may_start(status)
+        yield from self._may_jog(status)
         reverse = self._reverse(direction, status)
         self._jogged = True
         word = InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD

@@ -198,6 +198,12 @@ class Profile(Drive):
         if why := self._not_ready(status):
             raise Refused(f"{self.name} {why}; {self.remote}")
 
+    def _may_jog(self, status: int) -> Script[None]:
+        """Raise Refused as before a start, and while the motor turns: no manual says what a jog does then."""
+        yield from self._may_start(status)
+        if self._turns(status):
+            raise self._stop_first("turns, and may go on through a jog:")
+
     def _word(self, count: int) -> Any:
         assert self.control.values is not None
         return self.control.values(count)
