@@ -90,6 +90,24 @@ def test_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
     assert gateway.frame()["drives"].keys() == {"pump-1", "pump-2"}
 
 
+def test_a_part_that_fails_in_another_way_changes_nothing(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = free_port()
+    assert reload(gateway, MODBUS.format(first, 21))["done"] is True
+    build, failures = live_parts.build, [MemoryError("no memory")]
+
+    def build_or_fail(*arguments: Any) -> Any:
+        if failures:
+            raise failures.pop()
+        return build(*arguments)
+
+    monkeypatch.setattr(live_parts, "build", build_or_fail)
+    assert reload(gateway, MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
+    assert parts(gateway) == {"modbus": "ok"}
+    until(lambda: status_of(first, 21) == [3])
+
+
 def test_a_part_whose_port_is_lost_meanwhile_is_told(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:

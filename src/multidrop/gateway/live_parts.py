@@ -70,7 +70,7 @@ class LiveParts:
         replacement = Replacement({}, new, before)
         try:
             await beside(partial(self._build, new, plant, replacement.built))  # a folder may be large
-        except ValueError:
+        except Exception:
             await self.take_back(replacement)
             raise
         return replacement
@@ -88,7 +88,7 @@ class LiveParts:
             again: dict[str, Feed] = {}
             try:
                 await beside(partial(self._build, {name: settings}, self._gateway.plant, again))
-            except ValueError as failure:  # its port went to another program meanwhile
+            except Exception as failure:  # its port may have gone to another program meanwhile
                 self._gateway.dead[name] = str(failure)
                 _log.error("%s did not come back: %s", name, failure)
             for feed in again.values():
