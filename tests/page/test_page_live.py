@@ -209,4 +209,5 @@ def test_a_page_whose_scripts_do_not_come_says_that_it_stops_nothing(opened: Ope
     page.route("**/page/api.js", lambda route: route.abort())
     page.reload()
     page.locator("#notice").get_by_text("Stop all does nothing").wait_for()
+    assert page.locator("#link.stale").inner_text() == "connecting"
     assert page.locator("#stopall").is_disabled()
