@@ -309,11 +309,11 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
 {
     int is_exception = body[1] != request->function;
     if (!is_exception && !confirms(framing, body, request))
-        return MD_BAD_ECHO;
+        return 0;
     begin_message(reply, body[0], request->function);
     if (is_exception) {
         reply->exception = framing == MD_DELIXI ? body[1] : body[2];
-        return 0;
+        return 1;
     }
     int layout = find_function(framing, body[1])->reply;
     get_body(layout, body, reply);
@@ -323,7 +323,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
     }
     if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* as all others have it */
         md_put16(reply->data + 2, reply->start);
-    return 0;
+    return 1;
 }
 
 int md_is_gateways(int framing, const struct md_message *reply)

@@ -177,7 +177,7 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
     int used = open_frame(framing, bytes, len, request, text, &body);
     if (used <= 0)
         return used;
-    if (md_body_get_reply(framing, body, request, reply))
+    if (!md_body_get_reply(framing, body, request, reply))
         return MD_BAD_ECHO;
     if (framing == MD_TCP)
         reply->transaction = md_get16(bytes);

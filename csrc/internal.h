@@ -44,7 +44,7 @@ int md_body_reply_length(int framing, const struct md_message *request);
 int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);
 int md_body_put_reply(int framing, const struct md_message *message, uint8_t *body);
 void md_body_get_request(int framing, const uint8_t *body, struct md_message *message);
-/* Read a whole reply; MD_BAD_ECHO where it confirms what was not asked for, else 0. */
+/* Read a whole reply; 0 where it confirms what was not asked for. */
 int md_body_get_reply(int framing, const uint8_t *body, const struct md_message *request,
                       struct md_message *reply);
 
