@@ -142,7 +142,7 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         assert rows.adopted == [gateway.gateway.plant]
         assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
         after = len(rows.found)
-        until(lambda: [row[0] for row in rows.found[after:]].count("pump-1") > 40)
+        until(lambda: [row[0] for row in rows.found[after:]].count("pump-1") > 12)
         statuses = {status for drive, _, status in rows.found if drive == "pump-1"}
         assert "ok" in statuses
         assert statuses <= {"ok", *HOST_LATE}
