@@ -36,7 +36,7 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
 def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, number: int) -> None:
     link = tmp_path / "ports" / "hall-1"
     with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports") as (process, out):
