@@ -15,13 +15,12 @@ import pytest
 from commands import Run
 from examples import examples
 from hypothesis import HealthCheck, settings
+from patient import patient_peer
 
 from multidrop.cli import main
-from multidrop.core import Peer
 from multidrop.transport import exchange as exchanges
 
 TESTS = Path(__file__).parent
-PATIENCE = 60.0  # s
 
 # A busy machine is slow, and nothing is wrong with it.
 settings.register_profile(
@@ -34,8 +33,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Three for each processor: many tests wait for a line; 12 at most, for each worker collects all."""
-    return min(3 * len(os.sched_getaffinity(0)), 12)
+    """Two for each processor and one: many tests wait for a line; 12 at most, for each collects all."""
+    return min(2 * len(os.sched_getaffinity(0)) + 1, 12)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -100,28 +99,21 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--kills", type=int, default=8, help="how many clients test_crash.py kills")
+    parser.addoption("--kills", type=int, default=5, help="how many clients test_crash.py kills")
 
 
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for every drive however busy the machine is; not for tests in which one is silent."""
-    _wait_for_drives(monkeypatch)
+    monkeypatch.setattr(exchanges, "Peer", patient_peer)
 
 
 @pytest.fixture(scope="module")
 def _patient_module() -> Iterator[None]:
     """Do the same for a line that a module's tests share."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        _wait_for_drives(monkeypatch)
+        monkeypatch.setattr(exchanges, "Peer", patient_peer)
         yield
-
-
-def _wait_for_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    def peer(*, interval: float, **timeouts: float) -> Peer:
-        return Peer(interval=interval, **{name: max(one, PATIENCE) for name, one in timeouts.items()})
-
-    monkeypatch.setattr(exchanges, "Peer", peer)
 
 
 @pytest.fixture

@@ -61,6 +61,7 @@ def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
             assert packet["modbus.request_frame"] == str(number)
 
 
+@pytest.mark.long
 def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
     bad = next(each for each in PRINTED if each.verdict == "bad checksum")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
@@ -68,6 +69,7 @@ def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
     assert tshark(tmp_path / "a.pcapng")[0]["mbrtu.crc16.status"] == "0"
 
 
+@pytest.mark.long
 def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> None:
     packets = tshark(write(tmp_path / "a.pcapng", TEXT))
     frames = [frame.hex() for each in TEXT for frame in (each.request_frame, each.frame)]

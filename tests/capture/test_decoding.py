@@ -9,6 +9,7 @@ from pathlib import Path
 import checksums
 import pytest
 from captures import BEGIN, RTU, STEP, TEXT, rows, write
+from examples import usually
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, Side
 from multidrop.core import (
@@ -108,17 +109,20 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
 
 
 def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> None:
-    """Every register of one table, and then of another."""
+    """Every register of one table, and then some of another."""
+    ends = {3: 65500, 4: 10_000}
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
-        for function in (3, 4):
-            for start in range(0, 65500, 100):
+        for function, end in ends.items():
+            for start in range(0, end, 100):
                 asked = Message(1, function, start, 100)
                 reply = Message(1, function, start, 100, struct.pack(">100H", *range(start, start + 100)))
                 capture.write(build_request(Framing.RTU, asked), Side.ASKING, start, "hall-1")
                 capture.write(build_reply(Framing.RTU, reply), Side.ANSWERING, start + 1, "hall-1")
     found = rows(tmp_path / "a.pcapng")
     assert [(row.register, row.value) for row in found] == [
-        (f"{table}_register_{at}", at) for table in ("holding", "input") for at in range(65500)
+        (f"{table}_register_{at}", at)
+        for table, end in zip(("holding", "input"), ends.values(), strict=True)
+        for at in range(end)
     ]
 
 
@@ -132,7 +136,7 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
     return path
 
 
-@pytest.mark.parametrize(("data", "end"), [(b"\0\7", (7, "ok")), (b"", (None, "no reply"))])
+@pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
 def test_more_requests_than_are_remembered_are_decoded_all_the_same(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:

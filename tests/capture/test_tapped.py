@@ -213,6 +213,7 @@ def test_noise_echo_damage_and_late_replies_are_told_as_the_poll_took_them(
     check(rows, decoded)
 
 
+@pytest.mark.long
 def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Path) -> None:
     frame = bytes.fromhex("01 03 02 13 88 B5 13")
     with CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as capture:

@@ -24,7 +24,9 @@ from taps import tapped
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.capture.pairing import Pairing
+from multidrop.cli.sniff import command
 from multidrop.cli.sniff.listener import Listener
+from multidrop.cli.support.traffic import TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
 from multidrop.drive.timing import Settings
 from multidrop.drives.delixi_native import DelixiNative
@@ -119,6 +121,31 @@ def test_a_request_that_nobody_answers_is_told_while_the_line_is_silent() -> Non
     assert sniffer.summary["unanswered"] == 1
     os.close(master)
     os.close(slave)
+
+
+def test_bytes_that_came_while_the_machine_was_busy_are_no_silence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The listener had to wait for a processor before it had the request; the reply comes next."""
+    now = 0.0
+
+    class Listening:
+        port, stream = "line", Stream()
+
+        def receive(self) -> int:
+            """A request after 2 s, nothing for 0.05 s, and its reply."""
+            nonlocal now
+            said, seconds = next(coming, (b"", 1.0))
+            now += seconds
+            self.stream.put(said, round(now * 1e9))
+            return len(said)
+
+    coming = iter([(READ.request_frame, 2.0), (b"", 0.05), (READ.frame, 0.05)])
+    monkeypatch.setattr(command.time, "monotonic", lambda: now)
+    printer = TrafficPrinter("line", None, as_json=True, out=None)
+    command._listen(Listening(), printer, 3.0)  # type: ignore[arg-type]
+    assert printer.pairing.counts()["exchanges"] == 1
+    assert printer.pairing.counts()["unanswered"] == 0
 
 
 # ---- behind a network ----

@@ -430,6 +430,7 @@ def test_it_runs_on_a_terminal_and_leaves_it_as_it_was(plant: Path) -> None:
         assert termios.tcgetattr(terminal.slave) == terminal.before
 
 
+@pytest.mark.long
 def test_each_picture_is_drawn_over_the_last_one(plant: Path) -> None:
     """Not below it: a screen that scrolls is never still, and shows parts of two pictures."""
     with on_terminal("monitor", plant) as terminal:
@@ -455,6 +456,7 @@ def test_a_stop_is_carried_out_and_told(plant: Path) -> None:
         terminal.wait_for("the stop is repeated for 30 s at least: pump-9")
 
 
+@pytest.mark.long
 def test_the_page_says_why_what_is_not_polled_is_not_known(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
@@ -501,6 +503,7 @@ def test_without_colour_and_without_utf_8_it_is_complete(plant: Path) -> None:
         assert terminal.written.isascii()
 
 
+@pytest.mark.long
 def test_where_the_cursor_cannot_go_back_it_scrolls(plant: Path) -> None:
     with on_terminal("monitor", plant, TERM="dumb") as terminal:
         terminal.wait_for(">pump-1")

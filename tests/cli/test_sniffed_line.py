@@ -102,7 +102,7 @@ def mastered(hear: Callable[[bytes], bytes] = bytes) -> tuple[list[Said], list[d
     with (
         simulator,
         tapped(simulator.wires[0].path, BAUDRATE, hear) as (port, tap),
-        sniffing(tap, *TO_HEAR) as sniffer,
+        sniffing(tap, *TO_HEAR, patient=True) as sniffer,
     ):
         while len(said) < EXCHANGES:
             said += chance.choice(MASTERS)(port, chance)

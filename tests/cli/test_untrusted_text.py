@@ -169,7 +169,7 @@ def test_commands_print_through_what_spells_out() -> None:
     assert found == ours
 
 
-@pytest.mark.parametrize("command", ["plan", "poll"])
+@pytest.mark.parametrize("command", usually("poll", "plan"))
 def test_a_plant_file_that_runs_a_file_says_so_once(tmp_path: Path, command: str) -> None:
     """In a process of its own, as a file is run once in each."""
     (tmp_path / "fan.py").write_text(

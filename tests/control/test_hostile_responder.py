@@ -29,7 +29,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 
 SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))
-FRAMES = 150  # that the far end hears
+FRAMES = 80  # that the far end hears
 STRANGER = 99  # no drive of ours has this address
 MOTOR = "yd1000"
 REGISTERS = 5  # of each drive

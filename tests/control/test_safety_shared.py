@@ -116,7 +116,8 @@ class Stranger:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", usually(*RTU_FAMILIES))
+@pytest.mark.long
+@pytest.mark.parametrize("model", RTU_FAMILIES)
 def test_starts_and_stops_while_another_client_talks(model: str) -> None:
     with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)

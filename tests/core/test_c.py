@@ -1,28 +1,44 @@
 """The C core's own test programs, built by the system's compiler with its sanitizers, and run."""
 
+import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from c_programs import ROOT, SANITIZERS, build_and_run
 from examples import usually
 
 
+@pytest.fixture
+def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
+    """Build and run the program of that name; all workers keep what they compiled in one folder."""
+    shared = tmp_path_factory.getbasetemp()
+    shared = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "objects"
+    shared.mkdir(exist_ok=True)
+
+    def build(name: str, *core: str, **options: Any) -> None:
+        build_and_run(tmp_path / name, *core, objects=shared, **options)
+
+    return build
+
+
 @pytest.mark.slow
-def test_core(tmp_path: Path) -> None:
+def test_core(build: Callable[..., None]) -> None:
     line = ("line", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
     core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
-    build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
+    build("test_core", *core, arguments=["tests/data/frames.csv"])
 
 
 @pytest.mark.slow
-def test_rows(tmp_path: Path) -> None:
-    build_and_run(tmp_path / "test_rows", "columns", "tap", "body", "frame", "checksum", "reason")
+def test_rows(build: Callable[..., None]) -> None:
+    build("test_rows", "columns", "tap", "body", "frame", "checksum", "reason")
 
 
 @pytest.mark.slow
-def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
-    build_and_run(tmp_path / "test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
+def test_the_time_of_day_is_asked_for_again_and_again(build: Callable[..., None]) -> None:
+    build("test_row_queue", "row_queue", "columns", "body", "frame", "checksum", "reason")
 
 
 @pytest.mark.slow
@@ -30,28 +46,28 @@ def test_the_time_of_day_is_asked_for_again_and_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "sanitizers", usually(["-fsanitize=thread"], [*SANITIZERS]), ids=["threads", "memory"]
 )
-def test_ports_come_and_go_on_threads_of_their_own(tmp_path: Path, sanitizers: list[str]) -> None:
+def test_ports_come_and_go_on_threads_of_their_own(build: Callable[..., None], sanitizers: list[str]) -> None:
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
-    build_and_run(tmp_path / "test_engine", *core, sanitizers=sanitizers)
+    build("test_engine", *core, sanitizers=sanitizers)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_a_client_that_is_back_soon_wakes_nobody(tmp_path: Path) -> None:
+def test_a_client_that_is_back_soon_wakes_nobody(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "wakeup")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build_and_run(tmp_path / "test_wakings", *core)
+    build("test_wakings", *core)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_a_port_is_read_once_for_an_exchange(tmp_path: Path) -> None:
+def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None:
     replaced = ("waiter_poll", "port_io")
     core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build_and_run(tmp_path / "test_looks", *core)
+    build("test_looks", *core)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
-def test_no_wait_is_rounded(tmp_path: Path, program: str) -> None:
-    build_and_run(tmp_path / program, "waiter_epoll")
+def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:
+    build(program, "waiter_epoll")

@@ -82,6 +82,7 @@ def scraping(folder: Path, jobs: str) -> Iterator[Prometheus]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Path) -> None:
     with served(tmp_path, '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n') as gateway:
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])

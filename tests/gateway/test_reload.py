@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -42,11 +43,11 @@ class Rows:
     """A part that keeps the rows of a line's drives."""
 
     def __init__(self) -> None:
-        self.found: list[tuple[str, str, str]] = []  # drive, register, status
+        self.found: list[tuple[str, str, int]] = []  # drive, status, when it was asked
         self.adopted: list[Plant] = []
 
     def take(self, batch: Batch) -> None:
-        self.found += [(row.drive, row.register, str(row.status)) for row in batch]
+        self.found += [(row.drive, str(row.status), row.monotonic_ns) for row in batch]
 
     def adopt(self, plant: Plant) -> None:
         self.adopted.append(plant)
@@ -129,6 +130,7 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         (pump,) = gateway.gateway.plant.lines[0].drives
         gateway.sims["fan-1"].deaf_until = float("inf")
         gateway.await_state("fan-1", "silent")
+        until(lambda: [one for one in gateway.frame()["alarms"] if one["drive"] == "fan-1"])
         edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
         assert reload(gateway)["done"] is True
         gateway.sims["fan-1"].deaf_until = 0.0
@@ -141,12 +143,16 @@ def test_drives_come_and_go_and_a_line_that_is_the_same_goes_on(tmp_path: Path) 
         assert names == ["pump-1", "fan-2"]
         assert rows.adopted == [gateway.gateway.plant]
         assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
-        after = len(rows.found)
-        until(lambda: [row[0] for row in rows.found[after:]].count("pump-1") > 40)
-        statuses = {status for drive, _, status in rows.found if drive == "pump-1"}
+        adopted_ns = time.monotonic_ns()  # rows of before may still come
+
+        def later() -> list[str]:
+            return [drive for drive, _, at_ns in rows.found if at_ns > adopted_ns]
+
+        until(lambda: later().count("pump-1") > 12)
+        statuses = {status for drive, status, _ in rows.found if drive == "pump-1"}
         assert "ok" in statuses
         assert statuses <= {"ok", *HOST_LATE}
-        assert "fan-1" not in {drive for drive, _, _ in rows.found[after:]}
+        assert "fan-1" not in later()
         told = gateway.post("/api/stop").json
         assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "fan-2": True}
         until(lambda: gateway.gateway.lately.line("roof")["rate"])

@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
-from examples import usually
 from gateways import certificate, get, served, serving, simulated_plant, written
 from lines import PATIENCE, until
 
@@ -196,8 +195,9 @@ def test_mistaken_calls(run: Run, words: tuple[str, ...], sentence: str) -> None
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
+@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize("words", usually(["demo", "--web"], ["serve", "--demo"]))
+@pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
 def test_the_demo_is_live_and_everybody_here_may_stop_it(words: list[str]) -> None:
     with subprocess.Popen([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         try:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import patient
 import pytest
 from lines import PATIENCE
 
@@ -21,7 +22,7 @@ PAGES = "\n".join(page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.m
 def run(directory: Path, name: str, *words: str) -> str:
     """Return what an example prints."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", str(EXAMPLES / name), *words],
+        [sys.executable, "-W", "error", patient.__file__, str(EXAMPLES / name), *words],
         cwd=directory,
         env={**os.environ, "XDG_STATE_HOME": str(directory / "state")},
         capture_output=True,

@@ -176,6 +176,7 @@ def master(request: pytest.FixtureRequest, rig: Rig, tmp_path: Path) -> Iterator
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_all_words_are_the_drives_own(rig: Rig, master: Master) -> None:
     before = rig.server.answered.copy()
     asked = chunks(rig)

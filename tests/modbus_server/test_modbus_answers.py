@@ -89,7 +89,7 @@ def test_what_is_not_fresh_is_asked_of_the_drive(gateway: Gateway, why: str) -> 
     if why == "a miss":
         gateway.hub.values[key] = None
     elif why == "old":
-        gateway.hub.ages[key] = 1.5
+        gateway.hub.ages[key] = 60.0
     else:
         del gateway.hub.values[key]
     with gateway.client() as client:

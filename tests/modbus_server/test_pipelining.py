@@ -107,8 +107,8 @@ def all_clients(gateway: Gateway, requests: int) -> None:
     assert sum(passed) > 10  # answers came out of order too
 
 
-def test_twenty_thousand_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
-    all_clients(gateway, 20_000)
+def test_thousands_of_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
+    all_clients(gateway, 8_000)
 
 
 @pytest.mark.long

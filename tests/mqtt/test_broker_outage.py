@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import pytest
 from brokers import Broker, Listener, mosquitto
+from examples import usually
 from gateways import Served, plant_text, running, tokens
 from lines import HOST_LATE, until
 from peers import require_module
@@ -97,7 +98,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["frozen", "gone"])
+@pytest.mark.parametrize("kind", usually("gone", "frozen"))
 def test_nothing_of_the_polling_changes_and_what_was_dropped_is_counted(tmp_path: Path, kind: str) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, gateway_of(tmp_path, broker) as (gateway, slots):

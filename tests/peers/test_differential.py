@@ -59,6 +59,7 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Libmodbus:
     return Libmodbus(built)
 
 
+@pytest.mark.long
 def test_requests_as_libmodbus_s_server_understands_them(libmodbus: Libmodbus) -> None:
     """It answers, and changes its registers, as our reading of the request demands."""
     requests = frames(1, RTU, NUMBER, replies=False)

@@ -414,7 +414,7 @@ def test_a_hundred_adoptions_leave_nothing_behind(both: TwoLines) -> None:
             gc.collect()
             tracemalloc.start()
             before = tracemalloc.take_snapshot()
-            for number in range(examples(96)):
+            for number in range(examples(40)):
                 adopt_some(number)
             gc.collect()
             grown = tracemalloc.take_snapshot().compare_to(before, "filename")

@@ -64,9 +64,9 @@ def test_a_drive_is_added_and_removed_while_the_others_are_polled(port: str, eve
             poller.remove("line", "pump-2")
             assert "pump-2" not in poller.summary()["lines"]["line"]["drives"]
             first = len(seen.of("pump-1"))
-            until(lambda first=first: len(seen.of("pump-1")) > first + 20)
+            until(lambda first=first: len(seen.of("pump-1")) > first + 8)
             after = len(seen.of("pump-2"))
-            until(lambda first=first: len(seen.of("pump-1")) > first + 40)
+            until(lambda first=first: len(seen.of("pump-1")) > first + 16)
             assert len(seen.of("pump-2")) == after
     assert {*seen.of("pump-1")} == {proof(Toy(1), CURRENT)}
     assert {*seen.of("pump-2")} == {proof(Toy(2), CURRENT)}

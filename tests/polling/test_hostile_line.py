@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
+from examples import usually
 from leftovers import descriptors, threads
 from lines import polled, rows_of
 from stories import HEALTHY, Story
@@ -105,7 +106,7 @@ def test_a_delixi_parameter_is_no_echo_of_its_query(register: str, echo: int) ->
     assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", usually(*KINDS))
 def test_a_fault_while_the_core_repeats_the_bus_cycle(kind: str) -> None:
     """Nothing is polled at a rate: that goes without the poller's thread until something fails."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)

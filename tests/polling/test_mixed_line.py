@@ -15,10 +15,10 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Wire
 
-REAL_SECONDS = 6.0
+REAL_SECONDS = 4.0
 EVERY = 1.0  # s, of what is polled at a rate
 
-FAST_SECONDS = 3.0
+FAST_SECONDS = 2.0
 
 
 class UnreliableWire(LateWire):

@@ -143,7 +143,7 @@ def test_memory_is_bounded_over_many_rates() -> None:
             made.poller.set_rate("pump-1", "fault", 0.1 + number / 1000)
             made.run(0.05)
         before = kept()
-        for number in range(300):
+        for number in range(100):
             made.poller.set_rate("pump-1", "fault", 0.2 + number / 1000)
             made.poller.set_rate("pump-1", "status", None if number % 2 else 0.3)
             made.run(0.01)

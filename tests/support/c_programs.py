@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import random
 import shutil
 import subprocess
 from collections.abc import Sequence
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+OPTIONS = ["-std=c11", "-D_DEFAULT_SOURCE"]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 CC = os.environ.get("CC", "cc")
@@ -18,27 +21,42 @@ SKIPPED = 77  # the exit status of a test program that cannot test anything here
 
 
 def build_and_run(
-    program: Path, *core: str, arguments: Sequence[str] = (), sanitizers: Sequence[str] = SANITIZERS
+    program: Path,
+    *core: str,
+    objects: Path,
+    arguments: Sequence[str] = (),
+    sanitizers: Sequence[str] = SANITIZERS,
 ) -> None:
-    """The test program of that name, with these parts of the core."""
+    """Build the test program of that name with these parts of the core, and run it.
+
+    `objects` keeps what was compiled, for all programs of all workers.
+    """
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
-    build = [
-        CC,
-        "-std=c11",
-        "-D_DEFAULT_SOURCE",
-        "-g",
-        "-O0",  # compiled in half the time; .ci/run has it otherwise too
-        *STRICT,
-        *sanitizers,
-        "-Icsrc",
-        f"tests/c/{program.name}.c",
-        *(f"csrc/{name}.c" for name in core),
-        "-lm",
-    ]
-    built = subprocess.run([*build, "-o", program], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr
+    sources = [f"csrc/{name}.c" for name in core]
+    random.shuffle(sources)  # workers that begin at once compile different ones first
+    parts = [compiled(source, objects, sanitizers) for source in (f"tests/c/{program.name}.c", *sources)]
+    _run([CC, *sanitizers, *parts, "-lm", "-o", program])
     run = subprocess.run([program, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
     if run.returncode == SKIPPED:
         pytest.skip(run.stdout.strip())
     assert run.returncode == 0, run.stdout + run.stderr
+
+
+def compiled(source: str, objects: Path, sanitizers: Sequence[str]) -> Path:
+    """Return the object of a source. Whoever asks for it while another compiles it waits for that one."""
+    name = f"{Path(source).stem}{''.join(sanitizers)}".translate({ord(","): "-", ord("="): "-"})
+    made = objects / f"{name}.o"
+    with (objects / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            half = made.with_suffix(".half")
+            # -O0 is compiled in half the time; .ci/run has it otherwise too
+            _run([CC, *OPTIONS, "-g", "-O0", *STRICT, *sanitizers, "-Icsrc", "-c", source, "-o", half])
+            half.rename(made)
+    return made
+
+
+def _run(command: Sequence[str | Path]) -> None:
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr

@@ -90,12 +90,15 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """A plant of drives, each with the name of its line, all of whose readable registers are polled."""
+    """A plant of drives, each with the name of its line, that polls all readable registers without a rate.
+
+    What rates come to is reckoned for each server that is made, and would take most of a short test.
+    """
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:
         registers = [register for register in drive.registers.values() if register.readable and polled]
         lines.setdefault(line, []).append(
-            PolledDrive(drive, tuple(Polled(register, 0.1) for register in registers))
+            PolledDrive(drive, tuple(Polled(register, None) for register in registers))
         )
     made = [PlantLine(name, f"/dev/{name}", None, None, tuple(found)) for name, found in lines.items()]
     return Plant(tuple(made), Path("plant.toml"))

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import array
+import fcntl
 import json
+import os
 import signal
 import subprocess
+import sys
+import termios
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from commands import MULTIDROP
+from lines import until
 
 
 class Sniffer:
@@ -29,9 +35,20 @@ class Sniffer:
         return dict(self.told[-1]["summary"])
 
 
+# Where each request has its reply: on a busy machine that may come after the seconds that a master waits.
+PATIENT = """
+import sys
+from multidrop.cli import main
+from multidrop.cli.sniff import command
+command._SILENT_S = command._GIVEN_UP_S = float("inf")
+sys.exit(main())
+"""
+
+
 @contextmanager
-def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
-    command = [*MULTIDROP, "sniff", port, "--json", *map(str, words)]
+def sniffing(port: str, *words: object, patient: bool = False) -> Iterator[Sniffer]:
+    program = [sys.executable, "-c", PATIENT] if patient else MULTIDROP
+    command = [*program, "sniff", port, "--json", *map(str, words)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout is not None
@@ -43,7 +60,19 @@ def sniffing(port: str, *words: object) -> Iterator[Sniffer]:
         reader.start()
         try:
             yield sniffer
+            until(lambda: unread(port) == 0)
         finally:
             process.send_signal(signal.SIGINT)
             reader.join(timeout=60)
             process.kill()
+
+
+def unread(port: str) -> int:
+    """Return the number of bytes that wait for the listener."""
+    count = array.array("i", [0])
+    fd = os.open(port, os.O_RDWR | os.O_NOCTTY)
+    try:
+        fcntl.ioctl(fd, termios.FIONREAD, count)
+    finally:
+        os.close(fd)
+    return count[0]

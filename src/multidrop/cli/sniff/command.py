@@ -97,7 +97,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
             if seconds is not None and now - begun >= seconds:
                 break
             if listener.receive():
-                received_at = now
+                received_at = time.monotonic()  # not `now`: a busy machine may have let us wait for long
             listener.stream.end(now - received_at > _SILENT_S)
             printer.show(listener.stream)
             if now - received_at > _GIVEN_UP_S:
