@@ -26,7 +26,7 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
 
 @pytest.mark.slow
 def test_core(build: Callable[..., None]) -> None:
-    line = ("line", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
+    line = ("line", "listen", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
     core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 
@@ -71,3 +71,11 @@ def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:
     build(program, "waiter_epoll")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
+def test_nothing_is_sent_but_by_a_look_at_the_deadline(build: Callable[..., None]) -> None:
+    replaced = ("waiter_poll", "port_io", "mastership")
+    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    build("test_mastership", *core)
