@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
 from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
 
 import multidrop
@@ -31,11 +32,11 @@ FLOORS = [
     {"poller"},
     {"recording", "sim", "scan", "importers"},
     {"capture", "report", "history"},
-    {"gateway"},
+    {"gateway", "fleet"},
     {"cli"},
     {"__init__", "__main__"},
 ]
-TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "cli"}
+TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "fleet", "cli"}
 FILES_TOUCHING_THE_SYSTEM = {
     "core/fork.py",
     "control/eeprom_ledger.py",
@@ -50,6 +51,10 @@ FILES_TOUCHING_THE_SYSTEM = {
 }
 
 
+CLIENTS = {  # rooms that use public names alone, and the commands that import them
+    "gateway": {"cli/serve.py"},
+    "fleet": {"cli/fleet.py", "cli/hub.py"},
+}
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 
 
@@ -72,7 +77,7 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
-    if room(path) == "gateway":  # a client of the library: another test is about its imports
+    if room(path) in CLIENTS:  # another test is about their imports
         others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
@@ -122,26 +127,30 @@ def test_imports_for_types_alone_point_downwards_too() -> None:
     assert offenders(found) == {}
 
 
-def test_the_gateway_is_a_client_of_public_names_alone() -> None:
-    """So a daemon of one's own can do all that this one does."""
+@pytest.mark.parametrize("client", CLIENTS)
+def test_clients_use_public_names_alone(client: str) -> None:
+    """So a daemon of one's own can do all that these do."""
     found = {
         str(path.relative_to(PACKAGE)): {
-            name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name)
+            name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)
         }
         for path in FILES
-        if room(path) == "gateway"
+        if room(path) == client
     }
     assert found
     assert offenders(found) == {}
 
 
-def _is_public(name: str) -> bool:
-    return name.startswith("multidrop.gateway") or name.removeprefix("multidrop.") in multidrop.__all__
+def _is_public(name: str, client: str) -> bool:
+    return (
+        f"{name}.".startswith(f"multidrop.{client}.") or name.removeprefix("multidrop.") in multidrop.__all__
+    )
 
 
-def test_the_serve_command_alone_imports_the_gateway() -> None:
-    found = {str(path.relative_to(PACKAGE)) for path in FILES if "gateway" in rooms(_imported(path))}
-    assert {name for name in found if not name.startswith("gateway/")} == {"cli/serve.py"}
+@pytest.mark.parametrize("client", CLIENTS)
+def test_its_commands_alone_import_a_client(client: str) -> None:
+    found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
+    assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
 
 
 def test_no_test_imports_another_one() -> None:
