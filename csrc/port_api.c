@@ -82,6 +82,14 @@ int md_port_is_asking(struct md_port *port, const struct md_drive *drive)
     return is_asking;
 }
 
+int md_port_rs485(struct md_port *port, int mode)
+{
+    md_engine_enter(port->engine);
+    int failure = md_rs485_begin(port, mode);
+    md_engine_leave(port->engine);
+    return failure;
+}
+
 void md_port_tap(struct md_port *port, struct md_tap *tap)
 {
     md_engine_enter(port->engine);

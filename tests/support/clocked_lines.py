@@ -271,12 +271,12 @@ class ClockedOpener:
     def __init__(self, clocked: ClockedLines) -> None:
         self._clocked = clocked
 
-    def __call__(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
-        line = self.awaited(port, echo, ids)
+    def __call__(self, port: str, echo: object, ids: TransactionIds, rs485: object) -> ClockedLine:
+        line = self.awaited(port, echo, ids, rs485)
         line.reopen()
         return line
 
-    def awaited(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
+    def awaited(self, port: str, echo: object, ids: TransactionIds, rs485: object) -> ClockedLine:
         return ClockedLine(self._clocked, port, ids)
 
 

@@ -109,7 +109,8 @@ class LineSet:
         return self._bus(Bus.awaiting, line)
 
     def _bus(self, make: Callable[..., Bus], line: PlantLine) -> Bus:
-        return make(line.port, echo=line.echo, transaction=line.ids, ledger=self._ledger, audit=self._audit)
+        facts = {"echo": line.echo, "transaction": line.ids, "rs485": line.rs485}
+        return make(line.port, **facts, ledger=self._ledger, audit=self._audit)
 
     def add(self, declared: PlantLine, bus: Bus) -> PolledLine:
         """Make a line that is not polled yet. Raises ValueError where a drive cannot be on it."""
