@@ -79,7 +79,7 @@ static void close_ports(struct md_engine *engine)
 {
     for (unsigned i = engine->count; i-- > 0;) {
         struct md_port *port = engine->ports[i];
-        if (!port->is_closing)
+        if (!port->is_closing || port->rs485.is_sending) /* a stop that leaves must not be cut off */
             continue;
         if (!port->turn.progress.lost)
             md_waiter_remove(engine->waiter, port->fd);

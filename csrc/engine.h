@@ -6,6 +6,18 @@
 #include "turn.h"
 
 #include <pthread.h>
+#include <sys/types.h>
+
+/* The transceiver's direction. */
+struct md_rs485 {
+    int mode;        /* enum md_rs485_mode */
+    int tells_end;   /* the driver says when the last bit has left */
+    int is_sending;  /* RTS stands so that the transceiver sends */
+    int64_t sent_ns; /* the last bit has left by then, if the UART began at once */
+    int64_t look_ns; /* when to look whether it has */
+    int64_t empty_ns; /* nothing was queued any more; 0: not yet seen */
+    int64_t character_ns;
+};
 
 struct md_port {
     /* what the thread needs at every exchange */
@@ -19,6 +31,7 @@ struct md_port {
     const struct md_mastership *mastership; /* NULL: nobody else may be master here */
     int is_unheard;                         /* another one may have been since the last request */
     struct md_turn turn;
+    struct md_rs485 rs485;
 
     struct md_port *next; /* of those that wait to be opened */
     int is_opened, open_error, is_closing, is_closed;
@@ -53,6 +66,14 @@ void md_engine_await(struct md_engine *engine, const int *is_done); /* with the 
 int64_t md_port_receive(struct md_port *port); /* what has come; return when it was read */
 /* Carry on until there is nothing to do but wait; return what time it is then. */
 int64_t md_port_advance(struct md_port *port, int64_t now_ns);
+
+/* ---- port_rs485.c ---- */
+
+int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
+/* Write, with the transceiver sending from now on. */
+ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
+/* Let the transceiver receive again when the last bit has left; 0, or -errno: then the port is to be lost. */
+int md_rs485_look(struct md_port *port, int64_t now_ns);
 
 /* ---- ahead.c ---- */
 

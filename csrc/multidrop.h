@@ -92,6 +92,7 @@ enum md_refusal {
 /* Make the port raw with these settings, and read them back to find what it did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
+int md_port_keep_rts(int fd); /* leave RTS as it is when the port is closed */
 
 /* ---- clock.c: return a time ---- */
 
@@ -175,6 +176,14 @@ enum md_transactions {
     MD_IGNORED          /* MD_TCP through a gateway that replies with ids of its own */
 };
 
+/* The transceiver's direction: who switches it. */
+enum md_rs485_mode {
+    MD_RS485_OFF,     /* the adapter itself */
+    MD_RS485_KERNEL,  /* the driver, with polarity and delays as they are set up there */
+    MD_RS485_RTS_UP,  /* this port: RTS is on while a request leaves */
+    MD_RS485_RTS_DOWN /* this port: RTS is off then, and on else */
+};
+
 /* One request with all that is needed to carry it out; constant while in use. What every exchange needs comes
  * first: with many lines each cache line of it is read from memory. */
 struct md_exchange {
@@ -254,6 +263,8 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
 /* Send only while the mastership holds, which must outlive the port: looked at right before each write(2).
  * Where it has not held since the last request, and before the first one, the line is listened to. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
+/* Say who switches between sending and receiving, before anything is sent; return 0 or -errno. */
+int md_port_rs485(struct md_port *port, int mode);
 /* Put all that goes over the line into `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Begin nothing more of what is queued or repeated, but still urgent exchanges. Return 1 while one of the

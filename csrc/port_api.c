@@ -91,6 +91,14 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_leave(port->engine);
 }
 
+int md_port_rs485(struct md_port *port, int mode)
+{
+    md_engine_enter(port->engine);
+    int failure = md_rs485_begin(port, mode);
+    md_engine_leave(port->engine);
+    return failure;
+}
+
 void md_port_tap(struct md_port *port, struct md_tap *tap)
 {
     md_engine_enter(port->engine);

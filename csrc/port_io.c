@@ -50,7 +50,7 @@ int64_t md_port_receive(struct md_port *port)
 }
 
 /* Look whether this process may still send; 0: the request goes no further now. This stands right before
- * write(2), and nothing comes between. */
+ * write(2): nothing comes between but the switching of a transceiver that hangs on RTS. */
 static int may_send(struct md_port *port)
 {
     struct md_line *line = &port->turn.line;
@@ -73,7 +73,7 @@ static int send(struct md_port *port, int64_t begun_ns)
     struct md_line *line = &port->turn.line;
     if (port->mastership && !may_send(port))
         return 1;
-    ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
+    ssize_t written = md_rs485_write(port, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
     if (written > 0)
         md_line_sent(line, (size_t)written, begun_ns, done_ns - begun_ns > HELD_UP_NS ? done_ns : begun_ns);
@@ -166,12 +166,24 @@ static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
            md_line_silent_ns(&turn->line) - now_ns > MD_MOST_LATENESS;
 }
 
+/* Return when the transceiver's direction is to be looked at. */
+static int64_t direction_ns(const struct md_port *port)
+{
+    return port->rs485.is_sending ? port->rs485.look_ns : MD_NEVER;
+}
+
 int64_t md_port_advance(struct md_port *port, int64_t now_ns)
 {
     struct md_turn *turn = &port->turn;
     struct md_engine *engine = port->engine;
     int64_t wake_ns;
-    int want;
+    int want, failure = md_rs485_look(port, now_ns);
+    if (failure && !turn->progress.lost)
+        lose(port, -failure);
+    if (port->is_closing) { /* it is there but to let its last request leave */
+        engine->wakes[port->index] = direction_ns(port);
+        return now_ns;
+    }
     do
         want = md_turn_want(turn, &wake_ns, now_ns);
     while (act(port, want, &wake_ns, &now_ns));
@@ -190,6 +202,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns)
         watch(port, 1);
     int is_early = wake_ns != MD_NEVER && (port->is_blind || turn->whose == MD_NOBODYS) &&
                    (is_sent(port) || engine->count <= MOST_SPINNING);
-    engine->wakes[port->index] = wake_ns - (is_early ? engine->lateness_ns : 0);
+    wake_ns -= is_early ? engine->lateness_ns : 0;
+    engine->wakes[port->index] = sooner(wake_ns, direction_ns(port));
     return now_ns;
 }

@@ -22,12 +22,17 @@ static int get(int fd, attributes *now)
     return ioctl(fd, TCGETS2, now) ? -errno : 0;
 }
 
+static int put(int fd, const attributes *wanted)
+{
+    return ioctl(fd, TCSETS2, wanted) ? -errno : 0;
+}
+
 static int set(int fd, attributes *wanted, uint32_t baudrate)
 {
     wanted->c_cflag &= ~(tcflag_t)(CBAUD | CBAUD << IBSHIFT | CMSPAR);
     wanted->c_cflag |= BOTHER | BOTHER << IBSHIFT;
     wanted->c_ispeed = wanted->c_ospeed = baudrate;
-    return ioctl(fd, TCSETS2, wanted) ? -errno : 0;
+    return put(fd, wanted);
 }
 
 static uint32_t speed(const attributes *now)
@@ -43,11 +48,16 @@ static int get(int fd, attributes *now)
     return tcgetattr(fd, now) ? -errno : 0;
 }
 
+static int put(int fd, const attributes *wanted)
+{
+    return tcsetattr(fd, TCSANOW, wanted) && errno != EINVAL ? -errno : 0;
+}
+
 static int set(int fd, attributes *wanted, uint32_t baudrate)
 {
     if (cfsetispeed(wanted, baudrate) || cfsetospeed(wanted, baudrate))
         return -errno;
-    return tcsetattr(fd, TCSANOW, wanted) && errno != EINVAL ? -errno : 0;
+    return put(fd, wanted);
 }
 
 static uint32_t speed(const attributes *now)
@@ -84,6 +94,14 @@ int md_port_get(int fd, struct md_settings *settings)
     if (!failure)
         *settings = describe(&now);
     return failure;
+}
+
+int md_port_keep_rts(int fd)
+{
+    attributes port;
+    int failure = get(fd, &port);
+    port.c_cflag &= ~(tcflag_t)HUPCL;
+    return failure ? failure : put(fd, &port);
 }
 
 int md_port_set(int fd, const struct md_settings *settings)

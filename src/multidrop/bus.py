@@ -19,7 +19,7 @@ from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
-from multidrop.core import Echo, Mastership, Message, Peer, TransactionIds
+from multidrop.core import RS485, Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_own, check_own_text
@@ -40,6 +40,13 @@ EXPIRY = 1.0  # s
 _log = logging.getLogger("multidrop.bus")
 
 
+def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
+    """Return what a line is told of its port. Raises ValueError."""
+    switch = RS485(rs485)
+    switch.check_port(port)
+    return Echo(echo), TransactionIds(transaction), switch
+
+
 class Bus:
     """A line and the drives on it, which may differ in family, baud rate and format.
 
@@ -48,9 +55,10 @@ class Bus:
     of its own. `baudrate` and `format` replace the
     families' defaults for drives that are attached without their own, and `silence`, in s, the standard's
     t3.5 between frames, if all of them bear it. `echo` says that the adapter repeats what it sends: "on",
-    "off" (until it does), or "auto", to find out. Raises LineError when the port cannot be opened. Writes
-    that may wear an EEPROM are counted in `ledger`, a file that all processes share, and all writes are
-    noted in the file `audit`.
+    "off" (until it does), or "auto", to find out. `rs485` is who switches between sending and receiving where
+    the adapter does not: "kernel", the driver, or "rts-up" or "rts-down", the core, by RTS being on or off
+    while a request leaves. Raises LineError when the port cannot be opened. Writes that may wear an EEPROM
+    are counted in `ledger`, a file that all processes share, and all writes are noted in the file `audit`.
 
     A write is not sent when it is late by `expiry` seconds: since the verb was called, but for the time that
     its own reads may take. It is not sent either once a stop was called: that ends all that may move a motor
@@ -74,6 +82,7 @@ class Bus:
         silence: float | None = None,
         echo: str = "auto",
         transaction: str = "match",
+        rs485: str = "off",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = EXPIRY,
@@ -83,7 +92,8 @@ class Bus:
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
-        self._begin(Line(port, Echo(echo), TransactionIds(transaction), mastership), ledger, audit, expiry)
+        facts = _facts(port, echo, transaction, rs485)
+        self._begin(Line(port, *facts, mastership), ledger, audit, expiry)
 
     @classmethod
     def awaiting(
@@ -92,6 +102,7 @@ class Bus:
         *,
         echo: str = "auto",
         transaction: str = "match",
+        rs485: str = "off",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         mastership: Mastership | None = None,
@@ -99,8 +110,8 @@ class Bus:
         """Return a bus whose port is not there yet: the poller that has it opens it, and so do stops."""
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
-        line = Line.awaited(port, Echo(echo), TransactionIds(transaction), mastership)
-        bus._begin(line, ledger, audit, EXPIRY)
+        facts = _facts(port, echo, transaction, rs485)
+        bus._begin(Line.awaited(port, *facts, mastership), ledger, audit, EXPIRY)
         return bus
 
     def _begin(

@@ -14,7 +14,7 @@ from toy import Toy
 
 import multidrop.cli.scan
 from multidrop.cli.scan import sentence
-from multidrop.core import Framing
+from multidrop.core import RS485, Framing
 from multidrop.drive.timing import Settings
 from multidrop.drives.delixi_modbus import DelixiModbus
 from multidrop.drives.innovert_ibd import InnovertIBD
@@ -170,8 +170,9 @@ def test_what_is_doubtful_stands_in_comments(tmp_path: Path) -> None:
         Found(2, Settings(19200, "8N1"), Framing.ASCII, ("innovert-ibd",), 0.005),
     ]
     path = tmp_path / "found.toml"
-    path.write_text(plant_text('/dev/tty"S0', found, families))
+    path.write_text(plant_text('/dev/tty"S0', found, families, RS485.RTS_UP))
     (line,) = load_plant(path).lines
+    assert line.rs485 is RS485.RTS_UP
     assert line.port == '/dev/tty"S0'
     (polled,) = line.drives
     assert (polled.drive.address, polled.drive.model, str(polled.drive.settings)) == (

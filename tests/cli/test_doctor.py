@@ -36,7 +36,7 @@ from multidrop.cli.doctor.findings import (
     round_trip_finding,
     rs485_finding,
 )
-from multidrop.core import Completion, Failure, Framing, Message, build_reply
+from multidrop.core import RS485, Completion, Failure, Framing, Message, build_reply
 from multidrop.drive.timing import Settings
 from multidrop.drives.innovert_ibd import InnovertIBD
 from multidrop.drives.invt_che import InvtCHE
@@ -159,6 +159,17 @@ def test_a_long_latency_timer_is_to_be_changed(sysfs: Path) -> None:
             "the driver has none: the adapter itself must switch between sending and receiving",
             False,
         ),
+        (
+            rs485_finding(None, RS485.RTS_UP),
+            "rts-up: multidrop turns RTS on while a request leaves",
+            False,
+        ),
+        (
+            rs485_finding(RS485Mode(True, False), RS485.RTS_DOWN),
+            "rts-down: multidrop turns RTS off while a request leaves; the driver's own mode is on too",
+            True,
+        ),
+        (rs485_finding(RS485Mode(True, False), RS485.KERNEL), "on: the driver switches the direction", False),
         (rs485_finding(RS485Mode(False, False)), "the driver has it, and it is off", True),
         (rs485_finding(RS485Mode(True, False)), "on: the driver switches the direction", False),
         (
@@ -242,6 +253,18 @@ def test_on_a_socket_it_says_what_does_not_apply(run: Run, port: str) -> None:
     assert status == 0
     assert "is a TCP connection" in told
     assert "at the far end" in told
+
+
+def test_who_switches_the_transceiver_is_said_of_a_device_only(run: Run, port: str) -> None:
+    status, out, err = run("doctor", port, "--rs485", "rts-up")
+    assert (status, err) == (0, "")  # a pseudo-terminal has none, and goes without
+    for words, sentence in (
+        ((port, "--rs485", "on"), 'rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'),
+        (("tcp://10.0.0.7", "--rs485", "kernel"), "rs485 is a fact of serial devices"),
+    ):
+        status, out, err = run("doctor", *words)
+        assert (status, out) == (2, "")
+        assert sentence in err
 
 
 @pyserials_own

@@ -67,6 +67,11 @@ def test_a_port_is_read_once_for_an_exchange(build: Callable[..., None]) -> None
     build("test_looks", *core)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
+def test_a_transceiver_sends_until_the_last_bit_has_left(tmp_path: Path) -> None:
+    build_and_run(tmp_path / "test_rs485", "port_rs485")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(build: Callable[..., None], program: str) -> None:

@@ -234,8 +234,7 @@ def test_five_mistakes_in_one_file_are_all_reported_at_once(mistakes: Mistakes) 
         (
             "line = [3]",
             "line number 1: 3 is not a table with name, port, baudrate, format, silence, switching, echo, "
-            "transaction, "
-            "drive",
+            "rs485, transaction, drive",
         ),
         (
             HEAD,

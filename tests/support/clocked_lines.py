@@ -276,12 +276,16 @@ class ClockedOpener:
     def __init__(self, clocked: ClockedLines) -> None:
         self._clocked = clocked
 
-    def __call__(self, port: str, echo: object, ids: TransactionIds, mastership: None) -> ClockedLine:
-        line = self.awaited(port, echo, ids, mastership)
+    def __call__(
+        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
+    ) -> ClockedLine:
+        line = self.awaited(port, echo, ids, rs485, mastership)
         line.reopen()
         return line
 
-    def awaited(self, port: str, echo: object, ids: TransactionIds, mastership: None) -> ClockedLine:
+    def awaited(
+        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None
+    ) -> ClockedLine:
         return ClockedLine(self._clocked, port, ids)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import check_writable
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at
+from multidrop.cli.support.plants import add_line_arguments, add_rs485_argument, line_of, plant_at, rs485_at
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.drives import MODELS
@@ -53,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick", action="store_true", help="do not ask again for drives that answer later than usual"
     )
+    add_rs485_argument(parser)
     parser.add_argument("--out", metavar="PLANT.toml", type=Path, help="write a plant file of what is found")
     add_json_argument(parser)
 
@@ -60,14 +61,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if arguments.out:
         check_writable(arguments.out)
-    if plant := plant_at(arguments):
-        arguments.port = line_of(plant, arguments.name).port
+    plant = plant_at(arguments)
+    declared = line_of(plant, arguments.name) if plant else None
+    arguments.port = declared.port if declared else arguments.port
+    rs485 = rs485_at(arguments, declared)
     families = _families(arguments.model)
     planned = _planned(arguments, list(families.values()))
     found: list[Finding] = []
     finished = False
     begun = time.monotonic()
-    line = Line(arguments.port)
+    line = Line(arguments.port, rs485=rs485)
     try:
         found.extend(_shown(scan(line.carry_out, planned, list(families.values())), arguments.json))
         finished = True
@@ -79,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     drives = [finding for finding in found if isinstance(finding, Found)]
     written = None
     if arguments.out and any(drive.models for drive in drives):
-        arguments.out.write_text(plant_text(arguments.port, drives, families), "utf-8")
+        arguments.out.write_text(plant_text(arguments.port, drives, families, rs485), "utf-8")
         written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}

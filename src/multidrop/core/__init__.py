@@ -34,7 +34,15 @@ from multidrop.core.frame import (
 )
 from multidrop.core.latch import Latch, Permit
 from multidrop.core.mastership import Mastership, boottime_ns
-from multidrop.core.port import Echo, Port, TransactionIds, Transactions, now_ns, utc_minus_monotonic_ns
+from multidrop.core.port import (
+    RS485,
+    Echo,
+    Port,
+    TransactionIds,
+    Transactions,
+    now_ns,
+    utc_minus_monotonic_ns,
+)
 from multidrop.core.port_settings import (
     REFUSALS,
     CharacterFormat,
@@ -69,6 +77,7 @@ __all__ = [
     "MODBUS",
     "MOST_INVALID",
     "REFUSALS",
+    "RS485",
     "STATUSES",
     "STREAM_ROOM",
     "UNASKED",

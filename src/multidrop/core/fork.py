@@ -29,7 +29,8 @@ def _call_all() -> None:
         inherited.forked()
 
 
-os.register_at_fork(after_in_child=_call_all)
+if hasattr(os, "register_at_fork"):  # Windows knows no fork
+    os.register_at_fork(after_in_child=_call_all)
 
 
 def only_here(act: Callable[..., object]) -> Callable[..., None]:

@@ -33,6 +33,28 @@ class Echo(StrEnum):
         raise ValueError(f'echo {value!r} is none of "auto", "on" and "off"')
 
 
+class RS485(StrEnum):
+    """The switch between sending and receiving: who makes it, where the adapter does not by itself.
+
+    `KERNEL`: the driver's own RS-485 mode; `RTS_UP`: the core, RTS being on while a request leaves;
+    `RTS_DOWN`: RTS being off then.
+    """
+
+    OFF = "off"
+    KERNEL = "kernel"
+    RTS_UP = "rts-up"
+    RTS_DOWN = "rts-down"
+
+    @classmethod
+    def _missing_(cls, value: object) -> RS485:
+        raise ValueError(f'rs485 {value!r} is none of "off", "kernel", "rts-up" and "rts-down"')
+
+    def check_port(self, port: str) -> None:
+        """Raise ValueError for a port that cannot have it."""
+        if self is not RS485.OFF and "://" in port:
+            raise ValueError(f"rs485 is a fact of serial devices, and {port} is none; leave it out")
+
+
 class TransactionIds(StrEnum):
     """A gateway's transaction ids: its replies `MATCH` their requests, or it has ids of its own: `IGNORE`."""
 
@@ -53,6 +75,14 @@ class Transactions(IntEnum):
 
 
 _ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
+
+
+_SWITCHES = {
+    RS485.OFF: lib.MD_RS485_OFF,
+    RS485.KERNEL: lib.MD_RS485_KERNEL,
+    RS485.RTS_UP: lib.MD_RS485_RTS_UP,
+    RS485.RTS_DOWN: lib.MD_RS485_RTS_DOWN,
+}
 
 
 class _Engine:
@@ -127,6 +157,12 @@ class Port:
     def tell_echo(self, echo: Echo) -> None:
         """Say whether its adapter echoes."""
         lib.md_port_tell_echo(self.c, _ECHOES[echo])
+
+    def switch(self, rs485: RS485) -> None:
+        """Say who switches its transceiver, before anything is sent. OSError where the driver refuses."""
+        failure = lib.md_port_rs485(self.c, _SWITCHES[rs485])
+        if failure:
+            raise OSError(-failure, "the transceiver cannot be switched")
 
     def is_asking(self, peer: Peer) -> bool:
         """Return True while an exchange with this peer is queued, repeated, urgent or under way."""

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.core import Echo, TransactionIds
+from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.network import speaks_tcp
 from multidrop.drive.timing import Settings
@@ -51,6 +51,7 @@ _LINE = {
     "silence": Key(str, 'silence = "500 us"'),
     "switching": Key(str, 'switching = "2 ms"'),
     "echo": Key(str, 'echo = "auto"'),
+    "rs485": Key(str, 'rs485 = "kernel"'),
     "transaction": Key(str, 'transaction = "match"'),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
@@ -88,6 +89,8 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     }
     silence, switching = (duration_of(given, key, place) for key in ("silence", "switching"))
     echo = place.attempt(Echo, given.get("echo", "auto"))
+    rs485 = place.attempt(RS485, given.get("rs485", "off")) or RS485.OFF
+    place.attempt(rs485.check_port, port)
     ids = place.attempt(TransactionIds, given.get("transaction", "match"))
     if "transaction" in given and not speaks_tcp(port):
         place.wrong(f"transaction is a fact of tcp:// ports, and {port} is none; leave it out")
@@ -102,6 +105,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
         switching=switching or 0.0,
         echo=echo or Echo.AUTO,
         ids=ids or TransactionIds.MATCH,
+        rs485=rs485,
     )
 
 

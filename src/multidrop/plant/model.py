@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-from multidrop.core import Echo, TransactionIds
+from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.plant import metadata
@@ -60,6 +60,11 @@ class PlantLine:
     switching: float = 0.0  # s that the port takes to change them
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
+    rs485: RS485 = RS485.OFF
+
+    def at(self, port: str) -> PlantLine:
+        """Return the same line at another port; a network has no transceiver to switch."""
+        return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,7 @@ class Plant:
         """
         for name in ports:
             self.find_line(name)
-        lines = tuple(replace(line, port=ports.get(line.name, line.port)) for line in self.lines)
+        lines = tuple(line.at(ports.get(line.name, line.port)) for line in self.lines)
         owners: dict[str, str] = {}
         for line in lines:
             if line.port in owners:

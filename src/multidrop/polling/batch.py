@@ -16,7 +16,7 @@ from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
 from multidrop.core import STATUSES, Columns, Names, spell
-from multidrop.polling.table import ArrowTable
+from multidrop.polling.table import ArrowTable, nanoarrow
 from multidrop.polling.wide import WideRows
 
 _STATUSES = Names(STATUSES)
@@ -96,9 +96,7 @@ class Rows(ArrowTable):
         return self.arrow().__arrow_c_array__()
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
-        import nanoarrow
-
-        return nanoarrow.c_array_stream(self.arrow()).__arrow_c_stream__()
+        return nanoarrow().c_array_stream(self.arrow()).__arrow_c_stream__()
 
 
 class Batch(Rows):
@@ -168,8 +166,7 @@ class Batch(Rows):
 @cache
 def schema() -> Any:
     """Return the columns of every batch and of every recording."""
-    import nanoarrow as arrow
-
+    arrow = nanoarrow()
     return arrow.c_schema(
         arrow.struct(
             {
@@ -191,8 +188,7 @@ def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
 
     Raises ValueError or RuntimeError when the buffers are not those of so many rows.
     """
-    from nanoarrow import c_array_from_buffers
-
+    c_array_from_buffers = nanoarrow().c_array_from_buffers
     children = [
         c_array_from_buffers(kind, rows, buffers, validation_level="full")
         for kind, buffers in zip(schema().children, columns, strict=True)

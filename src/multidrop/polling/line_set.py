@@ -119,6 +119,7 @@ class LineSet:
             line.port,
             echo=line.echo,
             transaction=line.ids,
+            rs485=line.rs485,
             ledger=self._ledger,
             audit=self._audit,
             mastership=self._mastership,

@@ -32,6 +32,18 @@ class ArrowTable(ABC):
         return _library("polars", "polars", "to_polars").DataFrame(self)
 
 
+def nanoarrow() -> Any:
+    """Return the library that holds rows in Arrow's layout; ImportError where it is not installed."""
+    try:
+        return importlib.import_module("nanoarrow")
+    except ImportError as failure:
+        raise ImportError(
+            "rows in Arrow's layout, such as those of a recording that is read, need nanoarrow, which is not "
+            "installed: pip install nanoarrow",
+            name="nanoarrow",
+        ) from failure
+
+
 def _library(name: str, extra: str, method: str) -> Any:
     try:
         return importlib.import_module(name)

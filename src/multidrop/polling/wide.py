@@ -7,7 +7,7 @@ from array import array
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from multidrop.polling.table import ArrowTable
+from multidrop.polling.table import ArrowTable, nanoarrow
 
 if TYPE_CHECKING:
     from multidrop.polling.batch import Row
@@ -94,13 +94,10 @@ class WideRows(ArrowTable):
         return self._schema().__arrow_c_schema__()
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
-        import nanoarrow
-
-        return nanoarrow.c_array_stream(self._arrow()).__arrow_c_stream__()
+        return nanoarrow().c_array_stream(self._arrow()).__arrow_c_stream__()
 
     def _schema(self) -> Any:
-        import nanoarrow as arrow
-
+        arrow = nanoarrow()
         times = {
             "time": arrow.timestamp("ns", "UTC", nullable=False),
             "monotonic_ns": arrow.int64(nullable=False),
@@ -109,8 +106,7 @@ class WideRows(ArrowTable):
         return arrow.c_schema(arrow.struct({**times, **values}, nullable=False))
 
     def _arrow(self) -> Any:
-        from nanoarrow import c_array_from_buffers
-
+        c_array_from_buffers = nanoarrow().c_array_from_buffers
         ordered = sorted(self._times, key=lambda times: (times[1], times[0]))
         places = array("q", bytes(8 * len(ordered)))
         for place, times in enumerate(ordered):

@@ -122,9 +122,10 @@ class RecordingReader(ArrowTable):
         """Yield the rows, some thousands at a time. Raises ValueError where the file is damaged."""
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any:
+        layout = schema()  # says so where nanoarrow is missing
         from nanoarrow.c_array_stream import CArrayStream
 
-        return CArrayStream.from_c_arrays([rows.arrow() for rows in self], schema()).__arrow_c_stream__()
+        return CArrayStream.from_c_arrays([rows.arrow() for rows in self], layout).__arrow_c_stream__()
 
     def wide(self, *columns: str) -> WideRows:
         """Return a column for each `drive.register`, or for these alone, and a row for each time.

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.polling.batch import Rows, schema
+from multidrop.polling.table import nanoarrow
 from multidrop.recording.append_file import new_file
 from multidrop.recording.format import (
     METADATA_KEY,
@@ -103,8 +104,7 @@ class ParquetReader(RecordingReader):
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
 
     def __iter__(self) -> Iterator[Rows]:
-        from nanoarrow import c_array
-
+        c_array = nanoarrow().c_array
         rows = 0
         with self._open() as file:
             batches = file.iter_batches(GROUP_ROWS)  # not by groups: a damaged one may claim any size

@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 
-from multidrop.core import Framing
+from multidrop.core import RS485, Framing
 from multidrop.drive.family import Drive
 from multidrop.scan.identify import candidate
 from multidrop.scan.results import GUESS, Found
 
 
-def plant_text(port: str, found: Sequence[Found], families: Mapping[str, type[Drive]]) -> str:
+def plant_text(
+    port: str, found: Sequence[Found], families: Mapping[str, type[Drive]], rs485: RS485 = RS485.OFF
+) -> str:
     """Return the file's text; `families` by their model in a plant file.
 
     Raises ValueError where no drive of a known family was found.
     """
     names = {family.model or family.__name__: name for name, family in families.items()}
     taken: dict[int, str] = {}
-    tables = [f'[[line]]\nname = "line-1"\nport = {_text(port)}\n']
+    switch = f'rs485 = "{rs485}"\n' if rs485 is not RS485.OFF else ""
+    tables = [f'[[line]]\nname = "line-1"\nport = {_text(port)}\n{switch}']
     for device in sorted(found, key=lambda device: (not device.models, device.address)):
         address = device.address
         if not device.models:

@@ -25,6 +25,8 @@ class PtyPort:
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
+        if not hasattr(os, "openpty"):
+            raise OSError("this system has no pseudo-terminals: name ports such as socket://127.0.0.1:0")
         self._master, self._slave = os.openpty()
         self._simulated: SimulatedPort | None = None
         self._link = link

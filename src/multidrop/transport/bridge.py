@@ -5,15 +5,21 @@ from __future__ import annotations
 import socket
 import struct
 import sys
-import termios
 import threading
 import time
 from contextlib import suppress
 
 import serial
 
+try:
+    import termios
+except ImportError:  # Windows has none of its errors either
+    _terminal_error: type[Exception] = OSError
+else:
+    _terminal_error = termios.error
+
 # All exceptions with which a port can fail.
-PORT_FAILURES = (OSError, termios.error, serial.SerialException, ValueError, EOFError)
+PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
 # Both are shorter than WRITE_TIMEOUT: an outcome that a write's caller was given stays true.
 MOST_STALL_MS = 750  # of a network, after which it is sent nothing more

@@ -7,14 +7,22 @@ from __future__ import annotations
 
 import time
 
+from multidrop.core import now_ns as core_now_ns
 from multidrop.core import utc_minus_monotonic_ns
 
 sleep = time.sleep
 
+if hasattr(time, "clock_gettime_ns"):  # a call of Python's own costs less than one of the core
 
-def now_ns() -> int:
-    """Return the time of CLOCK_MONOTONIC in ns."""
-    return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    def now_ns() -> int:
+        """Return the time of CLOCK_MONOTONIC in ns."""
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+
+else:
+
+    def now_ns() -> int:
+        """Return the time of the core's clock in ns."""
+        return int(core_now_ns())
 
 
 def utc_ns() -> int:

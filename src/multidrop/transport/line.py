@@ -11,6 +11,7 @@ from contextlib import suppress
 import serial
 
 from multidrop.core import (
+    RS485,
     Completion,
     Echo,
     Exchange,
@@ -21,6 +22,7 @@ from multidrop.core import (
     Tap,
     TransactionIds,
     Transactions,
+    is_pseudo_terminal,
     must_take,
     refused_names,
 )
@@ -63,12 +65,18 @@ def _is_lost(core: Port, result: int) -> bool:
     return is_lost or (result == Failure.LATE_ANSWER_DUE and core.lost)
 
 
+def _refusal(rs485: RS485, failure: OSError) -> str:
+    """Return why a port cannot be polled: its driver refuses to switch the transceiver."""
+    what = "has no RS-485 mode" if rs485 is RS485.KERNEL else "does not switch RTS"
+    return f'the driver {what} ({os.strerror(failure.errno or 0)}), which rs485 = "{rs485}" needs'
+
+
 class Line:
     """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
 
     `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
-    requests' transaction ids unless `ids` says otherwise. Where it has a `mastership`, requests leave while
-    that holds. Every failure of the port is a LineError.
+    requests' transaction ids unless `ids` says otherwise. `rs485` is who switches the transceiver. Where it
+    has a `mastership`, requests leave while that holds. Every failure of the port is a LineError.
     """
 
     def __init__(
@@ -76,24 +84,35 @@ class Line:
         port: str,
         echo: Echo = Echo.AUTO,
         ids: TransactionIds = TransactionIds.MATCH,
+        rs485: RS485 = RS485.OFF,
         mastership: Mastership | None = None,
     ) -> None:
-        self._prepare(port, echo, ids, mastership)
+        self._prepare(port, echo, ids, rs485, mastership)
         self._open()
 
     @classmethod
-    def awaited(cls, port: str, echo: Echo, ids: TransactionIds, mastership: Mastership | None) -> Line:
+    def awaited(
+        cls,
+        port: str,
+        echo: Echo,
+        ids: TransactionIds,
+        rs485: RS485 = RS485.OFF,
+        mastership: Mastership | None = None,
+    ) -> Line:
         """Return a line whose port is not there yet: `regain` opens it."""
         line = cls.__new__(cls)
-        line._prepare(port, echo, ids, mastership)
+        line._prepare(port, echo, ids, rs485, mastership)
         return line
 
-    def _prepare(self, port: str, echo: Echo, ids: TransactionIds, mastership: Mastership | None) -> None:
+    def _prepare(
+        self, port: str, echo: Echo, ids: TransactionIds, rs485: RS485, mastership: Mastership | None
+    ) -> None:
         if mastership is not None:
             if not isinstance(mastership, Mastership):
                 raise TypeError(f"mastership takes a multidrop.Mastership, not {mastership!r}")
             check_fencible(port)
         self.port = port
+        self.rs485 = rs485
         self.mastership = mastership
         self.is_tcp = isinstance(port, str) and speaks_tcp(port)
         self.ids = ids
@@ -145,6 +164,7 @@ class Line:
             port.timeout = 0
             if isinstance(port, serial.Serial):
                 port.exclusive = True
+                port.rts = self.rs485 is not RS485.RTS_UP  # else the transceiver sends once it is open
             port.open()
             self.identity = identity_of(port, self.port)
             core = self._drive(port)
@@ -157,6 +177,9 @@ class Line:
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
         except NoSuchPort:
             raise
+        except LineError:
+            self._let_go()
+            raise
         except PORT_FAILURES as failure:
             self._let_go()
             raise LineError(self.port, reason_of(failure)) from failure
@@ -168,7 +191,8 @@ class Line:
         """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
             fd = port.fileno()
-            return Port(fd, must_take(os.ttyname(fd)), mastership=self.mastership)
+            opened = Port(fd, must_take(os.ttyname(fd)), mastership=self.mastership)
+            return self._switched(opened, os.ttyname(fd))
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
         if not is_bridged(port):
@@ -179,6 +203,16 @@ class Line:
             set_up(port, self._settings)
         self._bridge = Bridge(port)
         return Port(self._bridge.theirs.fileno(), _NO_SETTINGS)
+
+    def _switched(self, core: Port, device: str) -> Port:
+        """Have its transceiver switched; a pseudo-terminal has none, and goes without."""
+        try:
+            core.switch(self.rs485)
+        except OSError as failure:
+            if not is_pseudo_terminal(device):
+                core.close()
+                raise LineError(self.port, _refusal(self.rs485, failure)) from failure
+        return core
 
     def drop(self) -> None:
         """Carry out nothing more; what is queued and not yet sent never will be.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import struct
+import sys
 
 # struct serial_icounter_struct of linux/serial.h
 _TIOCGICOUNT = 0x545D
@@ -13,6 +13,10 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 def overruns(fd: int) -> int:
     """Return how many since the driver was loaded; OSError where it does not count them."""
+    if sys.platform != "linux":
+        raise OSError("Linux alone counts them")
+    import fcntl  # which Windows lacks
+
     counts = bytearray(_ICOUNTER.size)
     fcntl.ioctl(fd, _TIOCGICOUNT, counts)
     found = _ICOUNTER.unpack(counts)

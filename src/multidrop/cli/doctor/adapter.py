@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import errno
-import fcntl
 import struct
 import sys
 from dataclasses import dataclass
@@ -95,6 +94,8 @@ def _ask(fd: int, request: int, size: int) -> bytes | None:
     """Return the driver's answer to an ioctl; None where it does not know the request."""
     if sys.platform != "linux":
         return None
+    import fcntl  # which Windows lacks
+
     answer = bytearray(size)
     try:
         fcntl.ioctl(fd, request, answer)

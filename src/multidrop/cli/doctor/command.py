@@ -25,9 +25,17 @@ from multidrop.cli.doctor.findings import (
 from multidrop.cli.doctor.other_way import other_way_finding, unit_finding
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.plants import add_line_arguments, line_of, plant_at, usual_settings
+from multidrop.cli.support.plants import (
+    add_line_arguments,
+    add_rs485_argument,
+    line_of,
+    plant_at,
+    rs485_at,
+    usual_settings,
+)
 from multidrop.cli.support.values import wrapped
 from multidrop.core import (
+    RS485,
     Completion,
     Exchange,
     Framing,
@@ -67,13 +75,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--format", metavar="8N1", help="data bits, parity and stop bits; the same, or 8N1")
     parser.add_argument("--framing", metavar="rtu", help="of the drive, where the family has several")
+    add_rs485_argument(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = plant_at(arguments)
-    drive, settings = _of_plant(plant, arguments) if plant else _by_hand(arguments)
-    findings = list(_findings(arguments.port, drive, settings))
+    drive, settings, rs485 = _of_plant(plant, arguments) if plant else _by_hand(arguments)
+    findings = list(_findings(arguments.port, rs485, drive, settings))
     if arguments.json:
         records = [asdict(finding) for finding in findings]
         print_text(json.dumps({"port": arguments.port, "findings": records}, indent=2))
@@ -82,8 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 1 if any(finding.is_failure for finding in findings) else 0
 
 
-def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
-    """Return the drive to measure with, where one is named, and its or its line's settings.
+def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
+    """Return the drive to measure with, where one is named, its or its line's settings, and who switches.
 
     `port` is the line's port afterwards. Raises ValueError for what only a port by hand takes.
     """
@@ -94,15 +103,16 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> tuple[Drive | None
     if arguments.name is None or arguments.name in lines:
         line = line_of(plant, arguments.name)
         arguments.port = line.port
-        return None, usual_settings(line)
+        return None, usual_settings(line), rs485_at(arguments, line)
     line, drive = plant.find_drive(arguments.name)
     arguments.port = line.port
-    return drive, drive.settings
+    return drive, drive.settings, rs485_at(arguments, line)
 
 
-def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings]:
+def _by_hand(arguments: argparse.Namespace) -> tuple[Drive | None, Settings, RS485]:
     drive = _drive(arguments)
-    return drive, drive.settings if drive else _line_settings(arguments)
+    settings = drive.settings if drive else _line_settings(arguments)
+    return drive, settings, rs485_at(arguments, None)
 
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
@@ -125,14 +135,14 @@ def _line_settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _findings(port: str, drive: Drive | None, settings: Settings) -> Iterator[Finding]:
+def _findings(port: str, rs485: RS485, drive: Drive | None, settings: Settings) -> Iterator[Finding]:
     if "://" in port:
         yield from _remote(port)
     else:
-        yield from _local(port)
+        yield from _local(port, rs485)
     nobody = Message(NOBODY, 0x03, 0, 1)
-    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, settings)
-    measured = _round_trip(port, drive)
+    yield unit_finding(port, nobody, settings) if speaks_tcp(port) else _echo(port, rs485, settings)
+    measured = _round_trip(port, rs485, drive)
     yield measured
     if not other_port(port) or (drive and not measured.is_failure):
         return
@@ -161,15 +171,15 @@ def _remote(port: str) -> Iterator[Finding]:
     )
 
 
-def _local(port: str) -> Iterator[Finding]:
-    line = Line(port)  # raises LineError, with the reason, when it cannot be opened
+def _local(port: str, rs485: RS485) -> Iterator[Finding]:
+    line = Line(port, rs485=rs485)  # raises LineError, with the reason, when it cannot be opened
     try:
-        yield from _opened(port, str(Path(port).resolve()))
+        yield from _opened(port, str(Path(port).resolve()), rs485)
     finally:
         line.close()
 
 
-def _opened(port: str, device: str) -> Iterator[Finding]:
+def _opened(port: str, device: str, rs485: RS485) -> Iterator[Finding]:
     """Examine a port that multidrop has open."""
     link = f", which is {device}" if device != port else ""
     if is_pseudo_terminal(device):
@@ -187,7 +197,7 @@ def _opened(port: str, device: str) -> Iterator[Finding]:
     try:
         yield low_latency_finding(low_latency(fd))
         yield latency_finding(adapter)
-        yield rs485_finding(rs485_mode(fd))
+        yield rs485_finding(rs485_mode(fd), rs485)
     finally:
         os.close(fd)
 
@@ -195,7 +205,7 @@ def _opened(port: str, device: str) -> Iterator[Finding]:
 # ---- the line ----
 
 
-def _echo(port: str, settings: Settings) -> Finding:
+def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
     """Read from an address that nobody should have: only the request itself may come back."""
     request = Message(NOBODY, 0x03, 0, 1)
     peer = Peer(least_timeout=4 * LEAST_TIMEOUT, most_timeout=4 * LEAST_TIMEOUT)
@@ -208,7 +218,7 @@ def _echo(port: str, settings: Settings) -> Finding:
         character=settings.character,
         silence=max(settings.t3_5, LEAST_TIMEOUT),
     )
-    line = Line(port)
+    line = Line(port, rs485=rs485)
     try:
         found = line.carry_out(probe)
     except LineError as failure:
@@ -218,7 +228,7 @@ def _echo(port: str, settings: Settings) -> Finding:
     return echo_finding(found, build_request(Framing.RTU, request), settings)
 
 
-def _round_trip(port: str, drive: Drive | None) -> Finding:
+def _round_trip(port: str, rs485: RS485, drive: Drive | None) -> Finding:
     if drive is None:
         return Finding(
             "round trip",
@@ -226,7 +236,7 @@ def _round_trip(port: str, drive: Drive | None) -> Finding:
             "name one with --model and --address, or one of a plant file; `multidrop scan` finds those "
             "that are there",
         )
-    with Bus(port) as bus:
+    with Bus(port, rs485=rs485) as bus:
         bus.attach(drive)
         block = _first_reading(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from multidrop.cli.doctor.adapter import Adapter, RS485Mode
-from multidrop.core import Completion
+from multidrop.core import RS485, Completion
 from multidrop.drive.family import Drive
 from multidrop.drive.timing import Settings
 
 LATENCY_MS = 1  # a larger latency timer is worth changing
 ROUNDS = 20
 SLOW_S = 0.005  # a larger excess over a drive's usual response delay is reported
+
+
+_LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,14 @@ def low_latency_finding(low: bool | None) -> Finding:
     )
 
 
-def rs485_finding(mode: RS485Mode | None) -> Finding:
+def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
+    if switch in _LEVELS:
+        doubled = "; the driver's own mode is on too" if mode and mode.enabled else ""
+        return Finding(
+            "RS-485 mode",
+            f"{switch}: multidrop turns RTS {_LEVELS[switch]} while a request leaves{doubled}",
+            'two switch one direction: say rs485 = "kernel", or leave it out' if doubled else "",
+        )
     if mode is None:
         return Finding(
             "RS-485 mode", "the driver has none: the adapter itself must switch between sending and receiving"
@@ -63,7 +73,7 @@ def rs485_finding(mode: RS485Mode | None) -> Finding:
         return Finding(
             "RS-485 mode",
             "the driver has it, and it is off",
-            "if the transceiver hangs on RTS, switch it on in the device tree or with an RS-485 tool; "
+            'if the transceiver hangs on RTS, say rs485 = "kernel" in the plant file; '
             "an adapter that switches by itself needs nothing",
         )
     hears = ", and hears what it sends: multidrop takes the echo out" if mode.hears_itself else ""

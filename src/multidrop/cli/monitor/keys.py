@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import select
 import sys
-import termios
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -29,7 +27,15 @@ KEYS = {  # as terminals send them
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str]]:
-    """Give a function that waits so many seconds for a key, and returns its name or letter, or ""."""
+    """Give a function that waits so many seconds for a key, and returns its name or letter, or "".
+
+    Raises ValueError on Windows, whose consoles have no such mode.
+    """
+    if sys.platform == "win32":
+        raise ValueError("the live screen needs a terminal of Linux or macOS; `multidrop poll` works here")
+    import termios
+    import tty
+
     fd = sys.stdin.fileno()
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)

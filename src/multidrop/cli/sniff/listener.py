@@ -6,9 +6,9 @@ nothing is written to a socket, and an rfc2217 server gets the settings alone.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import select
+import sys
 import time
 from io import FileIO
 from typing import Any, NoReturn
@@ -25,6 +25,10 @@ _MOST = 4096  # bytes of one read
 
 def _open_device(port: str, settings: Settings) -> FileIO:
     """Open a device of this machine read-only, and lock and set it up."""
+    if sys.platform == "win32":
+        raise LineError(port, "on Windows only a socket:// can be listened to, and no serial device")
+    import fcntl
+
     fd = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from multidrop.core import RS485
 from multidrop.drive.timing import Settings
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
@@ -54,6 +55,27 @@ def add_line_arguments(parser: argparse.ArgumentParser, name: str = "LINE") -> N
     )
     parser.add_argument("name", metavar=name, nargs="?", help="of the plant file; its only line if not given")
     add_port_option(parser)
+
+
+def add_rs485_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --rs485, for a port by hand; `rs485_at` has its value."""
+    parser.add_argument(
+        "--rs485",
+        metavar="MODE",
+        help="who switches between sending and receiving, where the adapter does not by itself: "
+        "kernel, rts-up or rts-down",
+    )
+
+
+def rs485_at(arguments: argparse.Namespace, line: PlantLine | None) -> RS485:
+    """Return who switches the transceiver of this line, or of a port by hand. Raises ValueError."""
+    if line is None:
+        found = RS485(arguments.rs485 or "off")
+        found.check_port(arguments.port)
+        return found
+    if arguments.rs485 is not None:
+        raise ValueError("--rs485 is a matter of the plant file: write it into the line there")
+    return line.rs485
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from multidrop.bus import Bus
 from multidrop.cli.support.plants import add_port_option, is_plant, plant_of
-from multidrop.core import Echo
+from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drives.registry import find_model
 
@@ -26,12 +26,13 @@ class Target:
     drive: Drive
     port: str
     echo: Echo
+    rs485: RS485
     words: tuple[str, ...]
     model: str
 
     def open_bus(self, audit: Path | str | None = None) -> Bus:
         """Open the drive's line, with the drive alone on it. Raises LineError."""
-        bus = Bus(self.port, echo=self.echo, audit=audit)
+        bus = Bus(self.port, echo=self.echo, rs485=self.rs485, audit=audit)
         bus.attach(self.drive)
         return bus
 
@@ -112,7 +113,8 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
         raise _mistaken(arguments, f"name a drive of {path}: {drives}")
     line, drive = plant.find_drive(names[0])
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
-    return Target(drive, line.port, line.echo, (path, drive.name, *ports), shlex.join((path, drive.name)))
+    words = (path, drive.name, *ports)
+    return Target(drive, line.port, line.echo, line.rs485, words, shlex.join((path, drive.name)))
 
 
 def _by_hand(arguments: argparse.Namespace) -> Target:
@@ -128,7 +130,7 @@ def _by_hand(arguments: argparse.Namespace) -> Target:
     for name, value in settings.items():
         words += [] if value is None else [f"--{name}", str(value)]
     words += [f"--option={name}={value:g}" for name, value in arguments.option]
-    return Target(drive, port, Echo.AUTO, tuple(words), model)
+    return Target(drive, port, Echo.AUTO, RS485.OFF, tuple(words), model)
 
 
 def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:

@@ -1,0 +1,39 @@
+"""A machine for which there is no nanoarrow records all the same."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.ipc
+import pytest
+
+WITHOUT = "import sys; sys.modules['nanoarrow'] = None; from multidrop.cli import main; sys.exit(main())"
+
+
+def multidrop(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT, *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_it_polls_and_records(tmp_path: Path) -> None:
+    ran = multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    rows = pyarrow.ipc.open_stream(tmp_path / "run.arrows").read_all().num_rows
+    assert rows > 5
+    ran = multidrop("demo", "--seconds", "1", "--out", "run.csv", folder=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert len((tmp_path / "run.csv").read_text().splitlines()) > 5
+
+
+@pytest.mark.slow
+def test_what_reads_a_recording_says_what_is_missing(tmp_path: Path) -> None:
+    multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)
+    for words in (("report", "run.arrows"), ("convert", "run.arrows", "run.csv")):
+        ran = multidrop(*words, folder=tmp_path)
+        assert ran.returncode == 2
+        assert ran.stderr.startswith("multidrop: rows in Arrow's layout")
+        assert ran.stderr.count("\n") == 1
+    assert not (tmp_path / "run.csv").exists()

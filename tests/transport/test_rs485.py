@@ -1,0 +1,214 @@
+"""Lines whose transceiver is switched by RTS or by its driver, before a driver that notes what it is told.
+
+No RS-485 hardware is here: the driver is a library put before the system's, and the port a pseudo-terminal.
+tests/c/test_rs485.c has the times to the nanosecond, on a clock of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+
+import pytest
+from c_programs import CC, ROOT, STRICT
+from leftovers import descriptors, threads
+from lines import line, plant, polled
+from toy import Toy
+
+from multidrop.bus import Bus
+from multidrop.core import RS485
+from multidrop.errors import LineError
+from multidrop.plant.loader import PlantError, load_plant
+from multidrop.poller import Poller
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.transport import line as line_module
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
+CHARACTER_NS = 1_041_667  # of a toy: 9600 8N1
+ENABLED, ON_SEND, AFTER_SEND = 1, 2, 4  # linux/serial.h
+
+
+class Event(NamedTuple):
+    ns: int
+    what: str
+    count: int
+
+
+CLIENT = """
+import json, sys
+from toy import Toy
+from multidrop.bus import Bus
+from multidrop.core import Exchange, Framing, Message, Peer
+from multidrop.errors import BusError
+from multidrop.sim import Simulator, Wire, simulated
+from multidrop.transport import line as line_module
+
+line_module.is_pseudo_terminal = lambda device: False  # its driver is a UART's
+said = []
+with Simulator([Wire([simulated(Toy(1))])]) as sim:
+    try:
+        with Bus(sim.wires[0].path, rs485=sys.argv[1]) as bus:
+            toy = bus.attach(Toy, 1)
+            for _ in range(int(sys.argv[2])):
+                said.append(bus.read(toy, toy.output_current))
+            message = Message(0, 0x10, 0x15, 20, data=bytes(40))
+            peer = Peer(least_timeout=0.1, most_timeout=0.1)
+            settings = {"baudrate": 9600, "format": "8N1", "character": 10 / 9600, "silence": 0.004}
+            bus.line.carry_out(Exchange(Framing.RTU, message, peer, **settings))
+    except BusError as failure:
+        said.append(str(failure))
+print(json.dumps(said))
+"""
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if shutil.which(CC) is None:
+        pytest.skip(f"no C compiler ({CC})")
+    library = tmp_path_factory.mktemp("driver") / "rs485_driver.so"
+    source = ROOT / "tests/support/programs/rs485_driver.c"
+    subprocess.run([CC, "-std=c11", "-shared", "-fPIC", "-O1", *STRICT, "-o", library, source], check=True)
+    return library
+
+
+def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list[Any], list[Event]]:
+    """Return what a client read or was told, and what the driver was told."""
+    log = driver.with_name("log")
+    log.unlink(missing_ok=True)
+    log.touch()
+    settings = {"LD_PRELOAD": driver, "RS485_LOG": log, "RS485_CHARACTER_NS": CHARACTER_NS} | variables
+    paths = os.pathsep.join(map(str, [ROOT / "tests/support", os.environ.get("PYTHONPATH", "")]))
+    ran = subprocess.run(
+        [sys.executable, "-c", CLIENT, mode, str(reads)],
+        env=os.environ | {name: str(value) for name, value in settings.items()} | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    fields = [text.split() for text in log.read_text().splitlines()]
+    return json.loads(ran.stdout), [Event(int(ns), what, int(count)) for ns, what, count in fields]
+
+
+@pytest.mark.parametrize(
+    ("mode", "sending", "receiving"), [("rts-up", "up", "down"), ("rts-down", "down", "up")]
+)
+def test_rts_stands_for_sending_while_a_request_leaves_and_no_longer(
+    driver: Path, mode: str, sending: str, receiving: str
+) -> None:
+    read, events = play(driver, mode, 20)
+    assert len(read) == 20
+    writes = [at for at, event in enumerate(events) if event.what == "write"]
+    assert len(writes) >= 21
+    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # from its opening on
+    late = []
+    for at in writes:
+        before, write, after = events[at - 1 : at + 2]
+        assert (before.what, after.what) == (sending, receiving)
+        late.append(after.ns - write.ns - write.count * CHARACTER_NS)
+    assert min(late) >= 0
+    assert median(late) < 3.5 * CHARACTER_NS  # a busy machine may be late now and then
+    assert events[-1].what == receiving
+    assert events[-2].count == 49  # a broadcast: the port was closed at once, and waited for its last bit
+
+
+def test_the_driver_s_own_mode_is_switched_on_as_it_was_set_up(driver: Path) -> None:
+    for flags in (ON_SEND, AFTER_SEND):
+        read, events = play(driver, "kernel", 3, RS485_FLAGS=flags)
+        assert len(read) == 3
+        assert [event.count for event in events if event.what == "mode"] == [flags | ENABLED]
+    _, events = play(driver, "kernel", 1, RS485_FLAGS=0)
+    assert [event.count for event in events if event.what == "mode"] == [ON_SEND | ENABLED]
+
+
+def test_a_driver_that_refuses_is_told_of_in_a_sentence_and_nothing_is_sent(driver: Path) -> None:
+    for mode, variables, why in (
+        ("kernel", {}, "has no RS-485 mode (Inappropriate ioctl for device)"),
+        ("rts-up", {"RS485_CALLS": 0}, "does not switch RTS (Input/output error)"),
+    ):
+        (said,), events = play(driver, mode, 1, **variables)
+        assert said.endswith(f': the driver {why}, which rs485 = "{mode}" needs')
+        assert "write" not in [event.what for event in events]
+
+
+def test_rts_that_breaks_loses_the_port_and_nothing_more_is_sent(driver: Path) -> None:
+    said, events = play(driver, "rts-up", 9, RS485_CALLS=6)
+    assert said[-1].endswith("the port was lost (Input/output error)")
+    broken = [event.what for event in events].index("broken")
+    assert "write" in [event.what for event in events[:broken]]
+    assert "write" not in [event.what for event in events[broken:]]
+
+
+# ---- without that driver: a pseudo-terminal's has no RTS ----
+
+
+def test_a_poller_is_told_at_once_and_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_module, "is_pseudo_terminal", lambda device: False)
+    with Simulator([Wire([simulated(Toy(1))])]) as sim:
+        before = descriptors(), threads()
+        drive = polled(Toy(1), [Toy.output_current])
+        declared = replace(line(sim.wires[0].path, drive), rs485=RS485.RTS_UP)
+        with pytest.raises(LineError, match="the driver does not switch RTS"):
+            Poller(plant(declared))
+        assert (descriptors(), threads()) == before
+
+
+def test_a_pseudo_terminal_goes_without() -> None:
+    for mode in RS485:
+        with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path, rs485=mode) as bus:
+            toy = bus.attach(Toy, 1)
+            assert bus.read(toy, toy.output_current) is not None
+
+
+def test_the_word_is_one_of_four_and_the_port_a_device() -> None:
+    with pytest.raises(ValueError, match='rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'):
+        Bus("/dev/null", rs485="on")
+    with pytest.raises(ValueError, match="a fact of serial devices, and tcp://h is none; leave it out"):
+        Bus("tcp://h", rs485="kernel")
+
+
+PLANT = """
+[[line]]
+name = "hall"
+port = "{}"
+rs485 = {}
+[[line.drive]]
+name = "pump"
+model = "innovert-ibd"
+address = 1
+"""
+
+
+def test_a_plant_file_says_it_of_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT.format("/dev/ttyS0", '"rts-down"'))
+    loaded = load_plant(path)
+    assert loaded.lines[0].rs485 is RS485.RTS_DOWN
+    assert loaded.with_ports({"hall": "ports/hall"}).lines[0].rs485 is RS485.RTS_DOWN
+    assert loaded.with_ports({"hall": "socket://localhost:4001"}).lines[0].rs485 is RS485.OFF
+
+
+@pytest.mark.parametrize(
+    ("port", "value", "sentence"),
+    [
+        ("/dev/ttyS0", '"rts"', 'rs485 \'rts\' is none of "off", "kernel", "rts-up" and "rts-down"'),
+        ("/dev/ttyS0", "true", 'rs485 = "kernel"'),
+        ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is none; leave it out"),
+    ],
+)
+def test_what_no_line_can_be_told_is_one_mistake(
+    tmp_path: Path, port: str, value: str, sentence: str
+) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT.format(port, value))
+    with pytest.raises(PlantError) as wrong:
+        load_plant(path)
+    (mistake,) = wrong.value.mistakes
+    assert sentence in mistake
