@@ -12,10 +12,11 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #include "mastership.c"
 #undef clock_gettime
 #define write noted_write
+#include "port_rs485.c"
+#undef write
 #define send send_request /* it is static there, and of another type than the system's */
 #include "port_io.c"
 #undef send
-#undef write
 
 #include <assert.h>
 #include <fcntl.h>

@@ -59,7 +59,9 @@ def by_compiler(tree: Path, path: str) -> str | None:
 def by_test_frame(tree: Path, path: str) -> str | None:
     """The Python tests of frames and of a line; by_compiler has compiled the mutant for the module."""
     _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
-    return _pytest(tree, *(f"tests/core/test_{name}.py" for name in ("frame", "split", "learning", "line", "tcp")))
+    return _pytest(
+        tree, *(f"tests/core/test_{name}.py" for name in ("frame", "split", "learning", "line", "tcp"))
+    )
 
 
 def by_test_schedule(tree: Path, path: str) -> str | None:

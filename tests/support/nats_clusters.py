@@ -101,9 +101,10 @@ class Node:
 
     def is_healthy(self) -> bool:
         """Say whether its JetStream is ready, and in a cluster has a leader."""
-        with suppress(OSError), closing(
-            urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)
-        ) as answer:
+        with (
+            suppress(OSError),
+            closing(urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)) as answer,
+        ):
             return bool(answer.status == 200)
         return False
 

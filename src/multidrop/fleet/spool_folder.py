@@ -13,7 +13,6 @@ a new disk is a new log.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -65,6 +64,8 @@ class SpoolFolder:
             raise
 
     def _own(self, gateway: str, fleet: str) -> None:
+        import fcntl  # which Windows lacks
+
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
