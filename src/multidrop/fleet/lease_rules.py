@@ -32,6 +32,9 @@ class Terms(NamedTuple):
         return self.lease + self.guard
 
 
+USUAL = Terms()
+
+
 class Watched(NamedTuple):
     """A revision of a record, and when this observer saw it first (its own CLOCK_BOOTTIME, ns)."""
 

