@@ -73,6 +73,7 @@ class NotedMastership:
         self.until = 0
         self.ends = 0
         self.events: list[str] = []
+        self.lines: NotedLines | None = None
 
     def extend(self, until_ns: int) -> None:
         assert until_ns > self.clock(), "armed at a time that is past"
@@ -82,6 +83,9 @@ class NotedMastership:
             self.events.append("extend")
 
     def end(self) -> None:
+        assert self.lines is None or not self.lines.taken, (
+            "the timer is called off before the lines are closed"
+        )
         self.until = 0
         self.ends += 1
         self.events.append("end")
@@ -99,6 +103,7 @@ class NotedLines:
         self.mastership = mastership
         self.hall = hall
         self.taken: set[str] = set()
+        mastership.lines = self
 
     async def take(self, line: str, description: Any) -> None:
         self.hall.look(line, self)

@@ -7,8 +7,10 @@
     DRAINING  every line is given away and none is claimed.
 
 In every state: a line is polled only while its record names us and our present session, and while the lease
-is valid. Shortly before the lease runs out everything falls silent; then the kernel's timer is called off,
-and then the lines are closed. A session that is renewed before anybody has ended it goes on.
+is valid. Half a second before it runs out the lines are closed; when the last of them is, the kernel's timer
+is called off. (The engine sends nothing after the deadline, closed or not. Closing takes back what the system
+was given and could not send; so a process that stands still before that must die.) A session that is renewed
+before anybody has ended it goes on.
 """
 
 from __future__ import annotations
@@ -35,12 +37,13 @@ from multidrop.fleet.servers import Path
 
 _log = logging.getLogger("multidrop.fleet")
 
-SILENT_S = 0.1  # before the lease runs out
+SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
 GUARD_LOOK_S = 0.02
 STEP_S = 0.1
 FOLLOW_S = 0.2
 SETTLE_S = 3.0
 HOME_S = 1.0
+CANCEL_S = 0.2
 TAKE_AGAIN_S = 2.0  # after a line that could not be taken
 CLAIMS_AT_ONCE = 64
 LINES_AT_ONCE = 32
@@ -76,7 +79,7 @@ class Member:
         lock: LifeLock | None = None,
         terms: Terms = USUAL,
     ) -> None:
-        self.name = names.check_name("gateway", name)
+        self.name = names.checked_name("gateway", name)
         self.paths = paths
         self.lines = lines
         self.mastership = mastership
@@ -95,6 +98,7 @@ class Member:
         self._settled_at = 0
         self._looked: set[str] = set()  # buckets that were read at least once
         self._is_dirty = True
+        self._is_leaving = False
         self._stepped: tuple[bool, bool] | None = None
         self._releasing: set[str] = set()
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
@@ -116,6 +120,11 @@ class Member:
     @property
     def _is_settled(self) -> bool:
         return self.lease._clock() >= self._settled_at
+
+    @property
+    def _may_poll(self) -> bool:
+        """Say whether lines are taken and kept: there is a lease, and time to close them before it ends."""
+        return bool(self.lease.session) and self.lease.left_s > SILENT_S and not self._is_leaving
 
     def _path(self, number: int) -> Path:
         return self.paths[number]
@@ -166,8 +175,7 @@ class Member:
         try:
             await asyncio.wait([*tasks, self._failed], return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in tasks:
-                task.cancel()
+            await _cancel(tasks)
             ended = await asyncio.gather(*tasks, return_exceptions=True)
             await self._leave()
             for failure in ended:
@@ -178,9 +186,17 @@ class Member:
 
     async def _leave(self) -> None:
         """Let all lines go, and end the session: others take over at once."""
-        await asyncio.gather(*self._at_work.values(), return_exceptions=True)
-        await asyncio.gather(*(self._let_go(line) for line in list(self.polled)), return_exceptions=True)
+        await self._let_all_go()
         await self.lease.end()
+
+    async def _let_all_go(self) -> None:
+        self._is_leaving = True
+        try:
+            while self.polled or self._at_work:
+                self._reconcile()
+                await asyncio.gather(*self._at_work.values(), return_exceptions=True)
+        finally:
+            self._is_leaving = False
 
     async def _live(self) -> None:
         while True:
@@ -191,25 +207,24 @@ class Member:
                 _log.info("%s: session %d began", self.name, self.lease.session)
             elif self.lease.is_over:
                 _log.warning("%s: session %d is over", self.name, self.lease.session)
+                await self._let_all_go()
                 await self.lease.end()
                 self._is_dirty = True
             await self.step()
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
-        """Fall silent before the lease has run out; only then is the kernel's timer called off."""
-        is_silent = True
+        """Close the lines before the lease has run out; only then is the kernel's timer called off."""
+        is_armed = False
         while True:
-            if self.lease.left_s > SILENT_S:
-                is_silent = False
-            elif not is_silent:
-                is_silent = True
-                self.mastership.end()
-                self._is_dirty = True
-                _log.warning(
-                    "%s: the lease was not renewed in time; %d lines fall silent", self.name, len(self.polled)
-                )
+            if self._may_poll:
+                is_armed = True
+            elif is_armed:
                 self._reconcile()
+                if not self.polled and not self._at_work:
+                    is_armed = False
+                    self.mastership.end()
+                    _log.warning("%s: the lease was not renewed in time; no line is polled", self.name)
             await asyncio.sleep(GUARD_LOOK_S)
 
     async def _home(self) -> None:
@@ -246,7 +261,7 @@ class Member:
         """Do what is to be done now; nothing here waits for a server, but the ending of dead gateways."""
         await self.observer.end_the_dead()
         await self._share_out()
-        now = (self._is_settled, self.lease.left_s > SILENT_S)
+        now = (self._is_settled, self._may_poll)
         if self._is_dirty or now != self._stepped:
             self._is_dirty, self._stepped = False, now
             if self.lease.is_valid and len(self._looked) == len(names.BUCKETS):
@@ -292,7 +307,7 @@ class Member:
 
     def _reconcile(self) -> None:
         """Let go of what is not ours any more, take what is, and give away what was let go."""
-        valid = self.lease.left_s > SILENT_S
+        valid = self._may_poll
         mine = {
             line: self.plant.records[line].revision
             for line in self.lines_of_plant()
@@ -330,19 +345,19 @@ class Member:
         bucket = names.owner_bucket(line)
         value = owner_value(gateway, self.lease.session if gateway else 0, time.time_ns() // 1_000_000)
         async with self._claims:
-            if not self.lease.is_valid:
+            if not self._may_poll:
                 return
             with suppress(Conflict, FleetError):  # what became of it will be read
                 stored = await self.owners[bucket].bucket.put(line, value, revision)
                 self.owners[bucket].take(Record(line, stored, value))
                 self.moves += 1
-        if gateway and self.is_mine(line) and self.lease.left_s > SILENT_S and line in self.plant.records:
+        if gateway and line in self.plant.records:
             await self._take(line)
 
     async def _take(self, line: str) -> None:
         record = self.plant.records[line]
         async with self._openings:
-            if not (self.lease.left_s > SILENT_S and self.is_mine(line)):
+            if not (self._may_poll and self.is_mine(line)):
                 return
             try:
                 await self.lines.take(line, record.value)
@@ -358,3 +373,12 @@ class Member:
     async def _let_go(self, line: str) -> None:
         await self.lines.let_go(line)
         self.polled.pop(line, None)
+
+
+async def _cancel(tasks: Sequence[asyncio.Task[None]]) -> None:
+    """End the tasks: again where one of the libraries below has swallowed it."""
+    left = set(tasks)
+    while left:
+        for task in left:
+            task.cancel()
+        _, left = await asyncio.wait(left, timeout=CANCEL_S)

@@ -10,14 +10,12 @@ OWNERS = tuple(f"own_{part}" for part in range(3))
 PLANT = "plant"
 BUCKETS = (*LEASES, *OWNERS, PLANT)
 
-_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
-
-def check_name(kind: str, name: str) -> str:
-    """Return the name of a gateway or a line; ValueError where it could not be a part of a subject."""
-    if not _NAME.fullmatch(name):
+def checked_name(kind: str, name: str) -> str:
+    """Return the name. Raises ValueError for one that a subject cannot have."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise ValueError(
-            f"the {kind} {name!r} cannot be named in NATS; use letters, digits, - and _, such as hall-1"
+            f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write gateway-1"
         )
     return name
 
