@@ -111,6 +111,13 @@ static int64_t advance_ready(struct md_port *const *ready, int n, int *is_woken)
     return now_ns;
 }
 
+/* Whoever woke the thread may have put something before this port that need not wait: it is idle, or only
+ * listens, which is no reason for a stop to wait. */
+static int may_have_news(const struct md_port *port)
+{
+    return port->turn.whose == MD_NOBODYS || port->turn.line.listened_ns;
+}
+
 static void *run(void *argument)
 {
     struct md_engine *engine = argument;
@@ -140,7 +147,7 @@ static void *run(void *argument)
         if (!now_ns)
             now_ns = md_now_ns();
         for (unsigned i = 0; i < engine->count; i++)
-            if (engine->wakes[i] <= now_ns || (is_woken && engine->ports[i]->turn.whose == MD_NOBODYS))
+            if (engine->wakes[i] <= now_ns || (is_woken && may_have_news(engine->ports[i])))
                 md_port_advance(engine->ports[i], md_now_ns());
     }
     return NULL;

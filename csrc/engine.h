@@ -16,6 +16,8 @@ struct md_port {
     int is_empty;      /* it was read empty a moment ago: nothing is there yet */
     struct md_settings settings; /* in force; baudrate 0: not yet set */
     struct md_engine *engine;
+    const struct md_mastership *mastership; /* NULL: nobody else may be master here */
+    int is_unheard;                         /* another one may have been since the last request */
     struct md_turn turn;
 
     struct md_port *next; /* of those that wait to be opened */

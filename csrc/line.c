@@ -120,6 +120,8 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, md_line_silent_ns(line)) + exchange->drive->most_timeout_ns;
     go(line, MD_BEGUN);
+    if (md_listen_is_held(line))
+        line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
     md_late_resume(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
@@ -135,12 +137,16 @@ int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
     case SILENCE: /* a line that babbles is not waited for without end */
-        line->wake_ns = sooner(md_line_silent_ns(line), line->give_up_ns);
+        line->wake_ns = sooner(md_listen_free_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
             return MD_WAIT;
         go(line, MD_FELL_SILENT);
         return MD_READ;
     case CHECK:
+        if (line->listened_ns && !md_listen_end(line, now_ns)) {
+            fail(line, MD_OTHER_MASTER);
+            return MD_DONE;
+        }
         go(line, MD_NOTHING_CAME);
         line->rx_len = line->rx_from = 0;
         line->wake_ns =
@@ -226,6 +232,8 @@ static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
 static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     line->quiet_ns = later(line->quiet_ns, now_ns); /* the request before may still be leaving */
+    if (line->listened_ns)
+        md_listen_hear(line, len, now_ns);
     if (line->state != IDLE)
         line->completion->stale += (uint32_t)len;
     if (!md_line_is_under_way(line))

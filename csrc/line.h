@@ -49,6 +49,8 @@ struct md_line {
     struct md_completion *completion;
     int64_t quiet_ns;    /* the line's last activity */
     int64_t silence_ns;  /* demanded after it */
+    int64_t listened_ns; /* nothing but a stop is sent before then; 0: the line is not listened to */
+    int64_t listen_ns;   /* so long from the last byte that came */
     int64_t wake_ns;
     int64_t give_up_ns;  /* end of the wait for a babbling line to fall silent, or for the reply */
     int64_t begun_by_ns; /* the reply has begun by then, or it does not come in time */
@@ -63,6 +65,7 @@ struct md_line {
     uint8_t waited;      /* since the request left a wait was granted */
     uint32_t looks;      /* at the port, since then */
     uint32_t cut;        /* bytes of late replies, since then */
+    uint32_t foreign;    /* bytes that came while it was listened to */
     uint16_t sight_at, sight; /* where the reply may begin, and how much of it was there at first sight */
     uint16_t burst;      /* most characters that wait in the adapter; 0: it may be a whole reply */
     uint8_t rx[MD_RX_ROOM];
@@ -86,7 +89,23 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
 void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns);
 /* End the exchange under way: the port failed, or it is not to be sent any more. */
 void md_line_abandon(struct md_line *line, int result, int error);
+
+/* ---- listen.c: is there another master? ---- */
+
+/* Listen before the request that is ready to leave, for the time that the longest frame and the drive's
+ * time-out take. Return 0 where that makes no sense: a network has no frames of others. */
+int md_listen_begin(struct md_line *line, int64_t now_ns);
+/* The exchange under way waits for the end of that, as all but stops do. */
+int md_listen_is_held(const struct md_line *line);
+void md_listen_put_back(struct md_line *line); /* such an exchange, as if it had never begun */
 /* cdef: end */
+
+/* ---- listen.c, of a line that is listened to ---- */
+
+void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns); /* bytes came */
+int64_t md_listen_free_ns(const struct md_line *line); /* from then on the line is free for the exchange */
+/* The line was looked at for the last time before the request; 0: it is not free. */
+int md_listen_end(struct md_line *line, int64_t now_ns);
 
 /* ---- line_end.c: the end of an exchange ---- */
 

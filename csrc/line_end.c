@@ -14,6 +14,8 @@ static int is_failure(int result)
     case MD_EXPIRED:
     case MD_LINE_LOST:
     case MD_POLL_ENDED:
+    case MD_NOT_MASTER:
+    case MD_OTHER_MASTER:
         return 0;
     default:
         return result < 0;

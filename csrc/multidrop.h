@@ -14,7 +14,7 @@ enum {
     MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* a frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* a frame that its exchange keeps: of any read */
-    MD_STATUSES = 19,         /* of a row without an exception */
+    MD_STATUSES = 21,         /* of a row without an exception */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* requests of a drive whose replies may still come */
@@ -210,7 +210,9 @@ enum md_failure {
     MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
     MD_EXPIRED = -14,          /* not sent: its time was over, or a stop came first */
     MD_POLL_ENDED = -16,       /* the poll ended before its turn or its reply */
-    MD_MAYBE_ECHO = -17        /* the reply cannot be told from the adapter's echo */
+    MD_MAYBE_ECHO = -17,       /* the reply cannot be told from the adapter's echo */
+    MD_NOT_MASTER = -19,       /* not sent: this process may not send any more; a part may have left before */
+    MD_OTHER_MASTER = -20      /* not sent: bytes come that another master causes */
 };
 
 /* The result of an exchange. first_ns and last_ns are 0 where nothing came. */
@@ -234,12 +236,14 @@ struct md_progress {
     uint32_t repeating;   /* exchanges are repeated */
     uint32_t switches;    /* of baud rate and format */
     uint32_t echo;        /* of its adapter (enum md_echo), as far as is known */
+    uint32_t foreign;     /* bytes that came while the line was listened to before its first request */
     int64_t switching_ns; /* time that the switches took */
 };
 
 struct md_engine;
 struct md_port;
 struct md_tap;
+struct md_mastership;
 
 struct md_engine *md_engine_start(void); /* the thread for every line of the process; it ends with that */
 
@@ -247,6 +251,9 @@ struct md_engine *md_engine_start(void); /* the thread for every line of the pro
  * enum md_transactions. `room` for queued exchanges is a power of two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
+/* Send only while the mastership holds, which must outlive the port: looked at right before each write(2).
+ * Where it has not held since the last request, and before the first one, the line is listened to. */
+void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 /* Put all that goes over the line into `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Begin nothing more of what is queued or repeated, but still urgent exchanges. Return 1 while one of the
@@ -279,6 +286,19 @@ void md_count_stop(uint32_t *stops);
  * a 20th of the line, one exchange at a time, but none while one that insists waits. */
 void md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                        int64_t expires_ns, struct md_completion *completion);
+
+/* ---- mastership.c: return NULL or -1 and set errno on failure; else a time, or a flag ---- */
+
+int64_t md_boottime_ns(void); /* CLOCK_BOOTTIME, of which are the times below */
+/* Make one that does not hold yet; ENOSYS where the kernel has no such timer. */
+struct md_mastership *md_mastership_new(void);
+void md_mastership_free(struct md_mastership *mastership); /* after all ports that have it */
+/* Hold until then. Where it is not extended by `kill_ns`, the kernel kills this process. */
+int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns);
+/* Hold no more: nothing is sent once this has returned, and nobody is killed. */
+void md_mastership_end(struct md_mastership *mastership);
+int64_t md_mastership_until_ns(const struct md_mastership *mastership); /* 0: it does not hold */
+int md_mastership_holds(const struct md_mastership *mastership);
 /* cdef: end */
 
 #endif

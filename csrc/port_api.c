@@ -1,6 +1,6 @@
 /* What clients do with a port, on any thread of theirs. */
 #define _GNU_SOURCE
-#include "engine.h"
+#include "mastership.h"
 
 #include <errno.h>
 #include <stdlib.h>
@@ -82,6 +82,15 @@ int md_port_is_asking(struct md_port *port, const struct md_drive *drive)
     return is_asking;
 }
 
+void md_port_fence(struct md_port *port, struct md_mastership *mastership)
+{
+    md_engine_enter(port->engine);
+    __atomic_store_n(&mastership->engine, port->engine, __ATOMIC_SEQ_CST);
+    port->mastership = mastership;
+    port->is_unheard = 1;
+    md_engine_leave(port->engine);
+}
+
 void md_port_tap(struct md_port *port, struct md_tap *tap)
 {
     md_engine_enter(port->engine);
@@ -134,9 +143,12 @@ const struct md_progress *md_port_progress(struct md_port *port)
     return &port->turn.progress;
 }
 
-/* The thread looks at the port by itself before anything can be sent there: it need not be woken. */
+/* The thread looks at the port by itself before anything can be sent there: it need not be woken, but for a
+ * stop, which is not held up by listening. */
 static int is_attended(const struct md_port *port)
 {
+    if (port->turn.line.listened_ns)
+        return 0;
     return port->turn.whose != MD_NOBODYS ||
            port->engine->wakes[port->index] <= md_line_silent_ns(&port->turn.line);
 }

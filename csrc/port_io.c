@@ -49,12 +49,30 @@ int64_t md_port_receive(struct md_port *port)
     return now_ns;
 }
 
-/* Write; 1: the port took something, or is lost. The request leaves when it is written; where the thread
- * was held up just then, perhaps afterwards: from too early a time on its reply, and a late one, would be
- * waited for too short. */
+/* Look whether this process may still send; 0: the request goes no further now. This stands right before
+ * write(2), and nothing comes between. */
+static int may_send(struct md_port *port)
+{
+    struct md_line *line = &port->turn.line;
+    if (!md_mastership_holds(port->mastership)) {
+        port->is_unheard = 1;
+        md_line_abandon(line, MD_NOT_MASTER, 0);
+        return 0;
+    }
+    if (!port->is_unheard || line->exchange->insists)
+        return 1;
+    port->is_unheard = 0;
+    return !md_listen_begin(line, md_now_ns());
+}
+
+/* Write; 1: the port took something, or there is something else to do. The request leaves when it is written;
+ * where the thread was held up just then, perhaps afterwards: from too early a time on its reply, and a late
+ * one, would be waited for too short. */
 static int send(struct md_port *port, int64_t begun_ns)
 {
     struct md_line *line = &port->turn.line;
+    if (port->mastership && !may_send(port))
+        return 1;
     ssize_t written = write(port->fd, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
     if (written > 0)

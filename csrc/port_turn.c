@@ -156,13 +156,18 @@ static void rest(const struct md_exchange *exchange, const struct md_completion 
         exchange->drive->ready_ns = now_ns + exchange->drive->interval_ns;
 }
 
-/* One exchange of what is polled may hold up urgent requests: never two in a row, and never a stop. */
-static int is_polls_turn(const struct md_turn *turn)
+static int is_stop_waiting(const struct md_turn *turn)
 {
     for (const struct md_urgent *urgent = turn->urgent; urgent; urgent = urgent->next)
         if (urgent->exchange->insists)
-            return 0;
-    return turn->owed_ns > 0 && turn->last == MD_URGENT;
+            return 1;
+    return 0;
+}
+
+/* One exchange of what is polled may hold up urgent requests: never two in a row, and never a stop. */
+static int is_polls_turn(const struct md_turn *turn)
+{
+    return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
 
 /* Take up what comes next, or say when; 1: there is something to carry out now. */
@@ -197,6 +202,13 @@ static void report(struct md_turn *turn)
         call(turn);
 }
 
+/* Have the repeated exchange that was taken up last as the next one again. */
+static void step_back(struct md_turn *turn)
+{
+    if (turn->round_len)
+        turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
+}
+
 /* The exchange under way is over. */
 static void finish(struct md_turn *turn)
 {
@@ -205,12 +217,14 @@ static void finish(struct md_turn *turn)
     turn->whose = MD_NOBODYS;
     if (turn->progress.echo != (uint32_t)turn->line.echo)
         md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
+    if (turn->progress.foreign != turn->line.foreign)
+        md_store(&turn->progress.foreign, turn->line.foreign);
     if (whose == MD_BEFOREHAND)
         return;
     int goes_on = !turn->progress.lost && (whose == MD_URGENT || !turn->is_ending);
     if (md_before_is_again(&turn->before, turn->line.exchange, turn->line.completion) && goes_on) {
-        if (whose == MD_REPEATED && turn->round_len)
-            turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
+        if (whose == MD_REPEATED)
+            step_back(turn);
         return;
     }
     if (whose == MD_URGENT) {
@@ -229,12 +243,31 @@ static void finish(struct md_turn *turn)
     }
 }
 
+/* A stop does not wait for an exchange that only listens so far. That one has its turn again. */
+static void give_way(struct md_turn *turn)
+{
+    int whose = turn->whose;
+    md_listen_put_back(&turn->line);
+    turn->whose = MD_NOBODYS;
+    if (whose == MD_URGENT) {
+        struct md_urgent *urgent = turn->urgent;
+        turn->urgent = urgent->next;
+        md_turn_add_urgent(turn, urgent);
+    } else if (whose == MD_REPEATED) {
+        step_back(turn);
+    }
+}
+
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     struct md_line *line = &turn->line;
     for (;;) {
         if (turn->whose == MD_NOBODYS && !take(turn, wake_ns, now_ns))
             return MD_DONE;
+        if (md_listen_is_held(line) && is_stop_waiting(turn)) {
+            give_way(turn);
+            continue;
+        }
         int want = md_line_want(line, now_ns);
         if (want == MD_WRITE && is_expired(turn, now_ns)) {
             md_line_abandon(line, MD_EXPIRED, 0);

@@ -12,6 +12,7 @@ from multidrop.control.ramp import ramp as ramp
 from multidrop.control.ramp import start_staggered as start_staggered
 from multidrop.core import Echo as Echo
 from multidrop.core import Framing as Framing
+from multidrop.core import Mastership as Mastership
 from multidrop.core import NumberFormat as NumberFormat
 from multidrop.drive import Condition as Condition
 from multidrop.drive import Direction as Direction
@@ -56,6 +57,7 @@ from multidrop.errors import NoReply as NoReply
 from multidrop.errors import NoSuchPort as NoSuchPort
 from multidrop.errors import NotAttached as NotAttached
 from multidrop.errors import NotDone as NotDone
+from multidrop.errors import NotMaster as NotMaster
 from multidrop.errors import NoValue as NoValue
 from multidrop.errors import Overtaken as Overtaken
 from multidrop.errors import PortLost as PortLost

@@ -19,7 +19,7 @@ from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stop_all import Stopper
 from multidrop.control.writer import Writer
-from multidrop.core import Echo, Message, Peer, TransactionIds
+from multidrop.core import Echo, Mastership, Message, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.own import check_own, check_own_text
@@ -58,6 +58,9 @@ class Bus:
     `with` block, or closing, waits for the stops that are under way and closes the port; it sends nothing,
     unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
 
+    Where other processes may be masters of the line too, `mastership` holds requests back: what is too late
+    is not sent, a stop neither, and raises NotMaster.
+
     The logger `multidrop.line` has the port's coming and going, and at DEBUG the frames; `multidrop.control`
     has writes, refusals and stops.
     """
@@ -74,12 +77,13 @@ class Bus:
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
         expiry: float = EXPIRY,
+        mastership: Mastership | None = None,
     ) -> None:
         _checked_expiry(expiry, "a write")
         self.baudrate = baudrate
         self.format = format
         self.silence = silence
-        self._begin(Line(port, Echo(echo), TransactionIds(transaction)), ledger, audit, expiry)
+        self._begin(Line(port, Echo(echo), TransactionIds(transaction), mastership), ledger, audit, expiry)
 
     @classmethod
     def awaiting(
@@ -90,11 +94,13 @@ class Bus:
         transaction: str = "match",
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
+        mastership: Mastership | None = None,
     ) -> Bus:
         """Return a bus whose port is not there yet: the poller that has it opens it, and so do stops."""
         bus = cls.__new__(cls)
         bus.baudrate = bus.format = bus.silence = None
-        bus._begin(Line.awaited(port, Echo(echo), TransactionIds(transaction)), ledger, audit, EXPIRY)
+        line = Line.awaited(port, Echo(echo), TransactionIds(transaction), mastership)
+        bus._begin(line, ledger, audit, EXPIRY)
         return bus
 
     def _begin(

@@ -122,6 +122,34 @@ class Overtaken(BusError):
         self.why = why
 
 
+class NotMaster(BusError):
+    """Not sent: this process is not, or no more, the master of the line, or it hears another one there.
+
+    `heard` is what was received, where that is why. `is_sent`: a part of the request had left before, as on a
+    port that takes a few bytes at a time; no drive takes a part for a request.
+    """
+
+    def __init__(self, drive: str, port: str, *, heard: bytes = b"", is_sent: bool = False) -> None:
+        if heard:
+            came = heard[:16].hex(" ").upper()
+            why = f"bytes came on {port} before anything was asked, which another master causes ({came})"
+        else:
+            why = f"this process may not send on {port} any more, and another one may be its master now"
+        super().__init__(f"{drive}: not sent: not master: {why}")
+        self.drive = drive
+        self.reason = why
+        self.heard = heard
+        self.is_sent = is_sent
+
+    def of_a_stop(self) -> NotMaster:
+        """Return the same of a motor's stop: whoever reads it must know what to do now."""
+        self.args = (
+            f"{self.drive}: the stop was NOT sent, and its motor goes on as it is: {self.reason}. Stop it "
+            "through the process that is master of its line now, or at the drive itself",
+        )
+        return self
+
+
 class NotAttached(ValueError):
     """The drive is not, or no more, on this bus: a mistake of the caller."""
 

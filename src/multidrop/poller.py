@@ -14,7 +14,7 @@ from typing import Any
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook
-from multidrop.core import RowQueue
+from multidrop.core import Mastership, RowQueue
 from multidrop.core.fork import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -37,7 +37,8 @@ class Poller(RowSource):
 
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
     missing. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
-    of the polling, and are counted in `ledger` and noted in `audit`, as Bus says.
+    of the polling, and are counted in `ledger` and noted in `audit`, as Bus says. With a `mastership` nothing
+    is sent on any line unless that holds: each value that is due meanwhile has a row that says so.
 
     The logger `multidrop.line` has no polled frames: they never enter Python. `multidrop poll --capture`
     writes them to a file for Wireshark.
@@ -49,11 +50,12 @@ class Poller(RowSource):
         *,
         ledger: Ledger | Path | str | None = None,
         audit: Path | str | None = None,
+        mastership: Mastership | None = None,
     ) -> None:
         if not isinstance(plant, Plant):
             raise TypeError(f"Poller takes a Plant, such as load_plant('plant.toml') gives, not {plant!r}")
         row_queue = RowQueue()
-        self._lines = LineSet(row_queue, ledger, audit)
+        self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
         self._path = plant.path
         self._stops_on_exit = False

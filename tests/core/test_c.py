@@ -10,7 +10,7 @@ from examples import usually
 
 @pytest.mark.slow
 def test_core(tmp_path: Path) -> None:
-    line = ("line", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
+    line = ("line", "listen", "line_end", "reply", "tcp", "echo", "owed", "late", "delay", "counters")
     core = ("checksum", "body", "frame", "reason", "tap", *line, "columns")
     build_and_run(tmp_path / "test_core", *core, arguments=["tests/data/frames.csv"])
 
@@ -55,3 +55,11 @@ def test_a_port_is_read_once_for_an_exchange(tmp_path: Path) -> None:
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_no_wait_is_rounded(tmp_path: Path, program: str) -> None:
     build_and_run(tmp_path / program, "waiter_epoll")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
+def test_nothing_is_sent_but_by_a_look_at_the_deadline(tmp_path: Path) -> None:
+    replaced = ("waiter_poll", "port_io", "mastership")
+    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    build_and_run(tmp_path / "test_mastership", *core)

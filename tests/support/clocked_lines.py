@@ -223,6 +223,8 @@ class ClockedLine:
 
     only_settings = None  # a drive may have any
     why_closing = ""
+    mastership = None
+    may_send = True
 
     def __init__(self, clocked: ClockedLines, port: str, ids: TransactionIds) -> None:
         self.port = port
@@ -243,6 +245,9 @@ class ClockedLine:
 
     def inherit(self, peer: Peer, before: Peer) -> None:
         peer.inherit(before)
+
+    def note_foreign(self) -> None:
+        pass
 
     def overruns(self) -> None:
         pass
@@ -271,12 +276,12 @@ class ClockedOpener:
     def __init__(self, clocked: ClockedLines) -> None:
         self._clocked = clocked
 
-    def __call__(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
-        line = self.awaited(port, echo, ids)
+    def __call__(self, port: str, echo: object, ids: TransactionIds, mastership: None) -> ClockedLine:
+        line = self.awaited(port, echo, ids, mastership)
         line.reopen()
         return line
 
-    def awaited(self, port: str, echo: object, ids: TransactionIds) -> ClockedLine:
+    def awaited(self, port: str, echo: object, ids: TransactionIds, mastership: None) -> ClockedLine:
         return ClockedLine(self._clocked, port, ids)
 
 

@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from leftovers import descriptors, threads
@@ -53,10 +54,10 @@ def test_a_network_that_stalls_hands_on_nothing_later(monkeypatch: pytest.Monkey
     told: list[int] = []
 
     class Watched(Port):
-        def __init__(self, fd: int, must_take: int) -> None:
+        def __init__(self, fd: int, must_take: int, **details: Any) -> None:
             with socket.socket(fileno=os.dup(fd)) as connection:
                 told.append(connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT))
-            super().__init__(fd, must_take)
+            super().__init__(fd, must_take, **details)
 
     monkeypatch.setattr(line_module, "Port", Watched)
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, DriveRefused, LineError, NoReply, NotAttached, NoValue
+from multidrop.errors import BadReply, DriveRefused, LineError, NoReply, NotAttached, NotMaster, NoValue
 from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
 
 
@@ -32,7 +32,7 @@ class EchoCheck:
         Another client that asks the same seems to be one: then the drive's confirmations of writes, which
         are copies too, would not count, until something is read.
         """
-        with suppress(NoReply, BadReply, LineError, NotAttached):
+        with suppress(NoReply, BadReply, LineError, NotAttached, NotMaster):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
 
     def why_doubtful(self, drive: Drive) -> str:
@@ -46,6 +46,6 @@ class EchoCheck:
             return ""
         try:
             self.read_any(drive, READ_ATTEMPTS)
-        except (NoReply, BadReply, LineError, NotAttached) as failure:
+        except (NoReply, BadReply, LineError, NotAttached, NotMaster) as failure:
             return f"the reply may be the adapter's echo, for nothing was heard of the drive since: {failure}"
         return "the reply was the adapter's echo" if line.has_echo else ""

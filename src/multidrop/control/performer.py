@@ -15,11 +15,24 @@ from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carry_out
-from multidrop.errors import BadReply, DriveRefused, LineError, NoReply, NotAttached, Overtaken, Unconfirmed
+from multidrop.errors import (
+    BadReply,
+    DriveRefused,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    Overtaken,
+    Unconfirmed,
+)
 from multidrop.transport import clock
 from multidrop.transport.exchange import Exchanges
 
 _log = logging.getLogger("multidrop.control")
+
+
+# The failures of a read that say nothing of what was written before it.
+_ENDING = (NoReply, BadReply, DriveRefused, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
@@ -127,7 +140,7 @@ class Performer:
 
         try:
             return carry_out(script, do)
-        except (NoReply, BadReply, DriveRefused, LineError, NotAttached, Overtaken, _Over) as failure:
+        except (*_ENDING, Overtaken, _Over) as failure:
             why: Exception = overtaken[0] if isinstance(failure, _Over) else failure
             if not call.sent or why not in unseen:
                 raise why from None if why is failure else failure

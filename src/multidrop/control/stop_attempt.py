@@ -18,6 +18,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     NotDone,
+    NotMaster,
     PortLost,
     Refused,
     Unconfirmed,
@@ -28,7 +29,8 @@ from multidrop.transport.aside_log import log_aside
 LEAST_S = 30.0  # for which a stop is repeated where its caller gives no time
 PAUSE_S = 0.2  # before it is repeated
 MOST_STEPS = 8  # that are sent once more after an interruption
-WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost)
+UNSENT = (Refused, LineError, NotMaster, ValueError)
+WORTH_REPEATING = (Unconfirmed, NotDone, NoReply, BadReply, DriveRefused, PortLost, NotMaster)
 
 _log = logging.getLogger("multidrop.control")
 
@@ -118,15 +120,18 @@ class StopAttempt:
     def _note(self, step: Step, failure: Exception | None) -> None:
         if not isinstance(step, Write):
             return
-        if not isinstance(failure, (Refused, LineError, ValueError)):
+        if not isinstance(failure, UNSENT):
             self._sent += 1
             if isinstance(step, Pulse):
                 self._pulses.add((step.register.name, step.value))
-        self.is_sent |= not isinstance(failure, (Refused, LineError, DriveRefused, ValueError))
+        self.is_sent |= not isinstance(failure, (*UNSENT, DriveRefused))
         self._is_confirmed |= failure is None
 
     def _goes_on(self, failure: Exception, now: float) -> bool:
         limit = LEAST_S if self._seconds is None else self._seconds
+        if isinstance(failure, NotMaster) and not failure.heard:
+            self._tell_unsent(failure)
+            return False
         if not isinstance(failure, WORTH_REPEATING) or now >= self._begun + limit:
             return False
         if not self._has_warned:
@@ -135,6 +140,11 @@ class StopAttempt:
         self._begin()
         self.due = now + PAUSE_S
         return True
+
+    def _tell_unsent(self, failure: NotMaster) -> None:
+        """Say it at once and loudest: nobody else stops this motor by itself."""
+        if not self.is_sent:
+            log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 
     def once_more(self, do: Do) -> None:
         """Send the stop again without looking at anything: its caller was interrupted."""

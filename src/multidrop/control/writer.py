@@ -27,6 +27,7 @@ from multidrop.errors import (
     LineError,
     NoReply,
     NotAttached,
+    NotMaster,
     NoValue,
     Overtaken,
     Unconfirmed,
@@ -155,7 +156,12 @@ class Writer:
         if call is None:
             return self._exchanges.carry_out(drive, request, insists=True, timeout=timeout)
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
-        completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
+        try:
+            completion = self._exchanges.carry_out(drive, request, call.expires_ns, permit=call.permit)
+        except NotMaster as failure:
+            if not failure.is_sent:
+                call.sent, call.is_confirmed = before
+            raise
         if completion.result == Failure.EXPIRED:
             call.sent, call.is_confirmed = before
             raise call.unsent(what)
@@ -199,7 +205,7 @@ class Writer:
         try:
             with call.look() if call else nullcontext():
                 return self._exchanges.value(drive, register), None
-        except (NoReply, BadReply, DriveRefused, LineError, NotAttached) as failure:
+        except (NoReply, BadReply, DriveRefused, LineError, NotAttached, NotMaster) as failure:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
@@ -218,8 +224,10 @@ class Writer:
         except (Expired, Overtaken, NotAttached, NoReply):  # it was not sent
             raise
         except BaseException as failure:
+            if isinstance(failure, NotMaster) and not failure.is_sent:
+                raise
             log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
-            if isinstance(failure, LineError) and failure.is_sent:
+            if isinstance(failure, (LineError, NotMaster)) and failure.is_sent:
                 raise Unconfirmed(drive.name, what, failure.reason) from failure
             raise
 

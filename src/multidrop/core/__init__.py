@@ -33,6 +33,7 @@ from multidrop.core.frame import (
     sum8,
 )
 from multidrop.core.latch import Latch, Permit
+from multidrop.core.mastership import Mastership, boottime_ns
 from multidrop.core.port import Echo, Port, TransactionIds, Transactions, now_ns, utc_minus_monotonic_ns
 from multidrop.core.port_settings import (
     REFUSALS,
@@ -87,6 +88,7 @@ __all__ = [
     "Framing",
     "Kind",
     "Latch",
+    "Mastership",
     "Message",
     "Names",
     "NumberFormat",
@@ -105,6 +107,7 @@ __all__ = [
     "Unpacked",
     "Unpacker",
     "Wrappings",
+    "boottime_ns",
     "build_reply",
     "build_request",
     "characters_on_wire",

@@ -12,6 +12,7 @@ from weakref import finalize
 from multidrop._core import ffi, lib
 from multidrop.core.exchange import Completion, Exchange, Peer
 from multidrop.core.fork import register_at_fork
+from multidrop.core.mastership import Mastership
 from multidrop.core.row_queue import RowQueue
 from multidrop.core.tap import Tap
 
@@ -73,7 +74,8 @@ def _engine() -> _Engine:
     return _Engine()
 
 
-def _let_go(port: Any) -> None:
+def _let_go(port: Any, mastership: Mastership | None) -> None:
+    """Free it; the core looks at the mastership until then."""
     lib.md_port_stop(port)
     lib.md_port_free(port)
 
@@ -83,19 +85,28 @@ class Port:
 
     `must_take` is the mask of REFUSALS that are failures; -1 for a port without settings. `room` is
     how many exchanges may be queued, a power of two. With `transactions` all of them are of Modbus TCP,
-    and without them none is. OSError where the descriptor cannot be waited for.
+    and without them none is. Requests leave while the `mastership` holds; None: always. OSError where the
+    descriptor cannot be waited for.
     """
 
     def __init__(
-        self, fd: int, must_take: int, room: int = 256, *, transactions: Transactions = Transactions.NONE
+        self,
+        fd: int,
+        must_take: int,
+        room: int = 256,
+        *,
+        transactions: Transactions = Transactions.NONE,
+        mastership: Mastership | None = None,
     ) -> None:
         self.c = lib.md_port_open(_engine().c, fd, must_take, transactions, room)
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the port cannot be waited for")
         self.room = room
+        if mastership is not None:
+            lib.md_port_fence(self.c, mastership.c)
         # Read in place: a call of the core would release the GIL, and wait to have it back.
         self._progress = lib.md_port_progress(self.c)
-        self._free = finalize(self, _let_go, self.c)  # before what the core still reads is freed
+        self._free = finalize(self, _let_go, self.c, mastership)  # before what the core still reads is freed
         self._free.atexit = False  # others may still use the port at exit
         self._kept: set[Exchange | Peer] = set()  # the core may still read them
         self._submitted: deque[Exchange] = deque(maxlen=room)  # at most so many are pending
@@ -191,6 +202,11 @@ class Port:
     def has_echo(self) -> bool:
         """True once its adapter is known to echo: then no echo is taken for a reply."""
         return int(self._progress.echo) == int(lib.MD_ECHO)
+
+    @property
+    def foreign(self) -> int:
+        """Bytes that came while the line was listened to before a request: another master's doing."""
+        return int(self._progress.foreign)
 
     @property
     def switching(self) -> float:

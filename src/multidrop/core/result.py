@@ -32,6 +32,8 @@ class Failure(IntEnum):
     EXPIRED = lib.MD_EXPIRED
     POLL_ENDED = lib.MD_POLL_ENDED
     MAYBE_ECHO = lib.MD_MAYBE_ECHO
+    NOT_MASTER = lib.MD_NOT_MASTER
+    OTHER_MASTER = lib.MD_OTHER_MASTER
 
 
 class Status(IntEnum):
@@ -56,6 +58,8 @@ class Status(IntEnum):
     POLL_ENDED = -Failure.POLL_ENDED
     MAYBE_ECHO = -Failure.MAYBE_ECHO
     NO_VALUE = lib.MD_NO_VALUE
+    NOT_MASTER = -Failure.NOT_MASTER
+    OTHER_MASTER = -Failure.OTHER_MASTER
 
     def __str__(self) -> str:
         return STATUSES[self]
@@ -81,6 +85,8 @@ _WORDS: dict[int, str] = {
     Status.POLL_ENDED: "poll ended",
     Status.MAYBE_ECHO: "maybe the adapter's echo",
     Status.NO_VALUE: "no valid value",
+    Status.NOT_MASTER: "not sent: not master",
+    Status.OTHER_MASTER: "not sent: another master",
 }
 
 UNASKED = "not "  # begins the statuses of values for which no request left

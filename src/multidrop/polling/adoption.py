@@ -17,7 +17,6 @@ from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.changes import DriveChanges, check_plant, drive_changes, has_same_port
 from multidrop.polling.line_set import MOST_LINES, LineSet
 from multidrop.polling.polled_line import PolledLine
-from multidrop.transport.opening import unopened
 
 GONE = "its line is polled no more"
 
@@ -114,7 +113,7 @@ class Adoption:
             )
         self._lines.names.check_room(polled for line in self._plant.lines for polled in line.drives)
         for coming in self._coming:
-            unopened(coming.wanted.port)
+            self._lines.check_port(coming.wanted.port)
         if self._coming:
             self._lines.check_audit()
         if self._coming and self._stops_on_exit:

@@ -11,12 +11,13 @@ from pathlib import Path
 from multidrop.bus import Bus
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.core import RowQueue
+from multidrop.core import Mastership, RowQueue
 from multidrop.drive.family import Drive
 from multidrop.plant.model import PlantLine
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
 from multidrop.transport import clock
+from multidrop.transport.opening import check_fencible, unopened
 
 OPENING = 32  # ports at a time: one that takes its time holds up no other
 ENDING_NS = 1_000_000_000  # for which exchanges under way are waited for
@@ -28,12 +29,17 @@ class LineSet:
     """Lines, each with a number by which the core calls for it; one thread at a time changes them."""
 
     def __init__(
-        self, row_queue: RowQueue, ledger: Ledger | Path | str | None, audit: Path | str | None
+        self,
+        row_queue: RowQueue,
+        ledger: Ledger | Path | str | None,
+        audit: Path | str | None,
+        mastership: Mastership | None,
     ) -> None:
         self.names = RowNames()
         self._row_queue = row_queue
         self._ledger = ledger
         self._audit = audit
+        self._mastership = mastership
         self._lines: tuple[PolledLine, ...] = ()  # another one when they change: others go through them
         self._numbered: dict[int, PolledLine] = {}
         self._free: list[int] = []  # numbers that lines had
@@ -109,7 +115,14 @@ class LineSet:
         return self._bus(Bus.awaiting, line)
 
     def _bus(self, make: Callable[..., Bus], line: PlantLine) -> Bus:
-        return make(line.port, echo=line.echo, transaction=line.ids, ledger=self._ledger, audit=self._audit)
+        return make(
+            line.port,
+            echo=line.echo,
+            transaction=line.ids,
+            ledger=self._ledger,
+            audit=self._audit,
+            mastership=self._mastership,
+        )
 
     def add(self, declared: PlantLine, bus: Bus) -> PolledLine:
         """Make a line that is not polled yet. Raises ValueError where a drive cannot be on it."""
@@ -125,6 +138,10 @@ class LineSet:
         """Put the lines in the order of their names here."""
         places = {name: place for place, name in enumerate(names)}
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
+
+    def check_port(self, port: str) -> None:
+        """Raise NoSuchPort for a name that no port of these lines can have."""
+        (check_fencible if self._mastership else unopened)(port)
 
     def check_audit(self) -> None:
         """Raise OSError where the audit log of a line that comes cannot be opened."""

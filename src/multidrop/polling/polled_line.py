@@ -26,6 +26,7 @@ LEARN_NS = 1_000_000_000  # between looks at how long exchanges take
 RELEARN_NS = 2_000_000_000  # the same, where the core repeats the bus cycle
 GONE_S = 0.001  # between looks whether a drive that left is asked yet
 REOPEN_NS = 500_000_000  # between attempts to open a port that was lost
+STANDBY_NS = 500_000_000  # between rows of a line that this process is not master of
 
 
 class PolledLine:
@@ -55,6 +56,7 @@ class PolledLine:
         self._learnt_ns = 0
         self._reopening: threading.Thread | None = None
         self._reopen_ns = 0
+        self._standby_ns = 0
         self._lock = threading.Lock()  # of all above: drives come and go on any thread
         register_at_fork(self)
         try:
@@ -168,6 +170,10 @@ class PolledLine:
             if port.lost:
                 self._lose(port, now_ns)
                 return
+            self.bus.line.note_foreign()
+            if not self.bus.line.may_send:
+                self._stand_by(port, now_ns)
+                return
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
             self._drives.observe(now_ns)
@@ -197,7 +203,14 @@ class PolledLine:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
             self._schedule.unasked = [slot for slot in unasked if slot[1] > now_ns]
 
-    # ---- a port that is lost, and the end ----
+    # ---- not the master, a port that is lost, and the end ----
+
+    def _stand_by(self, port: Port, now_ns: int) -> None:
+        """Queue nothing; until this process is the line's master, every value that is due is missed."""
+        self._queue.pause(port)
+        if now_ns >= self._standby_ns:
+            self._standby_ns = now_ns + STANDBY_NS
+            self._miss(self._schedule.pass_all(now_ns), Status.NOT_MASTER)
 
     def _lose(self, port: Port, now_ns: int) -> None:
         port.stop()
@@ -260,12 +273,13 @@ class PolledLine:
         """Return what came of the line and of each drive since it was started, as plain numbers."""
         with self._lock:
             seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
-            peers = {drive.name: peer for drive, peer in self.bus.peers.items()}
+            line, peers = self.bus.line, {drive.name: peer for drive, peer in self.bus.peers.items()}
             return {
                 **line_summary(seconds, peers),
                 "overrun_slots": self._maker.skipped,
                 "switching_ms": round(self.switching * 1e3, 3),
                 "set_aside": self._refusals.names,
+                **({"foreign_bytes": line.foreign} if line.mastership else {}),
             }
 
 

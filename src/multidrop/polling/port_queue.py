@@ -51,14 +51,19 @@ class PortQueue:
         """Have the core repeat the bus cycle, or else queue what comes next."""
         cycle = self._schedule.cycle(now_ns)
         if cycle != self._cycle or port.repeating != bool(cycle):
-            following = port.repeat([])
-            if self._cycle:
-                self._schedule.go_on(self._cycle[following])
+            self.pause(port)
             self._cycle = self._schedule.cycle(now_ns)
             if self._cycle:
                 port.repeat([job.exchange for job in self._cycle])
         if not self._cycle:
             self._top_up(port, now_ns)
+
+    def pause(self, port: Port) -> None:
+        """Repeat nothing; what is queued is still carried out."""
+        following = port.repeat([])
+        if self._cycle:
+            self._schedule.go_on(self._cycle[following])
+            self._cycle = []
 
     def _top_up(self, port: Port, now_ns: int) -> None:
         done_ns = max(now_ns + self._ahead_ns, self._queued[-1].not_before_ns if self._queued else 0)

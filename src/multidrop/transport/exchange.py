@@ -35,7 +35,7 @@ from multidrop.transport.prepared import (
     make_exchange,
     make_read,
 )
-from multidrop.transport.replies import good_reply, no_reply, no_value
+from multidrop.transport.replies import check_master, good_reply, no_reply, no_value
 
 READ_ATTEMPTS = 3
 LEAST_TIMEOUT = 0.02  # s: what a host and its adapter may add to a drive's own delay
@@ -224,7 +224,7 @@ class Exchanges:
         request = any_read(drive, function, start, count)
         expires_ns = clock.now_ns() + round(expiry * 1e9)
         asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
-        completion = self._carry_out(asked, expires_ns)
+        completion = self._carry_out(drive, asked, expires_ns)
         is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.now_ns() >= expires_ns
         if is_late or completion.result == Failure.EXPIRED:
             raise Expired(drive.name, f"a read of {count} from {start} by function {function:02X}H", expiry)
@@ -241,7 +241,7 @@ class Exchanges:
         """Return the data of the reply to a read, which is sent again where it is lost."""
         while True:
             attempts -= 1
-            completion = self._carry_out(exchange)
+            completion = self._carry_out(drive, exchange)
             self._note_answer(drive, completion)
             if (data := completion.data) is not None:
                 return data
@@ -276,20 +276,23 @@ class Exchanges:
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
         )
-        completion = self._carry_out(made, expires_ns)
+        completion = self._carry_out(drive, made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
             raise no_reply(drive, completion)
         return completion
 
-    def _carry_out(self, made: Exchange, expires_ns: int = 0) -> Completion:
+    def _carry_out(self, drive: Drive, made: Exchange, expires_ns: int = 0) -> Completion:
         """Wait once until no late answer comes in any order; the core then asks for the proof of it.
 
-        Where that is after `expires_ns`, so long is enough.
+        Where that is after `expires_ns`, so long is enough. Raises NotMaster.
         """
         late_until_ns = made.peer.late_until_ns
         completion = self.line.carry_out(made, expires_ns=expires_ns)
         if completion.result != Failure.LATE_ANSWER_DUE:
+            check_master(drive, completion)
             return completion
         until_ns = min(late_until_ns, expires_ns + 1) if expires_ns else late_until_ns
         clock.sleep(max(0, until_ns - clock.now_ns()) / 1e9)
-        return self.line.carry_out(made, expires_ns=expires_ns)
+        completion = self.line.carry_out(made, expires_ns=expires_ns)
+        check_master(drive, completion)
+        return completion

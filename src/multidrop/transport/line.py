@@ -15,6 +15,7 @@ from multidrop.core import (
     Echo,
     Exchange,
     Failure,
+    Mastership,
     Peer,
     Port,
     Tap,
@@ -31,7 +32,14 @@ from multidrop.transport.aside_log import flush, log_aside
 from multidrop.transport.bridge import PORT_FAILURES, Bridge, hand_on_nothing_late, set_up
 from multidrop.transport.frame_log import log_frames
 from multidrop.transport.mixed_up import mixed_up
-from multidrop.transport.opening import connection_of, identity_of, reason_of, unopened
+from multidrop.transport.opening import (
+    check_fencible,
+    connection_of,
+    identity_of,
+    is_bridged,
+    reason_of,
+    unopened,
+)
 from multidrop.transport.overruns import overruns
 
 _NO_SETTINGS = -1
@@ -44,6 +52,11 @@ LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 _log = logging.getLogger("multidrop.line")
 
+FOREIGN = (
+    "%s: another master: %d bytes came before anything was asked; nothing but stops is sent until the "
+    "line has been silent"
+)
+
 
 def _is_lost(core: Port, result: int) -> bool:
     is_lost = result in (Failure.LINE_LOST, Failure.SETTINGS_REFUSED)
@@ -54,22 +67,34 @@ class Line:
     """An open port on which exchanges are carried out, urgent ones ahead of those that are queued.
 
     `port` is a device, any pyserial URL, or tcp://host:port for Modbus TCP, whose replies have their
-    requests' transaction ids unless `ids` says otherwise. Every failure of the port is a LineError.
+    requests' transaction ids unless `ids` says otherwise. Where it has a `mastership`, requests leave while
+    that holds. Every failure of the port is a LineError.
     """
 
-    def __init__(self, port: str, echo: Echo = Echo.AUTO, ids: TransactionIds = TransactionIds.MATCH) -> None:
-        self._prepare(port, echo, ids)
+    def __init__(
+        self,
+        port: str,
+        echo: Echo = Echo.AUTO,
+        ids: TransactionIds = TransactionIds.MATCH,
+        mastership: Mastership | None = None,
+    ) -> None:
+        self._prepare(port, echo, ids, mastership)
         self._open()
 
     @classmethod
-    def awaited(cls, port: str, echo: Echo, ids: TransactionIds) -> Line:
+    def awaited(cls, port: str, echo: Echo, ids: TransactionIds, mastership: Mastership | None) -> Line:
         """Return a line whose port is not there yet: `regain` opens it."""
         line = cls.__new__(cls)
-        line._prepare(port, echo, ids)
+        line._prepare(port, echo, ids, mastership)
         return line
 
-    def _prepare(self, port: str, echo: Echo, ids: TransactionIds) -> None:
+    def _prepare(self, port: str, echo: Echo, ids: TransactionIds, mastership: Mastership | None) -> None:
+        if mastership is not None:
+            if not isinstance(mastership, Mastership):
+                raise TypeError(f"mastership takes a multidrop.Mastership, not {mastership!r}")
+            check_fencible(port)
         self.port = port
+        self.mastership = mastership
         self.is_tcp = isinstance(port, str) and speaks_tcp(port)
         self.ids = ids
         self.identity = port  # see port_identity; known once the port is open
@@ -82,6 +107,8 @@ class Line:
         self._serial: serial.SerialBase | None = None
         self._tap: Tap | None = None
         self._is_loss_logged = False
+        self.foreign = 0  # bytes that came while it was listened to before a request
+        self._foreign_here = 0  # of these on the port that is open now
         self._is_over = False
         self._why_closed = "it is closed"
         self.why_closing: str | None = None  # why calls on it fail now, though `close` is yet to come
@@ -90,6 +117,7 @@ class Line:
 
     def _make_locks(self) -> None:
         self._lock = threading.RLock()  # one thread opens or closes at a time
+        self._noting = threading.Lock()
         self._callers: list[None] = []  # in `carry_out`; a list grows and shrinks without a lock
 
     def forked(self) -> None:
@@ -123,6 +151,7 @@ class Line:
             core.tell_echo(Echo.OFF if self.is_tcp else self._echo)
             if self._tap:
                 core.tap(self._tap)
+            self._foreign_here = 0
             self.queue = core
             with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
                 port.set_low_latency_mode(True)  # a USB adapter else holds bytes back for 16 ms
@@ -139,13 +168,13 @@ class Line:
         """Give the core a descriptor of this port."""
         if type(port).read is serial.Serial.read:
             fd = port.fileno()
-            return Port(fd, must_take(os.ttyname(fd)))
+            return Port(fd, must_take(os.ttyname(fd)), mastership=self.mastership)
         if connection := connection_of(port):
             hand_on_nothing_late(connection)
-        if self.is_tcp or self.port.startswith("socket://"):
+        if not is_bridged(port):
             os.set_blocking(port.fileno(), False)
-            ids = {"transactions": _TRANSACTIONS[self.ids]} if self.is_tcp else {}
-            return Port(port.fileno(), _NO_SETTINGS, **ids)
+            ids = _TRANSACTIONS[self.ids] if self.is_tcp else Transactions.NONE
+            return Port(port.fileno(), _NO_SETTINGS, transactions=ids, mastership=self.mastership)
         if self._settings:
             set_up(port, self._settings)
         self._bridge = Bridge(port)
@@ -269,6 +298,7 @@ class Line:
                 raise self._closed()
             found = core.carry_out(exchange, not_before_ns=not_before_ns, expires_ns=expires_ns)
             is_lost = found.result < 0 and _is_lost(core, found.result)
+            self.note_foreign()
         finally:
             self._callers.pop()
         if _log.isEnabledFor(logging.DEBUG):
@@ -311,6 +341,23 @@ class Line:
             return None if self._bridge or not self._serial else overruns(self._serial.fileno())
         except (*PORT_FAILURES, TypeError, AttributeError):  # it may be closed meanwhile
             return None
+
+    @property
+    def may_send(self) -> bool:
+        """False where this process is not, or no more, the master of the line."""
+        return self.mastership is None or self.mastership.holds
+
+    def note_foreign(self) -> None:
+        """Log what came while the line was listened to, where it has a mastership."""
+        core = self.queue
+        if self.mastership is None or core is None or core.foreign == self._foreign_here:
+            return
+        with self._noting:
+            now = core.foreign
+            came, self._foreign_here = now - self._foreign_here, now
+            self.foreign += came
+        if came > 0:
+            log_aside(_log, logging.WARNING, FOREIGN, self.port, came)
 
     @property
     def has_echo(self) -> bool:

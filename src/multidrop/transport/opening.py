@@ -79,6 +79,22 @@ def unopened(port: str) -> serial.Serial:
         raise NoSuchPort(port, f"there is no {url.scheme}://; a URL is such as {_URLS}") from mistake
 
 
+def is_bridged(port: serial.SerialBase) -> bool:
+    """Return True for a port that the core cannot write to itself: a thread hands on what it sends."""
+    return type(port).read is not serial.Serial.read and not isinstance(port, SocketPort)
+
+
+def check_fencible(port: str) -> None:
+    """Raise NoSuchPort for a port that nothing can hold back: what a thread has taken leaves later."""
+    if is_bridged(unopened(port)):
+        raise NoSuchPort(
+            port,
+            "a line with a mastership needs a port that the core writes to itself, such as "
+            "socket://10.0.0.7:4001 or a device: what goes through a thread could leave after another "
+            "process has become master",
+        )
+
+
 def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
     """Return the socket of a network port, None for other ports."""
     return getattr(port, "_socket", None)

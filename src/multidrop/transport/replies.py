@@ -6,7 +6,7 @@ from typing import Any
 
 from multidrop.core import STATUSES, Completion, Failure, Framing, Message
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, DriveRefused, NoReply, NoValue
+from multidrop.errors import BadReply, DriveRefused, NoReply, NotMaster, NoValue
 from multidrop.transport.mixed_up import mixed_up, silence_hint
 
 
@@ -29,6 +29,13 @@ def no_reply(drive: Drive, completion: Completion) -> NoReply:
         code = completion.raw[-1]
         return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
     return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))
+
+
+def check_master(drive: Drive, completion: Completion) -> None:
+    """Raise NotMaster where the request was held back, because another process may be the line's master."""
+    if completion.result in (Failure.NOT_MASTER, Failure.OTHER_MASTER):
+        is_sent = completion.sent_ns > 0
+        raise NotMaster(drive.name, _port_of(drive), heard=completion.raw, is_sent=is_sent)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:

@@ -1,0 +1,54 @@
+/* Listening before the first request: a line has one master, and who comes finds out whether it is alone.
+ * Bytes that come while nothing was asked are replies to another master, or its requests. Each of them begins
+ * the wait anew, so that nothing is asked before the line has been silent for long enough.
+ *
+ * A stop is not held up: whoever else is there, the motor must stop. */
+#include "line.h"
+
+enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
+
+/* One burst is borne: it may be the reply to what another master, which is gone, asked last. */
+int md_listen_begin(struct md_line *line, int64_t now_ns)
+{
+    const struct md_exchange *exchange = line->exchange;
+    int longest = exchange->framing == MD_ASCII ? MD_MOST_FRAME : LONGEST_RTU;
+    if (line->transactions || line->state != MD_READY)
+        return 0;
+    line->state = md_line_follows(MD_READY, MD_STRAY_BYTES);
+    line->listen_ns = longest * exchange->character_ns + exchange->drive->most_timeout_ns;
+    line->listened_ns = now_ns + line->listen_ns;
+    line->give_up_ns = line->listened_ns + line->listen_ns;
+    return 1;
+}
+
+int md_listen_is_held(const struct md_line *line)
+{
+    return line->listened_ns && line->state != MD_IDLE && !line->exchange->insists;
+}
+
+void md_listen_put_back(struct md_line *line)
+{
+    line->state = md_line_follows(line->state, MD_ENDED);
+}
+
+void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
+{
+    line->listened_ns = now_ns + line->listen_ns;
+    line->foreign += (uint32_t)len;
+}
+
+int64_t md_listen_free_ns(const struct md_line *line)
+{
+    int64_t silent_ns = md_line_silent_ns(line);
+    return md_listen_is_held(line) ? later(silent_ns, line->listened_ns) : silent_ns;
+}
+
+int md_listen_end(struct md_line *line, int64_t now_ns)
+{
+    if (!md_listen_is_held(line)) /* a stop; what follows it goes on listening */
+        return 1;
+    if (now_ns < line->listened_ns)
+        return 0;
+    line->listened_ns = 0;
+    return 1;
+}

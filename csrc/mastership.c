@@ -1,0 +1,103 @@
+/* The time until which this process may send on its lines, and the kernel's timer that ends the process where
+ * it stood still beyond that. Both are of CLOCK_BOOTTIME, which runs on while the machine sleeps.
+ *
+ * A look at the clock cannot be enough: the process may be stopped between the look and write(2). The timer
+ * needs nothing of the process, and a stopped process can be killed. */
+#include "mastership.h"
+
+#include <errno.h>
+#include <signal.h>
+#include <stdlib.h>
+
+#ifdef __linux__
+
+static int set_timer(struct md_mastership *mastership, int64_t at_ns)
+{
+    struct itimerspec once = {.it_value = timespec_of(at_ns)}; /* 0: called off */
+    return timer_settime(mastership->timer, TIMER_ABSTIME, &once, NULL);
+}
+
+int64_t md_boottime_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_BOOTTIME, &now);
+    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
+}
+
+struct md_mastership *md_mastership_new(void)
+{
+    struct md_mastership *mastership = calloc(1, sizeof *mastership);
+    struct sigevent kill = {.sigev_notify = SIGEV_SIGNAL, .sigev_signo = SIGKILL};
+    if (mastership && timer_create(CLOCK_BOOTTIME, &kill, &mastership->timer) == 0)
+        return mastership;
+    free(mastership);
+    return NULL;
+}
+
+void md_mastership_free(struct md_mastership *mastership)
+{
+    timer_delete(mastership->timer);
+    free(mastership);
+}
+
+#else
+
+static int set_timer(struct md_mastership *mastership, int64_t at_ns)
+{
+    (void)mastership, (void)at_ns;
+    errno = ENOSYS;
+    return -1;
+}
+
+int64_t md_boottime_ns(void)
+{
+    return MD_NEVER; /* later than any deadline: nothing is sent */
+}
+
+struct md_mastership *md_mastership_new(void)
+{
+    errno = ENOSYS;
+    return NULL;
+}
+
+void md_mastership_free(struct md_mastership *mastership)
+{
+    free(mastership);
+}
+
+#endif
+
+int64_t md_mastership_until_ns(const struct md_mastership *mastership)
+{
+    return __atomic_load_n(&mastership->until_ns, __ATOMIC_SEQ_CST);
+}
+
+/* The deadline is read before the clock: a process that stands still between the two finds a later time, and
+ * never an earlier one. */
+int md_mastership_holds(const struct md_mastership *mastership)
+{
+    int64_t until_ns = md_mastership_until_ns(mastership);
+    return until_ns && md_boottime_ns() < until_ns;
+}
+
+/* The timer comes first: no request leaves by a deadline that nobody watches. */
+int md_mastership_extend(struct md_mastership *mastership, int64_t until_ns, int64_t kill_ns)
+{
+    if (set_timer(mastership, kill_ns))
+        return -1;
+    __atomic_store_n(&mastership->until_ns, until_ns, __ATOMIC_SEQ_CST);
+    return 0;
+}
+
+/* The engine's thread has its mutex from the look to the end of write(2): who had it after the deadline was
+ * taken back knows that nothing is on its way there. */
+void md_mastership_end(struct md_mastership *mastership)
+{
+    __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);
+    struct md_engine *engine = __atomic_load_n(&mastership->engine, __ATOMIC_SEQ_CST);
+    if (engine) {
+        md_engine_enter(engine);
+        md_engine_leave(engine);
+    }
+    set_timer(mastership, 0);
+}

@@ -1,0 +1,256 @@
+/* Nothing leaves but by a look at CLOCK_BOOTTIME right before write(2), and what becomes of what does not.
+ * The clock is the test's, and so is write(2); the engine, its thread and the kernel's timer are real. */
+#define _GNU_SOURCE
+#include <stdint.h>
+#include <sys/types.h>
+#include <time.h>
+#include <unistd.h>
+
+static int told_clock(clockid_t clock, struct timespec *now);
+static ssize_t noted_write(int fd, const void *bytes, size_t len);
+#define clock_gettime told_clock
+#include "mastership.c"
+#undef clock_gettime
+#define write noted_write
+#define send send_request /* it is static there, and of another type than the system's */
+#include "port_io.c"
+#undef send
+#undef write
+
+#include <assert.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <stdatomic.h>
+#include <string.h>
+#include <sys/socket.h>
+
+enum { REQUEST = 8, MS = 1000000 };
+static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* no machine here runs for so short a time */
+
+static _Atomic int64_t boottime_ns;
+static atomic_int looks, looks_written, written, most_written;
+static _Atomic int64_t passes_ns; /* while a part of a request is written */
+
+static int told_clock(clockid_t clock, struct timespec *now)
+{
+    assert(clock == CLOCK_BOOTTIME);
+    atomic_fetch_add(&looks, 1);
+    *now = timespec_of(atomic_load(&boottime_ns));
+    return 0;
+}
+
+/* Take no more than most_written bytes; each request and each rest of one has a look of its own. */
+static ssize_t noted_write(int fd, const void *bytes, size_t len)
+{
+    size_t most = (size_t)atomic_load(&most_written);
+    ssize_t taken = write(fd, bytes, len < most ? len : most);
+    atomic_store(&looks_written, atomic_load(&looks));
+    atomic_fetch_add(&written, (int)taken);
+    atomic_fetch_add(&boottime_ns, atomic_load(&passes_ns));
+    return taken;
+}
+
+static struct md_history history, other_history;
+static struct md_drive drive = {.least_timeout_ns = 5 * MS, .most_timeout_ns = 5 * MS, .history = &history};
+static struct md_drive other = {.least_timeout_ns = 5 * MS, .most_timeout_ns = 5 * MS,
+                               .history = &other_history};
+static struct md_exchange reading = {.drive = &drive, .character_ns = 100000, .silence_ns = 4,
+                                     .framing = MD_RTU};
+static struct md_exchange stop;
+static struct md_port *port;
+static struct md_mastership *mastership;
+static int ends[2];
+
+static struct md_completion carry_out(const struct md_exchange *exchange)
+{
+    struct md_completion found;
+    drive.owed_count = 0; /* else late replies would hold the next one back */
+    drive.late_until_ns = 0;
+    atomic_store(&written, 0);
+    md_port_carry_out(port, exchange, 0, 0, &found);
+    return found;
+}
+
+static void make(void)
+{
+    reading.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
+    stop = reading;
+    stop.drive = &other; /* whose late reply holds no reading back */
+    stop.insists = 1;
+    atomic_store(&boottime_ns, BEGIN_NS);
+    atomic_store(&most_written, 1000);
+    int made = socketpair(AF_UNIX, SOCK_STREAM, 0, ends);
+    assert(made == 0);
+    fcntl(ends[0], F_SETFL, O_NONBLOCK);
+    struct md_engine *engine = md_engine_start();
+    assert(engine);
+    port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, 4);
+    assert(port);
+}
+
+static void check_costs_nothing_without_one(void)
+{
+    struct md_completion found = carry_out(&reading);
+    assert(found.result == MD_NO_REPLY && found.sent_ns && atomic_load(&written) == REQUEST);
+    assert(atomic_load(&looks) == 0);
+}
+
+static void check_unsent(const struct md_exchange *exchange)
+{
+    uint32_t failures = drive.failures;
+    struct md_completion found = carry_out(exchange);
+    assert(found.result == MD_NOT_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
+    assert(drive.failures == failures); /* it is no failure of the drive */
+}
+
+static int64_t left_of_timer(void)
+{
+    struct itimerspec left;
+    timer_gettime(mastership->timer, &left);
+    return left.it_value.tv_sec * MD_SECOND_NS + left.it_value.tv_nsec;
+}
+
+static int64_t real_boottime_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_BOOTTIME, &now);
+    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
+}
+
+/* Hold for so long by the test's clock; the kernel's timer goes by its own, an hour ahead. */
+static void extend(int64_t ns)
+{
+    int64_t kill_ns = real_boottime_ns() + 3600 * MD_SECOND_NS;
+    int failed = md_mastership_extend(mastership, atomic_load(&boottime_ns) + ns, kill_ns);
+    assert(!failed && left_of_timer() > 3590 * MD_SECOND_NS);
+}
+
+static void check_sent(const struct md_exchange *exchange)
+{
+    int before = atomic_load(&looks);
+    struct md_completion found = carry_out(exchange);
+    assert(found.result == MD_NO_REPLY && found.sent_ns && atomic_load(&written) == REQUEST);
+    assert(atomic_load(&looks_written) > before);
+}
+
+/* 256 characters of 0.1 ms, and 5 ms. */
+static void check_listens_first(void)
+{
+    struct md_completion found = carry_out(&reading);
+    assert(found.sent_ns - found.begun_ns >= 30 * MS && atomic_load(&written) == REQUEST);
+    found = carry_out(&reading);
+    assert(found.sent_ns - found.begun_ns < 30 * MS);
+}
+
+static void check_deadline(void)
+{
+    extend(1000);
+    check_sent(&reading);
+    atomic_fetch_add(&boottime_ns, 999);
+    check_sent(&reading);
+    atomic_fetch_add(&boottime_ns, 1);
+    check_unsent(&reading);
+    check_unsent(&stop);
+}
+
+/* A part has left when it is too late: the rest does not follow. */
+static void check_rest_is_held_back(void)
+{
+    extend(1000);
+    check_listens_first();
+    atomic_store(&most_written, 3);
+    check_sent(&reading);
+    atomic_store(&passes_ns, 1000);
+    struct md_completion found = carry_out(&reading);
+    assert(found.result == MD_NOT_MASTER && found.sent_ns && atomic_load(&written) == 3);
+    atomic_store(&passes_ns, 0);
+    atomic_store(&most_written, 1000);
+}
+
+/* ---- another master is there ---- */
+
+static atomic_int is_babbling;
+
+static void *babble(void *argument)
+{
+    (void)argument;
+    while (atomic_load(&is_babbling)) {
+        ssize_t put = write(ends[1], "\x01\x03\x02", 3);
+        assert(put == 3);
+        usleep(2000);
+    }
+    return NULL;
+}
+
+static void *read_meanwhile(void *argument)
+{
+    struct md_completion *found = argument;
+    md_port_carry_out(port, &reading, 0, 0, found);
+    return NULL;
+}
+
+static void check_other_master(void)
+{
+    pthread_t other, reader;
+    struct md_completion found, stopped;
+    extend(MD_SECOND_NS);
+    atomic_store(&is_babbling, 1);
+    pthread_create(&other, NULL, babble, NULL);
+    found = carry_out(&reading);
+    assert(found.result == MD_OTHER_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
+    assert(found.raw_len > 0 && md_port_progress(port)->foreign > 0);
+    stopped = carry_out(&stop); /* it is not held up */
+    assert(stopped.sent_ns && stopped.sent_ns - stopped.begun_ns < 30 * MS);
+    assert(atomic_load(&written) == REQUEST);
+    found = carry_out(&reading);
+    assert(found.result == MD_OTHER_MASTER);
+    atomic_store(&is_babbling, 0);
+    pthread_join(other, NULL);
+    uint8_t rest[256];
+    while (recv(ends[1], rest, sizeof rest, MSG_DONTWAIT) > 0)
+        ;
+    check_sent(&reading); /* it has been silent */
+
+    /* a stop that comes while another request listens goes first, and that one follows */
+    md_mastership_end(mastership);
+    check_unsent(&reading);
+    extend(MD_SECOND_NS);
+    reading.character_ns = 2 * MS; /* half a second */
+    pthread_create(&reader, NULL, read_meanwhile, &found);
+    while (!__atomic_load_n(&port->turn.line.listened_ns, __ATOMIC_SEQ_CST))
+        usleep(100);
+    int64_t called_ns = md_now_ns();
+    stopped = carry_out(&stop);
+    pthread_join(reader, NULL);
+    assert(stopped.sent_ns && stopped.sent_ns - called_ns < 100 * MS);
+    assert(found.sent_ns && found.sent_ns - stopped.sent_ns > 300 * MS);
+    reading.character_ns = 100000;
+}
+
+int main(void)
+{
+    alarm(60);
+    make();
+    check_costs_nothing_without_one();
+    mastership = md_mastership_new();
+    assert(mastership);
+    md_port_fence(port, mastership);
+    check_unsent(&reading); /* it was never extended */
+    check_unsent(&stop);
+    extend(1000);
+    check_sent(&stop);
+    check_listens_first();
+    check_deadline();
+    check_rest_is_held_back();
+    check_other_master();
+    md_mastership_end(mastership);
+    assert(left_of_timer() == 0 && md_mastership_until_ns(mastership) == 0);
+    check_unsent(&stop);
+
+    md_port_stop(port);
+    md_port_free(port);
+    md_mastership_free(mastership);
+    close(ends[0]);
+    close(ends[1]);
+    return 0;
+}

@@ -1,0 +1,325 @@
+"""Calls of a process that is not, or no more, the master of the line: nothing leaves, and it is said."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from lines import until
+from toy import Status, Toy
+
+from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, core, insist
+from multidrop.bus import Bus
+from multidrop.errors import NoReply, Unconfirmed
+from multidrop.sim import Simulator, Wire, simulated
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+S = 1_000_000_000
+LISTENING = (
+    256 * 10 / 9600
+)  # s, that the longest frame takes of an RTU line at 9600 baud, and time-outs beside
+
+
+def now_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+class Brief(Toy):
+    """Answers soon, if at all."""
+
+    response_timeout = 0.05
+
+
+def halt() -> Script[None]:
+    yield from insist(Toy.control, Status(0))
+
+
+class Scene:
+    """A bus with a mastership, and one simulated drive that counts what reaches it."""
+
+    def __init__(self, audit: Path) -> None:
+        self.audit = audit
+        self.sim = simulated(Brief(1))
+        self.simulator = Simulator([Wire([self.sim], unpaced=True)])
+        self.simulator.__enter__()
+        self.mastership = Mastership()
+        path = self.simulator.wires[0].path
+        self.bus = Bus(path, mastership=self.mastership, audit=audit, ledger=audit.with_name("ledger"))
+        self.drive = self.bus.attach(Brief(1, name="pump"))
+
+    def close(self) -> None:
+        self.bus.close()
+        self.mastership.end()
+        self.simulator.__exit__(None, None, None)
+
+    def become_master(self) -> None:
+        self.mastership.extend(now_ns() + 1000 * S)
+
+    @property
+    def requests(self) -> int:
+        return self.sim.counters.requests + self.sim.counters.damaged
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    made = Scene(tmp_path / "audit.jsonl")
+    yield made
+    made.close()
+
+
+CALLS: dict[str, Callable[[Scene], object]] = {
+    "read": lambda scene: scene.bus.read(scene.drive, Toy.output_current),
+    "write": lambda scene: scene.bus.write(scene.drive, Toy.acceleration_time, 20.0),
+    "ask": lambda scene: scene.bus.ask(scene.drive, 3, 1, 1),
+    "raw": lambda scene: scene.bus.raw(scene.drive, 6, 0x15, b"\x00\x01"),
+    "start": lambda scene: scene.drive.start(),
+    "stop": lambda scene: scene.drive.stop(),
+    "step of a stop": lambda scene: scene.bus.perform(scene.drive, halt()),
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_nothing_is_sent_before_it_is_master(scene: Scene, call: Callable[[Scene], object]) -> None:
+    begun = time.monotonic()
+    with pytest.raises(NotMaster) as failure:
+        call(scene)
+    assert time.monotonic() - begun < 10  # a stop is not repeated
+    assert not failure.value.is_sent
+    assert not failure.value.heard
+    assert scene.requests == 0
+    assert scene.bus.statistics().counters.sent == 0
+    assert scene.audit.read_text() == ""  # what was not sent is no write
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_nothing_is_sent_after_it_was_master(scene: Scene, call: Callable[[Scene], object]) -> None:
+    scene.become_master()
+    scene.bus.read(scene.drive, Toy.output_current)
+    before = scene.requests
+    scene.mastership.end()
+    with pytest.raises(NotMaster):
+        call(scene)
+    assert scene.requests == before
+
+
+def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
+    for _ in range(3):
+        with pytest.raises(NotMaster):
+            scene.bus.read(scene.drive, Toy.output_current)
+    assert scene.bus.peer(scene.drive).failures == 0
+    assert scene.bus.statistics().counters.ended == {core.Status.NOT_MASTER: 3}
+
+
+def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
+    """Nobody calls anything: the clock decides."""
+    mastership = Mastership(guard_s=1000)
+    path = scene.simulator.wires[0].path
+    scene.bus.close()
+    with Bus(path, mastership=mastership) as bus:
+        drive = bus.attach(Brief(1, name="pump"))
+        mastership.extend(until_ns := now_ns() + 2 * S)
+        bus.read(drive, Toy.output_current)
+        read_ns, before = now_ns(), scene.requests
+        assert read_ns < until_ns, "the machine is too busy for this"
+        failure = None
+        while failure is None:
+            try:
+                bus.read(drive, Toy.output_current)
+                before = scene.requests
+            except NotMaster as unsent:
+                failure = unsent
+        assert now_ns() >= until_ns
+        assert scene.requests == before
+        mastership.end()
+
+
+def test_a_stop_says_that_it_was_not_sent(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    port = scene.bus.line.port
+    sentence = (
+        "pump: the stop was NOT sent, and its motor goes on as it is: this process may not send on "
+        f"{port} any more, and another one may be its master now. Stop it through the process that is master "
+        "of its line now, or at the drive itself"
+    )
+    with caplog.at_level(logging.INFO, "multidrop.control"):
+        with pytest.raises(NotMaster) as failure:
+            scene.drive.stop()
+        until(lambda: any(record.levelno == logging.CRITICAL for record in caplog.records))
+    assert str(failure.value) == sentence
+    assert [record.getMessage() for record in caplog.records if record.levelno == logging.CRITICAL] == [
+        sentence
+    ]
+
+
+def test_a_stop_of_all_says_it_of_each(scene: Scene) -> None:
+    other = scene.bus.attach(Brief(2, name="fan"))
+    found = scene.bus.stop_all()
+    assert {name: stopped.seen for name, stopped in found.items()} == {
+        "pump": Seen.FAILED,
+        "fan": Seen.FAILED,
+    }
+    assert all("the stop was NOT sent, and its motor goes on" in stopped.why for stopped in found.values())
+    assert scene.requests == 0
+    assert other.bus is scene.bus
+
+
+def test_a_look_at_what_was_started_says_why_there_is_none(scene: Scene) -> None:
+    scene.become_master()
+    scene.drive.start()
+    scene.mastership.end()
+    with pytest.raises(NotMaster, match=r"^pump: not sent: not master: this process may not send on "):
+        scene.drive.state()
+
+
+def test_commands_go_on_when_it_is_master_again(scene: Scene) -> None:
+    scene.become_master()
+    scene.drive.start()
+    scene.mastership.end()
+    with pytest.raises(NotMaster):
+        scene.drive.stop()
+    scene.become_master()
+    scene.drive.stop()
+    assert scene.requests > 0
+
+
+# ---- another master ----
+
+
+@pytest.fixture
+def shared() -> Iterator[tuple[int, Bus, Mastership]]:
+    """A port that nobody answers on, seen from the line."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    os.set_blocking(far, False)
+    mastership = Mastership()
+    mastership.extend(now_ns() + 1000 * S)
+    with Bus(os.ttyname(near), mastership=mastership) as bus:
+        yield far, bus, mastership
+    mastership.end()
+    os.close(far)
+    os.close(near)
+
+
+class Babbler:
+    """Another master, which asks again and again until it falls silent."""
+
+    def __init__(self, far: int) -> None:
+        self._far, self._is_over = far, threading.Event()
+        self._thread = threading.Thread(target=self._ask)
+        self._thread.start()
+
+    def _ask(self) -> None:
+        while not self._is_over.wait(0.02):
+            os.write(self._far, b"\x07\x03\x00\x01\x00\x01\xd5\xac")
+
+    def stop(self) -> None:
+        self._is_over.set()
+        self._thread.join()
+
+
+def sent_on(far: int) -> bytes:
+    try:
+        return os.read(far, 4096)
+    except BlockingIOError:
+        return b""
+
+
+def test_the_line_is_listened_to_before_the_first_request(shared: tuple[int, Bus, Mastership]) -> None:
+    far, bus, _ = shared
+    drive = bus.attach(Brief(1, name="pump"))
+    listening = LISTENING + 0.05
+    for is_first in (True, False):
+        begun = time.monotonic()
+        with pytest.raises(NoReply):
+            bus.ask(drive, 3, 1, 1, expiry=60)
+        assert not is_first or time.monotonic() - begun >= listening
+        assert sent_on(far)
+
+
+def test_it_listens_anew_where_it_was_not_master_for_a_while(shared: tuple[int, Bus, Mastership]) -> None:
+    far, bus, mastership = shared
+    drive = bus.attach(Brief(1, name="pump"))
+    with pytest.raises(NoReply):
+        bus.ask(drive, 3, 1, 1, expiry=60)
+    sent_on(far)
+    mastership.end()
+    with pytest.raises(NotMaster):
+        bus.ask(drive, 3, 1, 1, expiry=60)
+    mastership.extend(now_ns() + 1000 * S)
+    begun = time.monotonic()
+    with pytest.raises(NoReply):
+        bus.ask(drive, 3, 1, 1, expiry=60)
+    assert time.monotonic() - begun >= LISTENING
+    assert sent_on(far)
+
+
+def test_another_master_is_told_and_nothing_is_sent(
+    shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
+) -> None:
+    far, bus, _ = shared
+    drive = bus.attach(Brief(1, name="pump"))
+    other = Babbler(far)
+    try:
+        for call in (
+            lambda: bus.ask(drive, 3, 1, 1, expiry=60),
+            lambda: bus.write(drive, Toy.frequency, 5.0),
+        ):
+            with pytest.raises(NotMaster) as failure:
+                call()
+            assert failure.value.heard
+            assert "before anything was asked, which another master causes (07 03 00 01 " in str(
+                failure.value
+            )
+        assert sent_on(far) == b""
+        until(lambda: "another master: " in caplog.text)
+        assert bus.line.foreign > 0
+    finally:
+        other.stop()
+    with pytest.raises(NoReply):  # it has been silent: it is asked
+        bus.ask(drive, 3, 1, 1, expiry=60)
+    assert sent_on(far)
+
+
+def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership]) -> None:
+    far, bus, _ = shared
+    drive = bus.attach(Brief(1, name="pump"))
+    other = Babbler(far)
+    try:
+        with pytest.raises(Unconfirmed, match=r"^pump: it is not known whether the stop took effect"):
+            drive.stop(seconds=0)
+    finally:
+        other.stop()
+    assert b"\x01\x06\x00\x14\x00\x00" in sent_on(far)
+
+
+# ---- ports and arguments that cannot be ----
+
+
+@pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
+def test_a_bridged_port_is_refused(port: str) -> None:
+    with pytest.raises(
+        NoSuchPort, match="a line with a mastership needs a port that the core writes to itself"
+    ):
+        Bus(port, mastership=Mastership())
+    with pytest.raises(NoSuchPort):
+        Bus.awaiting(port, mastership=Mastership())
+
+
+def test_a_mastership_is_one() -> None:
+    with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.Mastership, not 0\.7$"):
+        Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
+
+
+def test_an_unmastered_bus_is_as_before(scene: Scene) -> None:
+    path = scene.simulator.wires[0].path
+    scene.bus.close()
+    with Bus(path) as bus:
+        assert bus.read(bus.attach(Brief(1)), Toy.output_current) == 0.0

@@ -1,0 +1,194 @@
+"""Mastership: a deadline of CLOCK_BOOTTIME; the kernel kills a process that stood still beyond it."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+import multidrop
+from multidrop import Mastership
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+S = 1_000_000_000
+KEEPER = """
+import sys, time
+from multidrop import Mastership
+mastership = Mastership(guard_s=float(sys.argv[1]))
+mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + round(float(sys.argv[2]) * 1e9))
+exec(sys.argv[3])
+print(mastership.until_ns, flush=True)
+sys.stdin.read()
+"""
+
+
+def now_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+@contextmanager
+def keeper(guard_s: float, seconds: float, then: str = "pass") -> Iterator[subprocess.Popen[str]]:
+    """A process with a mastership of so many seconds; its first line is the deadline."""
+    words = [sys.executable, "-c", KEEPER, str(guard_s), str(seconds), then]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def until_of(process: subprocess.Popen[str]) -> int:
+    assert process.stdout
+    return int(process.stdout.readline())
+
+
+def test_it_does_not_hold_before_it_is_extended() -> None:
+    mastership = Mastership()
+    assert (mastership.until_ns, mastership.holds, mastership.guard_s) == (0, False, 0.7)
+    assert repr(mastership) == "<Mastership not held, guard 0.7 s>"
+
+
+def test_it_holds_until_its_deadline() -> None:
+    mastership = Mastership(guard_s=100)
+    until_ns = now_ns() + S // 20
+    mastership.extend(until_ns)
+    assert mastership.until_ns == until_ns
+    assert mastership.holds or now_ns() >= until_ns
+    while now_ns() < until_ns:
+        time.sleep(0.001)
+    assert not mastership.holds
+    assert mastership.until_ns == until_ns
+    mastership.end()
+    assert (mastership.until_ns, mastership.holds) == (0, False)
+
+
+def test_a_deadline_never_goes_backwards() -> None:
+    mastership = Mastership()
+    later = now_ns() + 200 * S
+    mastership.extend(later)
+    mastership.extend(later - 100 * S)
+    assert mastership.until_ns == later
+    mastership.extend(later + 1)
+    assert mastership.until_ns == later + 1
+    mastership.end()
+
+
+def test_it_holds_anew_after_its_end() -> None:
+    mastership = Mastership()
+    mastership.extend(now_ns() + 200 * S)
+    mastership.end()
+    mastership.end()
+    mastership.extend(sooner := now_ns() + 100 * S)
+    assert mastership.until_ns == sooner
+    mastership.end()
+
+
+def test_threads_that_extend_at_once_leave_the_latest_deadline() -> None:
+    mastership = Mastership()
+    first = now_ns() + 200 * S
+    offers = [[first + 8 * n + thread for n in range(500)] for thread in range(8)]
+    threads = [
+        threading.Thread(target=lambda times=times: [*map(mastership.extend, times)]) for times in offers
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert mastership.until_ns == max(map(max, offers))
+    mastership.end()
+
+
+def test_a_time_that_is_past_is_refused_and_arms_nothing() -> None:
+    """A timer that is set to the past kills at once."""
+    mastership = Mastership(guard_s=1e-6)
+    with pytest.raises(ValueError, match=r"^until_ns = \d+ is past, by 1\.\d+ s of CLOCK_BOOTTIME: "):
+        mastership.extend(now_ns() - S)
+    mastership.extend(until_ns := now_ns() + 100 * S)
+    with pytest.raises(ValueError, match="is past"):
+        mastership.extend(0)
+    assert mastership.until_ns == until_ns
+    mastership.end()
+
+
+@pytest.mark.parametrize("wrong", [1.5, "now", None, True])
+def test_a_deadline_is_a_whole_number(wrong: object) -> None:
+    with pytest.raises(TypeError, match=r"^until_ns is a whole number of ns of CLOCK_BOOTTIME, not "):
+        Mastership().extend(wrong)  # type: ignore[arg-type]
+
+
+def test_a_deadline_beyond_all_time_is_refused() -> None:
+    with pytest.raises(ValueError, match="is beyond"):
+        Mastership().extend(1 << 63)
+
+
+@pytest.mark.parametrize("wrong", [0, -1, float("nan"), float("inf"), 3601])
+def test_a_guard_is_a_time(wrong: float) -> None:
+    with pytest.raises(ValueError, match=r"^guard_s = .* must be above 0 and at most 3600, in s$"):
+        Mastership(wrong)
+
+
+def test_a_guard_is_a_number() -> None:
+    with pytest.raises(TypeError, match=r"^guard_s is a number of seconds, not '1'$"):
+        Mastership("1")  # type: ignore[arg-type]
+
+
+def test_the_kernel_kills_a_stopped_process_half_a_guard_after_its_deadline() -> None:
+    with keeper(0.4, 0.3) as process:
+        until_ns = until_of(process)
+        process.send_signal(signal.SIGSTOP)
+        assert process.wait(60) == -signal.SIGKILL
+        assert now_ns() >= until_ns + S // 5
+
+
+def test_a_process_that_extends_in_time_lives() -> None:
+    then = (
+        "for n in range(40):\n"
+        " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
+        "time.sleep(0.7)"  # the first deadline and its guard are over
+    )
+    with keeper(0.2, 0.3, then) as process:
+        assert until_of(process)
+        assert process.poll() is None
+
+
+@pytest.mark.parametrize(
+    "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
+)
+def test_a_process_that_ended_it_is_not_killed(end: str) -> None:
+    with keeper(0.1, 0.2, f"{end}; time.sleep(0.6)") as process:
+        assert until_of(process) == 0
+        assert process.poll() is None
+
+
+def test_a_child_of_a_fork_is_no_master() -> None:
+    mastership = Mastership()
+    mastership.extend(now_ns() + 100 * S)
+    if (child := os.fork()) == 0:
+        found = 1
+        try:
+            mastership.end()  # it does not call the parent's timer off
+            mastership.extend(now_ns() + 200 * S)
+        except ValueError as refusal:
+            held = mastership.holds or mastership.until_ns
+            found = 0 if "make another one here" in str(refusal) and not held else 2
+        finally:
+            os._exit(found)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert mastership.holds
+    mastership.end()
+
+
+def test_it_is_a_public_name() -> None:
+    assert multidrop.Mastership is Mastership
+    gc.collect()
