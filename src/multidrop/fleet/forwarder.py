@@ -1,0 +1,145 @@
+"""Forwarder: a spool's messages into the stream, in order, each once.
+
+One message is under way at a time, and says which place the last of its subject must have: the stream takes
+it there or not at all. After any doubt (start, time-out, refusal) the stream is asked for the last of the
+subject, and it goes on behind that. There is no offset file, and no window of time that duplicates outlive.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from nats.aio.client import Client
+
+from multidrop.fleet.samples_stream import (
+    DIGEST,
+    EXPECTED,
+    LOST,
+    SEQUENCE,
+    StreamError,
+    digest_of,
+    last_of,
+    publish,
+    subject_of,
+)
+from multidrop.fleet.spool import Spool
+from multidrop.fleet.spool_folder import StoredMessage
+
+AGAIN_S = 0.25  # between attempts at a stream that failed
+LOOKING_S = 1.0  # for a message that nobody announced
+SET_BACK = (
+    "the stream has message {} of the log {}, and the spool has {}: its folder was copied or set back; "
+    "move it away, and a new log begins"
+)
+
+_log = logging.getLogger("multidrop.fleet.forwarder")
+
+
+class ForwarderState(NamedTuple):
+    """Messages that were sent since the start, the last sequence in the stream, and what is wrong now."""
+
+    sent: int
+    last: int | None  # None: the stream was not asked yet
+    trouble: str | None
+
+
+class NotOurLog(Exception):
+    """The stream has another message under a number of this log: the folder was copied, or set back."""
+
+
+class Forwarder:
+    """Sends the messages of a spool over this connection until cancelled: `await forwarder.run()`."""
+
+    def __init__(self, spool: Spool, client: Client) -> None:
+        self._spool, self._client = spool, client
+        self._subject = subject_of(spool.gateway, spool.log)
+        self._news = asyncio.Event()
+        self._sent = 0
+        self._last: int | None = None
+        self._trouble: str | None = None
+
+    def state(self) -> ForwarderState:
+        return ForwarderState(self._sent, self._last, self._trouble)
+
+    async def run(self) -> None:
+        """Forward until cancelled; whatever goes wrong is told once, and tried again."""
+        loop = asyncio.get_running_loop()
+
+        def announce() -> None:
+            with suppress(RuntimeError):  # the loop is over
+                loop.call_soon_threadsafe(self._news.set)
+
+        self._spool.on_message = announce
+        while True:
+            try:
+                await self._forward()
+            except (StreamError, NotOurLog, OSError) as failure:
+                self._note(str(failure))
+            await asyncio.sleep(AGAIN_S)
+
+    async def _forward(self) -> None:
+        """Ask where the stream is, and send what is behind that, until there is a doubt."""
+        place, sequence = await self._ask()
+        self._note(None)
+        while True:
+            self._news.clear()
+            stored = self._spool.following(sequence)
+            if stored is None:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._news.wait(), LOOKING_S)
+                continue
+            data = await asyncio.to_thread(_read, stored.path)
+            if data is None:  # removed meanwhile: the spool is full
+                continue
+            found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
+            if found is None:  # an earlier attempt of ours came through
+                return
+            place, sequence = found, stored.sequence
+            self._sent += 1
+            self._have(sequence)
+
+    async def _ask(self) -> tuple[int, int]:
+        """Return the place and the sequence of the last message that the stream has of this log."""
+        last = await last_of(self._client, self._subject)
+        if last is None:
+            sequence = self._last or 0  # the stream keeps no message for ever
+            self._have(sequence)
+            return 0, sequence
+        if last.sequence > self._spool.state().newest:
+            raise NotOurLog(SET_BACK.format(last.sequence, self._spool.log, "no such message"))
+        stored = self._spool.stored(last.sequence)
+        data = await asyncio.to_thread(_read, stored.path) if stored else None
+        if data is not None and digest_of(data) != last.digest:
+            raise NotOurLog(SET_BACK.format(last.sequence, self._spool.log, "another one"))
+        self._have(last.sequence)
+        return last.place, last.sequence
+
+    def _headers(self, stored: StoredMessage, data: bytes, place: int) -> dict[str, str]:
+        return {
+            EXPECTED: str(place),
+            SEQUENCE: str(stored.sequence),
+            DIGEST: digest_of(data),
+            LOST: str(self._spool.state().lost),
+        }
+
+    def _have(self, sequence: int) -> None:
+        self._last = sequence
+        self._spool.acknowledge(sequence)
+
+    def _note(self, trouble: str | None) -> None:
+        if trouble and trouble != self._trouble:
+            _log.error("samples are not forwarded: %s", trouble)
+        if self._trouble and not trouble:
+            _log.warning("samples are forwarded again, behind message %s", self._last)
+        self._trouble = trouble
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None

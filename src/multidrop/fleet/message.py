@@ -1,0 +1,151 @@
+"""Messages: many rows as one Arrow IPC stream that any Arrow reader opens, two to three bytes a row.
+
+| column           | type                            | meaning                                               |
+|------------------|---------------------------------|-------------------------------------------------------|
+| `time`           | timestamp[ns, UTC]              | the request was sent                                  |
+| `clock_ns`       | int64                           | time - monotonic_ns: nearly the same in all rows      |
+| `uncertainty_us` | int32, null for a miss          | the value was taken between time and this much later  |
+| `drive`          | dictionary of utf8              | the drive's name                                      |
+| `register`       | dictionary of utf8              | the register's name                                   |
+| `value`          | float64, null for a miss        | in the register's unit                                |
+| `status`         | dictionary of utf8              | `ok`, or why there is no value                        |
+
+Rows are ordered by register, and for one register as they were polled: values that are alike lie side by
+side, and a time that ten registers share costs little more than one. Buffers are compressed by zstd-1;
+dictionaries hold the names of these rows alone. An uncertainty is rounded up to whole microseconds: the bound
+stays true, and its last ten bits are noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from multidrop import BatchColumns
+
+MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its headers included
+MOST_ROWS = 1 << 16
+LONGEST_US = (1 << 31) - 1
+COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
+NAMED = pa.dictionary(pa.uint16(), pa.utf8())
+TIMES = pa.timestamp("ns", "UTC")
+ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
+    [
+        pa.field("time", TIMES, nullable=False),
+        pa.field("monotonic_ns", pa.int64(), nullable=False),
+        pa.field("uncertainty_ns", pa.int64()),
+        pa.field("drive", NAMED, nullable=False),
+        pa.field("register", NAMED, nullable=False),
+        pa.field("value", pa.float64()),
+        pa.field("status", NAMED, nullable=False),
+    ]
+)
+_KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
+_KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
+
+
+class MessageError(ValueError):
+    """Bytes that are no message."""
+
+
+class Packed(NamedTuple):
+    """A message, and the number of its rows."""
+
+    data: bytes
+    rows: int
+
+
+class RowBuffer:
+    """Rows of many batches of one poller, copied: its memory is free again at once."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._names: dict[str, tuple[str, ...]] = {"drive": (), "register": (), "status": ()}
+        self._columns = {name: bytearray() for name in _KINDS}
+
+    def add(self, columns: BatchColumns) -> bool:
+        """Copy the rows; False for those of another poller, whose codes stand for other names."""
+        names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
+        if any(not _continues(names[of], known) for of, known in self._names.items()):
+            return False
+        self._names = names
+        for name, copied in self._columns.items():
+            copied += getattr(columns, name).cast("B")
+        self.rows += len(columns.time)
+        return True
+
+    def messages(self, most: int = MOST_BYTES) -> Iterator[Packed]:
+        """Yield the rows as messages of at most `most` bytes and 65536 rows."""
+        column = {
+            name: pa.Array.from_buffers(kind, self.rows, [None, pa.py_buffer(self._columns[name])])
+            for name, kind in _KINDS.items()
+        }
+        is_sample = pc.equal(column["status"], 0)
+        columns = {
+            "time": column["time"].cast(TIMES),
+            "clock_ns": pc.subtract(column["time"], column["monotonic_ns"]),
+            "uncertainty_us": _microseconds(pc.if_else(is_sample, column["uncertainty_ns"], None)),
+            "drive": column["drive"],
+            "register": column["register"],
+            "value": pc.if_else(is_sample, column["value"], None),
+            "status": column["status"],
+        }
+        rows = pa.RecordBatch.from_pydict(columns)
+        for begin in range(0, self.rows, MOST_ROWS):
+            yield from _pieces(rows.slice(begin, MOST_ROWS), self._names, most)
+
+
+def _continues(names: tuple[str, ...], known: tuple[str, ...]) -> bool:
+    return names is known or names[: len(known)] == known
+
+
+def unpack(data: bytes | memoryview) -> Any:
+    """Return the rows of a message as a pyarrow.Table with the columns of `ROWS`. Raises MessageError."""
+    try:
+        with pa.ipc.open_stream(data) as reader:
+            table = reader.read_all()
+        table.validate(full=True)
+        columns = {name: table.column(name) for name in ("time", "clock_ns", "drive", "register", "status")}
+        columns["monotonic_ns"] = pc.subtract(columns["time"].cast(pa.int64()), columns.pop("clock_ns"))
+        columns["uncertainty_ns"] = pc.multiply(table.column("uncertainty_us").cast(pa.int64()), 1000)
+        columns["value"] = table.column("value")
+        return pa.table([columns[name].cast(ROWS.field(name).type) for name in ROWS.names], schema=ROWS)
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError, MemoryError) as error:
+        first = (str(error) or type(error).__name__).splitlines()[0]
+        raise MessageError(f"{len(data)} bytes are no message of samples: {first}") from error
+
+
+def _microseconds(ns: Any) -> Any:
+    up = pc.divide(pc.add(ns, 999), 1000)
+    return pc.min_element_wise(up, LONGEST_US, skip_nulls=False).cast(pa.int32())
+
+
+def _pieces(rows: Any, names: Mapping[str, Sequence[str]], most: int) -> Iterator[Packed]:
+    data = _stream(_coded(rows, names))
+    if len(data) <= most or len(rows) < 2:
+        yield Packed(data, len(rows))
+        return
+    middle = len(rows) // 2
+    yield from _pieces(rows.slice(0, middle), names, most)
+    yield from _pieces(rows.slice(middle), names, most)
+
+
+def _coded(rows: Any, names: Mapping[str, Sequence[str]]) -> Any:
+    rows = rows.take(pc.array_sort_indices(rows.column("register")))
+    columns = {name: rows.column(name) for name in rows.schema.names}
+    for name, known in names.items():
+        used = columns[name].unique().sort()
+        codes = pc.index_in(columns[name], value_set=used).cast(pa.uint16())
+        texts = pa.array([known[code] for code in used.to_pylist()], pa.utf8())
+        columns[name] = pa.DictionaryArray.from_arrays(codes, texts)
+    return pa.RecordBatch.from_pydict(columns)
+
+
+def _stream(rows: Any) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, rows.schema, options=COMPRESSED) as writer:
+        writer.write_batch(rows)
+    return bytes(sink.getvalue())

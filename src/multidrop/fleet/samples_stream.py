@@ -1,0 +1,246 @@
+"""The stream of all gateways' samples, by NATS JetStream's own API (ADR-31 for direct gets).
+
+A message has the subject `samples.<gateway>.<log id>`, its number in that log as the header
+`Multidrop-Sequence`, and a digest of its bytes. Nothing here keeps a state: the stream is asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from nats.aio.client import Client
+from nats.errors import Error, NoRespondersError
+
+STREAM = "samples"
+SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
+EXPECTED = "Nats-Expected-Last-Subject-Sequence"
+OLDEST_SERVER = (2, 12)
+ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
+NO_MESSAGE, WRONG_SEQUENCE = 10037, 10071  # error codes of JetStream
+
+
+class StreamError(OSError):
+    """NATS is not reached, refuses, or has no such stream. One sentence."""
+
+
+class StreamAbout(NamedTuple):
+    """A stream's identity and extent: a stream that is made anew counts from 1 again."""
+
+    created: str
+    first: int
+    last: int
+
+
+class LastMessage(NamedTuple):
+    """The newest message of a subject: its place in the stream, its number in the log, its digest."""
+
+    place: int
+    sequence: int
+    digest: str
+
+
+class StreamMessage(NamedTuple):
+    """A message as the hub reads it; `sequence` 0 stands for a header that is missing or no number."""
+
+    place: int
+    gateway: str
+    log: str
+    sequence: int
+    lost: int  # rows that the gateway's spool had lost when it sent this
+    data: bytes
+
+
+def subject_of(gateway: str, log: str) -> str:
+    return f"{STREAM}.{gateway}.{log}"
+
+
+def digest_of(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+async def connect(servers: list[str], **options: Any) -> Client:
+    """Return a connection that comes back by itself. Raises StreamError."""
+    client = Client()
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            await client.connect(
+                servers,
+                allow_reconnect=True,
+                max_reconnect_attempts=-1,
+                reconnect_time_wait=1,
+                ping_interval=2,
+                **{"error_cb": _ignore, **options},
+            )
+    except (Error, OSError, TimeoutError) as failure:
+        last = client.last_error or failure
+        raise StreamError(f"no server of NATS answers at {', '.join(servers)}: {_text(last)}") from failure
+    version = client.connected_server_version
+    if (version.major, version.minor) < OLDEST_SERVER:
+        await client.close()
+        raise StreamError(
+            f"the server of NATS at {', '.join(servers)} is {version.major}.{version.minor}.{version.patch}: "
+            f"a fleet needs {'.'.join(map(str, OLDEST_SERVER))} or newer"
+        )
+    return client
+
+
+async def _ignore(_: Exception) -> None:
+    """Leave it to who asks: the client would log a traceback for each."""
+
+
+async def create_stream(client: Client, *, replicas: int = 3, most_bytes: int = -1) -> None:
+    """Make the stream where there is none; the oldest messages go when it has more than `most_bytes`."""
+    config = {
+        "name": STREAM,
+        "subjects": [f"{STREAM}.*.*"],
+        "retention": "limits",
+        "discard": "old",
+        "storage": "file",
+        "num_replicas": replicas,
+        "max_bytes": most_bytes,
+        "allow_direct": True,
+        "deny_delete": True,
+    }
+    await _ask(client, f"STREAM.CREATE.{STREAM}", config)
+
+
+async def about(client: Client) -> StreamAbout:
+    """Return the stream's identity and extent. Raises StreamError."""
+    found = await _ask(client, f"STREAM.INFO.{STREAM}", {})
+    config, state = found["config"], found["state"]
+    if not config.get("allow_direct"):
+        raise StreamError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
+    return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
+
+
+async def last_of(client: Client, subject: str) -> LastMessage | None:
+    """Return the newest message of a subject, by the stream's leader. Raises StreamError."""
+    found = await _ask(client, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
+    if found is None:
+        return None
+    message = found["message"]
+    lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
+    headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    return LastMessage(int(message["seq"]), _number(headers.get(SEQUENCE)), headers.get(DIGEST, ""))
+
+
+async def publish(client: Client, subject: str, data: bytes, headers: dict[str, str]) -> int | None:
+    """Store a message, and return its place; None where the subject's last one is another than expected.
+
+    Raises StreamError: then it may be stored or not.
+    """
+    try:
+        answer = await client.request(subject, data, timeout=ANSWER_S, headers=headers)
+    except NoRespondersError as failure:
+        raise StreamError(f"no stream takes {subject}: it has no leader now, or there is none") from failure
+    except (Error, OSError, TimeoutError) as failure:
+        raise _silent(client, failure) from failure
+    found = _parsed(answer.data)
+    if error := found.get("error"):
+        if error.get("err_code") == WRONG_SEQUENCE:
+            return None
+        raise StreamError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
+    return int(found["seq"])
+
+
+async def read_after(client: Client, place: int, messages: int, size: int) -> list[StreamMessage]:
+    """Return the next messages behind this place: so many and bytes at most, without a hole among them.
+
+    An empty list says that there is none now. Any replica may answer. Raises StreamError.
+    """
+    inbox = client.new_inbox()
+    wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
+    found: list[StreamMessage] = []
+    try:
+        subscribed = await client.subscribe(inbox)
+        try:
+            await client.publish(f"$JS.API.DIRECT.GET.{STREAM}", json.dumps(wanted).encode(), reply=inbox)
+            before = 0
+            while True:
+                message = await subscribed.next_msg(timeout=ANSWER_S)
+                headers = {str(name): value for name, value in (message.headers or {}).items()}
+                if "Nats-Sequence" not in headers:
+                    _check_end(headers)
+                    return found
+                if _number(headers.get("Nats-Last-Sequence")) != before:  # one was lost on the way here
+                    return found
+                found.append(_stream_message(headers, message.data))
+                before = found[-1].place
+        finally:
+            await subscribed.unsubscribe()
+    except (Error, OSError, TimeoutError) as failure:
+        if found:  # each is whole, and the next call goes on behind them
+            return found
+        raise failure if isinstance(failure, StreamError) else _silent(client, failure) from failure
+
+
+def _check_end(headers: Mapping[str, str]) -> None:
+    status = headers.get("Status", "")
+    if status == "503":
+        raise StreamError(f"there is no stream {STREAM!r}, or it has no leader now")
+    if status not in ("204", "404"):
+        raise StreamError(f"the stream {STREAM!r} gives nothing: {status} {headers.get('Description', '')}")
+
+
+def _stream_message(headers: Mapping[str, str], data: bytes) -> StreamMessage:
+    _, gateway, log, *_ = [*headers.get("Nats-Subject", "").split("."), "", "", ""]
+    return StreamMessage(
+        int(headers["Nats-Sequence"]),
+        gateway,
+        log,
+        _number(headers.get(SEQUENCE)),
+        _number(headers.get(LOST)),
+        data,
+    )
+
+
+def _number(text: str | None) -> int:
+    return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
+
+
+async def _ask(client: Client, subject: str, what: Mapping[str, Any], *none: int) -> Any:
+    """Return the answer of JetStream's API; None for one of these errors."""
+    try:
+        answer = await client.request(f"$JS.API.{subject}", json.dumps(what).encode(), timeout=ANSWER_S)
+    except NoRespondersError as failure:
+        raise StreamError("the servers of NATS run without JetStream, or have no quorum now") from failure
+    except (Error, OSError, TimeoutError) as failure:
+        raise _silent(client, failure) from failure
+    found = _parsed(answer.data)
+    error = found.get("error")
+    if not error:
+        return found
+    if error.get("err_code") in none:
+        return None
+    if error.get("err_code") == 10059:
+        raise StreamError(f"there is no stream {STREAM!r}: make it by `multidrop fleet init`")
+    raise StreamError(f"NATS refuses {subject}: {error.get('description')}")
+
+
+def _parsed(data: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(data)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise StreamError("NATS answers something else than JSON")
+    return found
+
+
+def _silent(client: Client, failure: Exception) -> StreamError:
+    """Say why nothing was answered: a server tells of missing rights beside the answer, not by it."""
+    last = client.last_error
+    if last and "permissions violation" in str(last).lower():
+        return StreamError(f"the rights of this connection do not suffice: {_text(last)}")
+    if not client.is_connected:
+        return StreamError(f"NATS is not reached: {_text(last or failure)}")
+    return StreamError(f"NATS did not answer within {ANSWER_S:.0f} s")
+
+
+def _text(failure: Exception) -> str:
+    return str(failure).removeprefix("nats: ") or type(failure).__name__

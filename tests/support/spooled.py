@@ -1,0 +1,67 @@
+"""Batches of a plant, and what a spool or a stream has of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from completions import add_miss, add_rows, new_completion
+
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
+from multidrop.fleet.message import unpack
+from multidrop.polling.batch import Batch
+
+NOON = 1_795_262_400_000_000_000  # 2026-11-21 12:00 UTC
+STEP = 10_000_000  # ns between requests
+DRIVES = Names([f"pump-{number}" for number in range(1, 5)])
+REGISTERS = Names([f"value_{number}" for number in range(1, 11)])
+MISSED = 9  # the rest of numbers whose request was not answered, modulo 10
+
+
+def numbered(first: int, count: int, drives: Names = DRIVES) -> Batch:
+    """Make `count` exchanges of ten registers in the core's memory, as a poll does.
+
+    Exchange `n` was sent at `n * STEP` of the monotonic clock, to drive `n % 4`; register `r` has the value
+    `n % 60000 + r`. Each tenth is a miss.
+    """
+    columns = Columns(10 * count)
+    layouts = [
+        RowLayout(drive, [Field(at, NumberFormat.U16, at, 1.0, 1.0) for at in range(10)])
+        for drive in range(4)
+    ]
+    for number in range(first, first + count):
+        layout = layouts[number % 4]
+        if number % 10 == MISSED:
+            assert add_miss(columns, layout, Status.NO_REPLY, number * STEP, NOON)
+            continue
+        found = new_completion(result=25, sent_ns=number * STEP, first_ns=number * STEP + 5_000_001)
+        found.reply.data_len = 20
+        words = [number % 60000 + at for at in range(10)]
+        found.reply.data[0:20] = list(b"".join(word.to_bytes(2, "big") for word in words))
+        assert add_rows(columns, layout, found, NOON)
+    return Batch(columns, drives, REGISTERS)
+
+
+def rows_of(table: Any) -> list[tuple[Any, ...]]:
+    """Return rows as tuples of plain numbers and texts, in order of time, drive and register."""
+    columns = [table.column(name) for name in table.schema.names]
+    columns[0] = columns[0].cast("int64")
+    return sorted(
+        zip(*(column.to_pylist() for column in columns), strict=True), key=lambda row: (row[0], row[3:5])
+    )
+
+
+def rows_in(folder: Path) -> list[tuple[Any, ...]]:
+    """Return all rows of a spool's files."""
+    files = sorted(folder.glob("*.arrows"))
+    return sorted(
+        (row for file in files for row in rows_of(unpack(file.read_bytes()))),
+        key=lambda row: (row[0], row[3:5]),
+    )
+
+
+def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
+    """Return the numbers of the exchanges, each of which has all its rows."""
+    found = [row[1] // STEP for row in rows]
+    assert found == [number for number in found[::10] for _ in range(10)]
+    return found[::10]
