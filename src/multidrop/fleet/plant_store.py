@@ -33,8 +33,8 @@ def read_plant(path: FilePath) -> tuple[Plant, dict[str, Any]]:
         names.checked_name("line", line.name)
         if not line.port.startswith(SOCKETS):
             raise ValueError(
-                f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, which "
-                "every gateway reaches and can close at once, and no others"
+                f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
+                "which every gateway reaches and can close at once, and no others"
             )
     return plant, {table["name"]: _description(table, path.parent) for table in document["line"]}
 
@@ -44,8 +44,8 @@ def _description(table: Mapping[str, Any], folder: FilePath) -> dict[str, Any]:
     for model in {drive["model"] for drive in table["drive"]}:
         if ".py" in model:
             raise ValueError(
-                f"line {table['name']}: the family {model} is a Python file, and gateways run none that comes "
-                "over the network; declare it in TOML"
+                f"line {table['name']}: the family {model} is a Python file, and gateways run none that "
+                "comes over the network; declare it in TOML"
             )
         if model.endswith(".toml"):
             files |= _family_files(folder, model)
