@@ -30,10 +30,12 @@ class Trial:
 
     def lease(self, name: str = "a", lock: LifeLock | None = None) -> Lease:
         self.masterships.append(NotedMastership(self.clock))
-        return Lease(name, self.buckets, self.masterships[-1], lock=lock, clock=self.clock)  # type: ignore[arg-type]
+        buckets: Any = self.buckets
+        return Lease(name, buckets, self.masterships[-1], lock=lock, clock=self.clock)
 
     def observer(self, name: str = "b") -> Observer:
-        return Observer(name, self.buckets, USUAL, self.clock)  # type: ignore[arg-type]
+        buckets: Any = self.buckets
+        return Observer(name, buckets, USUAL, self.clock)
 
     def values(self, name: str = "a") -> list[Any]:
         return [bucket.records[name].value for bucket in self.buckets]

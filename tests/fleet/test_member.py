@@ -19,7 +19,7 @@ from multidrop.fleet import member as member_module  # noqa: E402
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.lease import boottime_ns  # noqa: E402
-from multidrop.fleet.member import Member, State  # noqa: E402
+from multidrop.fleet.member import Member, MemberState  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import paths_of  # noqa: E402
 from multidrop.fleet.setup import open_all  # noqa: E402
@@ -133,7 +133,7 @@ def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None
             drained = running.members["c"]
             drained.drain()
             await until(lambda: not drained.polled and running.all_are_polled(), "drain")
-            assert drained.state is State.DRAINING
+            assert drained.state is MemberState.DRAINING
             assert drained.lease.is_valid
             await asyncio.sleep(0.5)
             assert not drained.polled

@@ -102,8 +102,8 @@ async def _init(arguments: argparse.Namespace) -> int:
 
 
 async def _serve(arguments: argparse.Namespace) -> int:
-    from multidrop import parse_size
     from multidrop.fleet.gateway import FleetGateway
+    from multidrop.recording.retention import parse_size
 
     name = _name(arguments, "serve gw-1")
     folder = arguments.folder or _state_folder() / name

@@ -15,11 +15,11 @@ from nats.aio.msg import Msg
 from multidrop import Mastership
 from multidrop.fleet import names
 from multidrop.fleet.errors import FleetError
+from multidrop.fleet.fleet_lines import FleetLines
 from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.member import Member
-from multidrop.fleet.polled_lines import PolledLines
 from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import paths_of
 from multidrop.fleet.setup import check_buckets, open_all
@@ -56,7 +56,7 @@ class FleetGateway:
         self.paths = paths_of(urls, options)
         self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
         self.spool = Spool(folder / "spool", name, most=spool_bytes)
-        self.lines = PolledLines(self.mastership, folder)
+        self.lines = FleetLines(self.mastership, folder)
         self.member = Member(name, self.paths, self.lines, self.mastership, lock=self.lock)
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop.fleet import lease_rules
 from multidrop.fleet.buckets import NONE_YET, Bucket, Record
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.lease_rules import RENEW_S, SECOND, Terms, Watched
+from multidrop.fleet.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -117,7 +117,7 @@ class Lease:
         self._clock = clock
         self._note = note
         self._nonce = uuid.uuid4().hex
-        self._watched: list[Watched | None] = [None] * len(buckets)
+        self._watched: list[SeenRevision | None] = [None] * len(buckets)
         self._ended: set[int] = set()  # paths that others have ended in this session, for good
 
     # ---- what others ask ----

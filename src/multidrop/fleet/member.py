@@ -49,7 +49,7 @@ CLAIMS_AT_ONCE = 64
 LINES_AT_ONCE = 32
 
 
-class State(StrEnum):
+class MemberState(StrEnum):
     OUTSIDE = "outside"
     SETTLING = "settling"
     WORKING = "working"
@@ -110,12 +110,12 @@ class Member:
     # ---- what others ask ----
 
     @property
-    def state(self) -> State:
+    def state(self) -> MemberState:
         if not self.lease.session:
-            return State.OUTSIDE
+            return MemberState.OUTSIDE
         if self.is_draining:
-            return State.DRAINING
-        return State.WORKING if self._is_settled else State.SETTLING
+            return MemberState.DRAINING
+        return MemberState.WORKING if self._is_settled else MemberState.SETTLING
 
     @property
     def _is_settled(self) -> bool:

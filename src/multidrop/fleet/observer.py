@@ -12,7 +12,7 @@ from multidrop.fleet import lease_rules
 from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import Conflict, FleetError
 from multidrop.fleet.lease import boottime_ns
-from multidrop.fleet.lease_rules import Terms, Watched
+from multidrop.fleet.lease_rules import SeenRevision, Terms
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -27,7 +27,7 @@ class Observer:
         self.terms = terms
         self.paths = [Follower(bucket) for bucket in buckets]
         self.ended = 0  # sessions that this one ended
-        self._watched: list[dict[str, Watched]] = [{} for _ in buckets]
+        self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._clock = clock
 
     async def look(self, path: int) -> None:

@@ -15,7 +15,7 @@ NOBODY = ""
 
 
 class Step(NamedTuple):
-    """What a gateway has to do about the lines, at the revisions it judged by."""
+    """The claims and releases of a gateway, at the revisions that it judged by."""
 
     claims: dict[str, int]  # line: revision of the record that is replaced
     releases: set[str]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
@@ -109,7 +110,7 @@ async def _contest(paths: Sequence[Path], replicas: int) -> None:
     settings = bucket_settings(CONTEST, replicas)
     await _create(paths[0], settings)
     try:
-        claimants = [Bucket(CONTEST, lambda path=path: path) for path in paths if path.is_open]  # type: ignore[misc]
+        claimants = [Bucket(CONTEST, partial(_itself, path)) for path in paths if path.is_open]
         revision, unsure = NONE_YET, 0
         while revision == NONE_YET or unsure < ROUNDS:
             unsure += 1
@@ -125,6 +126,10 @@ async def _contest(paths: Sequence[Path], replicas: int) -> None:
                 raise no_quorum(paths[0], Unsure("a key was never granted"))
     finally:
         await ask(paths[0], f"STREAM.DELETE.{settings['name']}")
+
+
+def _itself(path: Path) -> Path:
+    return path
 
 
 async def _claim(bucket: Bucket, revision: int, claimant: int) -> int | None:

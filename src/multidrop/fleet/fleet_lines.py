@@ -1,4 +1,4 @@
-"""Polled lines: those that a gateway has taken, in one Poller that sends only while it is their master."""
+"""Fleet lines: those that a gateway has taken, in one Poller that sends only while it is their master."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from multidrop.fleet.plant_store import line_of
 THREADS = 32
 
 
-class PolledLines:
+class FleetLines:
     """Takes lines into a poller and lets them go; both in threads, for both wait for ports."""
 
     def __init__(self, mastership: Mastership, folder: Path) -> None:
