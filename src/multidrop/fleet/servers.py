@@ -170,17 +170,29 @@ async def connect(url: str, options: Mapping[str, Any]) -> Client:
     settings = {"allow_reconnect": False, "max_reconnect_attempts": 0, "connect_timeout": CONNECT_S}
     try:
         await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
+    except asyncio.CancelledError:
+        _cut(client)
+        raise
     except (NatsError, OSError, TimeoutError, ValueError) as failure:
-        if client._transport is not None:  # nats-py leaves it open where it is cancelled
-            client._transport.close()  # type: ignore[no-untyped-call]
+        _cut(client)
         why = str(refusals[-1] if refusals else failure) or type(failure).__name__
         raise FleetError(f"no NATS server answers at {url}: {why}") from None
     return client
 
 
 async def _close(client: Client) -> None:
-    with suppress(NatsError, OSError, TimeoutError):
-        await asyncio.wait_for(client.close(), CONNECT_S)
+    try:
+        with suppress(NatsError, OSError, TimeoutError):
+            await asyncio.wait_for(client.close(), CONNECT_S)
+    finally:
+        _cut(client)
+
+
+def _cut(client: Client) -> None:
+    """Close the socket: nats-py leaves it open where it is cancelled, or the server does not answer."""
+    writer = getattr(client._transport, "_io_writer", None)
+    if writer is not None and writer.transport is not None:
+        writer.transport.abort()
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[Path]:
