@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 
 from multidrop.fleet import lease_rules
-from multidrop.fleet.lease_rules import Terms, Watched
+from multidrop.fleet.lease_rules import SeenRevision, Terms
 
 SMALL = Terms(lease=1, guard=2)
 WHOLE = Terms(lease=2, guard=2)
@@ -63,7 +63,7 @@ class Model:
             yield path._replace(ending=None, is_ended=is_done, seen=None if is_done else path.seen)
 
     def may_end(self, seen: tuple[bool, int]) -> bool:
-        return not self.waits or lease_rules.is_stale(Watched(1, -seen[1]), 0, self.terms)
+        return not self.waits or lease_rules.is_stale(SeenRevision(1, -seen[1]), 0, self.terms)
 
     def grown_older(self, path: PathState) -> PathState:
         """Return the path one tick later."""

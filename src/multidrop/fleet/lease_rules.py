@@ -32,7 +32,10 @@ class Terms(NamedTuple):
         return self.lease + self.guard
 
 
-class Watched(NamedTuple):
+USUAL = Terms()
+
+
+class SeenRevision(NamedTuple):
     """A revision of a record, and when this observer saw it first (its own CLOCK_BOOTTIME, ns)."""
 
     revision: int
@@ -58,12 +61,12 @@ def killed_at(until: int, terms: Terms) -> int:
     return until + terms.guard // 2
 
 
-def watch(before: Watched | None, revision: int, now: int) -> Watched:
+def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
     """Return what is known of a record after it was read."""
-    return before if before is not None and before.revision == revision else Watched(revision, now)
+    return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 
-def is_stale(watched: Watched, now: int, terms: Terms) -> bool:
+def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
     """Say whether this very revision may be ended: it was not renewed for lease and guard."""
     return now - watched.since >= terms.patience
 

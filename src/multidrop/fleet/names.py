@@ -1,8 +1,14 @@
-"""Names that go into subjects, keys and file names."""
+"""Names of NATS things: buckets, subjects, and names of gateways and lines, which go into them."""
 
 from __future__ import annotations
 
 import re
+import zlib
+
+LEASES = tuple(f"lease_{path}" for path in range(3))
+OWNERS = tuple(f"own_{part}" for part in range(3))
+PLANT = "plant"
+BUCKETS = (*LEASES, *OWNERS, PLANT)
 
 
 def checked_name(kind: str, name: str) -> str:
@@ -12,3 +18,18 @@ def checked_name(kind: str, name: str) -> str:
             f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write gateway-1"
         )
     return name
+
+
+def owner_bucket(line: str) -> str:
+    """Return the bucket with the record of a line's master."""
+    return OWNERS[zlib.crc32(line.encode()) % len(OWNERS)]
+
+
+def command_subject(line: str) -> str:
+    """Return the subject on which a line's master is asked for an offer."""
+    return f"cmd.{line}"
+
+
+def gateway_subject(gateway: str) -> str:
+    """Return the subject on which a gateway takes requests about itself."""
+    return f"gateway.{gateway}"

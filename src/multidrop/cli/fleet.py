@@ -1,0 +1,252 @@
+"""The `fleet` command: several gateways for the lines of one plant, by NATS JetStream."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import os
+import signal
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.values import aligned
+
+if TYPE_CHECKING:
+    from multidrop.fleet.servers import Path as ServerPath
+
+URLS = "nats://127.0.0.1:4222"
+DRAIN_S = 30.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", metavar="ACTION", choices=ACTIONS, help=", ".join(ACTIONS))
+    parser.add_argument("what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init")
+    parser.add_argument(
+        "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
+    )
+    parser.add_argument("--folder", metavar="DIR", type=Path, help="where a gateway keeps its spool and lock")
+    parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    for library in ("nats", "pyarrow"):
+        require_extra(library, "fleet", "fleet")
+    with logging_to(warn, "multidrop.fleet", logging.INFO if arguments.action == "serve" else logging.ERROR):
+        return int(asyncio.run(ACTIONS[arguments.action](arguments)))
+
+
+def _urls(arguments: argparse.Namespace) -> list[str]:
+    text = arguments.nats or os.environ.get("MULTIDROP_NATS") or URLS
+    found = [url.strip() for url in text.split(",") if url.strip()]
+    for url in found:
+        if not url.startswith(("nats://", "tls://")):
+            raise ValueError(f"{url} is no address of a NATS server; write {URLS}")
+    return found
+
+
+async def _with_paths(
+    arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]
+) -> int:
+    from multidrop.fleet.servers import paths_of
+
+    paths = paths_of(_urls(arguments))
+    try:
+        return await work(paths)
+    finally:
+        for path in paths:
+            await path.close()
+
+
+# ---- init ----
+
+
+async def _init(arguments: argparse.Namespace) -> int:
+    from multidrop.fleet import names
+    from multidrop.fleet.buckets import Bucket
+    from multidrop.fleet.plant_store import read_plant, store
+    from multidrop.fleet.samples_stream import connect, create_stream
+    from multidrop.fleet.setup import set_up
+
+    records = read_plant(Path(arguments.what))[1] if arguments.what else None
+
+    async def work(paths: list[ServerPath]) -> int:
+        made = await set_up(paths)
+        client = await connect(_urls(arguments))
+        await create_stream(client, replicas=made["replicas"])
+        await client.close()
+        if records is not None:
+            made["lines"] = await store(Bucket(names.PLANT, lambda: paths[0]), records)
+        if arguments.json:
+            print_text(json.dumps(made, indent=2))
+            return 0
+        servers = ", ".join(f"{name} {version}" for name, version in made["servers"].items())
+        print_text(f"servers: {servers}; each bucket on {made['replicas']}")
+        if records is not None:
+            print_text("lines: " + ", ".join(f"{count} {word}" for word, count in made["lines"].items()))
+        if made["replicas"] < 3:
+            warn("fewer than three servers: when one of them dies, no line is polled until it is back")
+        return 0
+
+    return await _with_paths(arguments, work)
+
+
+# ---- serve ----
+
+
+async def _serve(arguments: argparse.Namespace) -> int:
+    from multidrop.fleet.gateway import FleetGateway
+    from multidrop.recording.retention import parse_size
+
+    name = _name(arguments, "serve gw-1")
+    folder = arguments.folder or _state_folder() / name
+    gateway = FleetGateway(name, _urls(arguments), folder, spool_bytes=parse_size(arguments.keep))
+    loop = asyncio.get_running_loop()
+
+    def end(number: signal.Signals) -> None:
+        loop.remove_signal_handler(number)
+        signal.signal(number, signal.default_int_handler)  # a second one interrupts
+        gateway.end()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end, number)
+    await gateway.run(lambda: print_text(f"ready {name}", flush=True))
+    return 0
+
+
+def _state_folder() -> Path:
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "multidrop" / "fleet"
+
+
+def _name(arguments: argparse.Namespace, example: str) -> str:
+    if not arguments.what:
+        raise ValueError(f"name a gateway, such as `multidrop fleet {example}`")
+    return str(arguments.what)
+
+
+# ---- drain, status, lines ----
+
+
+async def _drain(arguments: argparse.Namespace) -> int:
+    from multidrop.fleet.gateway import ask_gateway
+    from multidrop.fleet.setup import check_buckets, open_all
+
+    name = _name(arguments, "drain gw-1")
+
+    async def work(paths: list[ServerPath]) -> int:
+        await open_all(paths)
+        path = next(one for one in paths if one.is_open)
+        await check_buckets(path)
+        said = await ask_gateway(path, name, "drain")
+        ends = time.monotonic() + DRAIN_S
+        while said["lines"] and time.monotonic() < ends:
+            await asyncio.sleep(0.1)
+            said = await ask_gateway(path, name, "state")
+        if arguments.json:
+            print_text(json.dumps(said, indent=2))
+        else:
+            print_text(f"{name} has {said['lines']} lines left; it takes none until it is started again")
+        return 1 if said["lines"] else 0
+
+    return await _with_paths(arguments, work)
+
+
+async def _seen(paths: list[ServerPath]) -> dict[str, Any]:
+    """Return gateways and lines as the records have them, and what the gateways say themselves."""
+    from multidrop.fleet.errors import FleetError
+    from multidrop.fleet.gateway import ask_gateway
+    from multidrop.fleet.overview import read_fleet
+    from multidrop.fleet.setup import check_buckets, open_all
+
+    await open_all(paths)
+    path = next(one for one in paths if one.is_open)
+    await check_buckets(path)
+    found = await read_fleet(path)
+
+    async def ask(name: str) -> dict[str, Any] | None:
+        try:
+            return await ask_gateway(path, name, "state")
+        except FleetError:
+            return None
+
+    said = await asyncio.gather(*(ask(name) for name in found["gateways"]))
+    for gateway, state in zip(found["gateways"].values(), said, strict=True):
+        gateway["says"] = state
+    return found
+
+
+async def _status(arguments: argparse.Namespace) -> int:
+    async def work(paths: list[ServerPath]) -> int:
+        found = await _seen(paths)
+        if arguments.json:
+            print_text(json.dumps(found, indent=2))
+            return 0
+        head = ("GATEWAY", "HOST", "SESSION", "SINCE", "STATE", "LINES", "MARGIN", "BEHIND", "LOST")
+        rows = [_gateway_row(name, gateway) for name, gateway in found["gateways"].items()]
+        print_text("\n".join(aligned([head, *rows], "<<><<>>>>")))
+        free = [name for name, line in found["lines"].items() if not line["master"]]
+        print_text(f"\n{len(found['lines'])} lines, {len(free)} without a master")
+        for name, gateway in found["gateways"].items():
+            for line, why in ((gateway["says"] or {}).get("troubles") or {}).items():
+                print_text(f"{name}: line {line}: {why}")
+        return 1 if free else 0
+
+    return await _with_paths(arguments, work)
+
+
+def _gateway_row(name: str, gateway: dict[str, Any]) -> tuple[str, ...]:
+    says = gateway["says"]
+    since = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(gateway["began_ms"] / 1000))
+    head = (name, gateway["host"], str(gateway["session"]), since)
+    if says is None:
+        return (*head, "no answer", str(gateway["lines"]), "-", "-", "-")
+    behind = says["spool"]["behind"]
+    return (
+        *head,
+        says["state"],
+        str(gateway["lines"]),
+        f"{says['margin_s']:.1f} s",
+        "-" if behind is None else str(behind),
+        str(says["spool"]["lost"]),
+    )
+
+
+async def _lines(arguments: argparse.Namespace) -> int:
+    async def work(paths: list[ServerPath]) -> int:
+        lines = (await _seen(paths))["lines"]
+        if arguments.json:
+            print_text(json.dumps(lines, indent=2))
+            return 0
+        head = ("LINE", "PORT", "MASTER", "SINCE")
+        rows = [
+            (
+                name,
+                line["port"],
+                line["master"] or "none",
+                time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(line["since_ms"] / 1000))
+                if line["master"]
+                else "",
+            )
+            for name, line in lines.items()
+        ]
+        print_text("\n".join(aligned([head, *rows], "<<<<")))
+        return 0
+
+    return await _with_paths(arguments, work)
+
+
+ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
+    "init": _init,
+    "serve": _serve,
+    "drain": _drain,
+    "status": _status,
+    "lines": _lines,
+}

@@ -1,0 +1,15 @@
+"""Failures of a fleet's servers."""
+
+from __future__ import annotations
+
+
+class FleetError(OSError):
+    """Tell a user, in one sentence, why the fleet's servers cannot be used."""
+
+
+class Unsure(FleetError):
+    """A request without an answer in time: it may have been carried out, or still be."""
+
+
+class Conflict(Exception):
+    """A record that has another revision than the one that was to be replaced."""

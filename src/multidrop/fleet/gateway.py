@@ -1,0 +1,164 @@
+"""FleetGateway: one process of a fleet. It polls the lines that are its own, and forwards what they say."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path as FilePath
+from typing import Any
+
+from nats.aio.msg import Msg
+
+from multidrop import Mastership
+from multidrop.fleet import names
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.fleet_lines import FleetLines
+from multidrop.fleet.forwarder import Forwarder
+from multidrop.fleet.lease import LifeLock
+from multidrop.fleet.lease_rules import SECOND, USUAL
+from multidrop.fleet.member import Member
+from multidrop.fleet.samples_stream import connect
+from multidrop.fleet.servers import paths_of
+from multidrop.fleet.setup import check_buckets, open_all
+from multidrop.fleet.spool import Spool
+
+SPOOL_BYTES = 10_000_000_000
+FORWARD_S = 3.0  # for what is left at the end; the rest is forwarded after the next start
+ENDING_S = 0.05
+
+_log = logging.getLogger("multidrop.fleet")
+
+
+class FleetGateway:
+    """A gateway of this name; what it keeps is in `folder`: its lock, its spool, its audit log.
+
+    Raises ValueError for a name that no subject can have, FleetError where another process runs with it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        urls: Sequence[str],
+        folder: FilePath,
+        *,
+        options: Mapping[str, Any] | None = None,
+        spool_bytes: int = SPOOL_BYTES,
+    ) -> None:
+        self.name = names.checked_name("gateway", name)
+        self.urls = list(urls)
+        self.folder = folder
+        self._options = dict(options or {})
+        folder.mkdir(parents=True, exist_ok=True)
+        self.lock = LifeLock(folder / f"{name}.lock")
+        self.paths = paths_of(urls, options)
+        self.mastership = Mastership(guard_s=USUAL.guard / SECOND)
+        self.spool = Spool(folder / "spool", name, most=spool_bytes)
+        self.lines = FleetLines(self.mastership, folder)
+        self.member = Member(name, self.paths, self.lines, self.mastership, lock=self.lock)
+        self.forwarder: Forwarder | None = None
+        self._end = asyncio.Event()
+
+    async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
+        """Poll and forward until `end` is called; then let all lines go, and forward what is left.
+
+        Raises FleetError where no server is reached, or the fleet was not set up.
+        """
+        try:
+            await open_all(self.paths)
+            await check_buckets(self.member.best())
+            client = await connect(self.urls, **self._options)
+        except BaseException:
+            await self._close()
+            raise
+        self.forwarder = Forwarder(self.spool, client)
+        forwarding = asyncio.create_task(self.forwarder.run())
+        try:
+            await self.paths[0].subscribe(names.gateway_subject(self.name), self._answer)
+            self.lines.poller.on_batch(self.spool.append)
+            with self.lines.poller:
+                member = asyncio.create_task(self.member.run())
+                end = asyncio.create_task(self._end.wait())
+                on_ready()
+                await asyncio.wait({member, end, forwarding}, return_when=asyncio.FIRST_COMPLETED)
+                end.cancel()
+                member.cancel()
+                with suppress(asyncio.CancelledError):
+                    await member
+                await self.lines.close()
+            await asyncio.to_thread(self.spool.sync, FORWARD_S)
+            await self._forward_the_rest(forwarding)
+        finally:
+            forwarding.cancel()
+            await asyncio.gather(forwarding, return_exceptions=True)
+            await client.close()
+            await self._close()
+
+    def end(self) -> None:
+        """Let `run` come to its end. To be called in the loop."""
+        self._end.set()
+
+    async def _forward_the_rest(self, forwarding: asyncio.Task[None]) -> None:
+        assert self.forwarder is not None
+        loop = asyncio.get_running_loop()
+        ends = loop.time() + FORWARD_S
+        while not forwarding.done() and loop.time() < ends:
+            if (self.forwarder.state().last or 0) >= self.spool.state().newest:
+                return
+            await asyncio.sleep(ENDING_S)
+
+    async def _close(self) -> None:
+        for path in self.paths:
+            await path.close()
+        self.lines.poller.close()
+        self.mastership.end()
+        self.spool.close()
+        self.lock.close()
+
+    # ---- what others ask ----
+
+    async def _answer(self, message: Msg) -> None:
+        """Answer a request about this gateway."""
+        wanted = message.data.decode("utf-8", "replace")
+        if wanted == "drain":
+            self.member.drain()
+            _log.warning("%s: asked to give all lines away", self.name)
+        with suppress(Exception):  # whoever asked may have gone
+            await message.respond(json.dumps(self.state()).encode())
+
+    def state(self) -> dict[str, Any]:
+        """Return what `multidrop fleet status` shows of this gateway."""
+        member, spool = self.member, self.spool.state()
+        forwarder = self.forwarder.state() if self.forwarder else None
+        last = forwarder.last if forwarder else None
+        return {
+            "gateway": self.name,
+            "state": member.state.value,
+            "session": member.lease.session,
+            "margin_s": round(member.lease.left_s, 3),
+            "paths": [path.server_name for path in self.paths],
+            "lines": len(member.polled),
+            "moves": member.moves,
+            "troubles": dict(sorted(member.troubles.items())),
+            "trouble": member.lease.trouble,
+            "spool": {
+                "bytes": spool.stored,
+                "lost": spool.lost,
+                "behind": None if last is None else max(0, spool.newest - last),
+                "trouble": spool.trouble or (forwarder.trouble if forwarder else None),
+            },
+        }
+
+
+async def ask_gateway(path: Any, gateway: str, wanted: str) -> dict[str, Any]:
+    """Return a gateway's answer to "state" or "drain". Raises FleetError where it gives none."""
+    try:
+        message = await path.request(names.gateway_subject(gateway), wanted.encode())
+    except FleetError:
+        raise FleetError(
+            f"no gateway called {gateway} answers; `multidrop fleet status` lists them"
+        ) from None
+    found: dict[str, Any] = json.loads(message.data)
+    return found

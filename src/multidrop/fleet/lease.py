@@ -1,0 +1,295 @@
+"""Lease: a gateway's own session, renewed on three paths, and until when the gateway may send."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import logging
+import os
+import time
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple, Protocol
+
+from multidrop.fleet import lease_rules
+from multidrop.fleet.buckets import NONE_YET, Bucket, Record
+from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
+
+_log = logging.getLogger("multidrop.fleet")
+
+JOIN_S = 0.25  # between tries to begin a session
+
+
+def boottime_ns() -> int:
+    """Return CLOCK_BOOTTIME: it runs on while the machine sleeps, and nobody sets it."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+class MayPoll(Protocol):
+    """The engine's right to send; `multidrop.Mastership` is one."""
+
+    def extend(self, until_ns: int) -> object:
+        """Let the engine send until then, and put the kernel's timer off."""
+
+    def end(self) -> object:
+        """Send nothing more, and call the timer off."""
+
+
+class LifeLock:
+    """A lock on a local file, held for life: who gets it knows that the one before has died.
+
+    The file has a random id of its own: containers may have the same machine's id and the same path.
+    Raises FleetError when another process of this machine holds it.
+    """
+
+    def __init__(self, path: FilePath) -> None:
+        self.path = path.resolve()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("a+b")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.close()
+            sentence = f"another gateway of this machine runs with {path}; end that one first"
+            raise FleetError(sentence) from None
+        self._file.seek(0)
+        self.id = self._file.read().decode("ascii", "replace").strip()
+        if not self.id:
+            self.id = uuid.uuid4().hex
+            self._file.write(self.id.encode())
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+    def proves_death(self, value: Mapping[str, Any]) -> bool:
+        """Say whether a record is of a process that held this very lock, and so is dead."""
+        mine = (str(self.path), self.id, machine_id())
+        return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def machine_id() -> str:
+    """Return this machine's own id; "" where it has none, which proves nothing."""
+    with suppress(OSError):
+        return FilePath("/etc/machine-id").read_text().strip()
+    return ""
+
+
+class Held(NamedTuple):
+    """Our record on one path: its revision, and when the renewal that made it was about to be sent (ns)."""
+
+    revision: int
+    sent: int
+
+
+class Lease:
+    """The session of one gateway.
+
+    `until` is the time (CLOCK_BOOTTIME, ns) until which it may send. `note` returns what else stands in the
+    record, for others to see.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        buckets: Sequence[Bucket],
+        mastership: MayPoll,
+        *,
+        lock: LifeLock | None = None,
+        terms: Terms = lease_rules.USUAL,
+        clock: Callable[[], int] = boottime_ns,
+        note: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
+        self.name = name
+        self.terms = terms
+        self.session = 0  # 0: none
+        self.until = 0
+        self.trouble = ""  # why there is no session
+        self.began_ms = 0  # UTC
+        self.held: list[Held | None] = [None] * len(buckets)
+        self._buckets = buckets
+        self._mastership = mastership
+        self._lock = lock
+        self._clock = clock
+        self._note = note
+        self._nonce = uuid.uuid4().hex
+        self._watched: list[SeenRevision | None] = [None] * len(buckets)
+        self._ended: set[int] = set()  # paths that others have ended in this session, for good
+
+    # ---- what others ask ----
+
+    @property
+    def is_valid(self) -> bool:
+        return bool(self.session) and lease_rules.may_send(self._clock(), self.until)
+
+    @property
+    def left_s(self) -> float:
+        """Return for how long (s) it may still send; negative: since when it may not."""
+        return (self.until - self._clock()) / SECOND
+
+    @property
+    def best(self) -> int:
+        """Return the path that was renewed last: what is asked there is newest."""
+        return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
+
+    @property
+    def is_over(self) -> bool:
+        """Say whether too few paths are left to this session, ever."""
+        return sum(path is not None for path in self.held) < self.terms.needed
+
+    # ---- a session begins ----
+
+    async def begin(self) -> None:
+        """Begin a session, as soon as every one before it is over."""
+        while not await self.try_to_begin():
+            await asyncio.sleep(JOIN_S)
+
+    async def try_to_begin(self) -> bool:
+        """Take the records that may be taken. Return False where it must be tried again."""
+        paths = range(len(self._buckets))
+        records = await asyncio.gather(*(self._read(path) for path in paths))
+        known = {path: record for path, record in enumerate(records) if record is not None}
+        if len(known) < self.terms.needed:
+            self.trouble = (
+                f"{len(known)} of {len(paths)} lease buckets answer, {self.terms.needed} are needed"
+            )
+            return False
+        free = {path: record for path, record in known.items() if self._is_free(path, record)}
+        if len(free) < self.terms.needed:
+            self.trouble = self._rival(known)
+            return False
+        session = 1 + max(record.value["session"] if record.value else 0 for record in known.values())
+        self._nonce, self._ended = uuid.uuid4().hex, set()
+        self.session, self.began_ms = session, time.time_ns() // 1_000_000
+        await asyncio.gather(*(self._take(path, record) for path, record in free.items()))
+        if self.is_over:
+            await self.end()
+            self.trouble = f"another gateway called {self.name} began at the same time"
+            return False
+        self.trouble = ""
+        self._extend()
+        return True
+
+    async def _read(self, path: int) -> Record | None:
+        try:
+            return await self._buckets[path].get(self.name)
+        except FleetError:
+            return None
+
+    def _is_free(self, path: int, record: Record) -> bool:
+        """Say whether the session in this record is over, or its end may be written at this revision."""
+        value = record.value
+        if record.revision == NONE_YET or value is None or value["ended"]:
+            return True
+        if self._lock is not None and self._lock.proves_death(value):
+            return True
+        now = self._clock()
+        watched = self._watched[path] = lease_rules.watch(self._watched[path], record.revision, now)
+        return lease_rules.is_stale(watched, now, self.terms)
+
+    def _rival(self, known: Mapping[int, Record]) -> str:
+        others = [record.value for record in known.values() if record.value and not record.value["ended"]]
+        host = others[0].get("host", "?") if others else "?"
+        return f"a gateway called {self.name} is registered on {host}; waiting until its lease has run out"
+
+    async def _take(self, path: int, record: Record) -> None:
+        sent = self._clock()
+        try:
+            revision = await self._buckets[path].put(self.name, self._value(), record.revision)
+        except (Conflict, FleetError):
+            return
+        self.held[path] = Held(revision, sent)
+
+    def _value(self, *, ended: bool = False) -> dict[str, Any]:
+        return {
+            **self._note(),
+            "session": self.session,
+            "nonce": self._nonce,
+            "ended": ended,
+            "began": self.began_ms,
+            "host": os.uname().nodename,
+            "machine": machine_id(),
+            "lock": str(self._lock.path) if self._lock else "",
+            "lock_id": self._lock.id if self._lock else "",
+            "pid": os.getpid(),
+        }
+
+    # ---- and goes on ----
+
+    async def renew(self, path: int) -> None:
+        """Renew one path, for ever; one task for each, so that none waits for another."""
+        while True:
+            begun = self._clock()
+            if self.session:
+                await self.renew_once(path)
+            rest = RENEW_S - (self._clock() - begun) / SECOND
+            await asyncio.sleep(max(rest, RENEW_S / 5))
+
+    async def renew_once(self, path: int) -> None:
+        """Renew one path. What is counted is the moment before the request was sent."""
+        held, nonce, sent = self.held[path], self._nonce, self._clock()
+        if held is None:
+            if path not in self._ended:
+                await self._take_late(path)
+            return
+        try:
+            revision = await self._buckets[path].put(self.name, self._value(), held.revision)
+        except Conflict:
+            await self._look_again(path, nonce, held)
+        except FleetError as failure:
+            if isinstance(failure, Unsure):
+                await self._look_again(path, nonce, held)
+        else:
+            if nonce == self._nonce:  # else the answer is to a session before
+                self.held[path] = Held(revision, sent)
+                self._extend()
+
+    async def _look_again(self, path: int, nonce: str, held: Held) -> None:
+        """Learn what became of a renewal: it may have been stored without our knowing."""
+        record = await self._read(path)
+        if record is None or nonce != self._nonce:
+            return
+        value = record.value
+        if value and value["nonce"] == nonce and not value["ended"]:
+            self.held[path] = Held(record.revision, held.sent)  # an older time than it could be
+        elif record.revision > held.revision:
+            self.held[path] = None
+            self._ended.add(path)
+            _log.warning("%s: path %d of session %d was ended by another", self.name, path, self.session)
+
+    async def _take_late(self, path: int) -> None:
+        """Take a path that could not be had when the session began."""
+        record = await self._read(path)
+        if record is None:
+            return
+        if record.value is None or record.value["session"] < self.session:  # that one is over by the others
+            await self._take(path, record)
+            self._extend()
+        elif record.value["nonce"] == self._nonce and not record.value["ended"]:
+            self.held[path] = Held(record.revision, 0)
+
+    def _extend(self) -> None:
+        until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
+        if until > self.until and lease_rules.may_send(self._clock(), until):
+            self.until = until
+            self._mastership.extend(until)
+
+    # ---- and ends ----
+
+    async def end(self) -> None:
+        """Write the end of this session, so that nobody has to wait for it; nothing may be sent any more."""
+        self._mastership.end()
+        self.until = 0
+        held, value = self.held, self._value(ended=True)
+        self.session, self.held, self._ended = 0, [None] * len(held), set()
+        self._watched = [None] * len(held)
+
+        async def write(path: int, revision: int) -> None:
+            with suppress(Conflict, FleetError):
+                await self._buckets[path].put(self.name, value, revision)
+
+        await asyncio.gather(*(write(path, mine.revision) for path, mine in enumerate(held) if mine))

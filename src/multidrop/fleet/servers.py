@@ -1,0 +1,200 @@
+"""Connections to NATS: three paths, each at a server of its own as long as that one lives."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import nats
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.errors import Error as NatsError
+
+from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.lease_rules import PATHS
+
+OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
+CONNECT_S = 1.0
+ANSWER_S = 1.0  # for a request; a lease is renewed twice a second
+PONG_S = 0.7  # a server that takes longer is left for another one
+KEEP_S = 1.0  # between looks at a connection
+
+
+class Path:
+    """One connection, at its home where that server lives, else at any other."""
+
+    def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
+        self.urls = list(urls)  # the first is home
+        self.url = ""  # where it is
+        self._options = options or {}
+        self._client: Client | None = None
+        self._leaving: set[asyncio.Task[None]] = set()
+        self._subscriptions: dict[str, Callable[[Msg], Any]] = {}
+
+    @property
+    def is_open(self) -> bool:
+        return self._client is not None and self._client.is_connected
+
+    @property
+    def server_name(self) -> str:
+        """Return the name of the server where it is; "" for none."""
+        return str(self._client._server_info.get("server_name", "")) if self._client else ""
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Return the version of the server where it is."""
+        assert self._client is not None
+        found = self._client.connected_server_version
+        return found.major, found.minor
+
+    async def open(self) -> None:
+        """Connect to the first server that answers. Raises FleetError when none does."""
+        failures = []
+        for url in self.urls:
+            try:
+                await self._move(url)
+            except FleetError as failure:
+                failures.append(str(failure))
+            else:
+                return
+        raise FleetError("; ".join(failures))
+
+    async def keep(self) -> None:
+        """Come home, or go elsewhere from a server that does not answer; for ever."""
+        while True:
+            with suppress(FleetError):
+                await self.look_after()
+            await asyncio.sleep(KEEP_S)
+
+    async def look_after(self) -> None:
+        """Do once what `keep` does."""
+        if not self.is_open or not await self._answers():
+            self._leave()
+            await self.open()
+        elif self.url != self.urls[0]:
+            await self._move(self.urls[0])
+
+    async def _answers(self) -> bool:
+        assert self._client is not None
+        try:
+            await asyncio.wait_for(self._client.flush(), PONG_S)
+        except (NatsError, OSError, TimeoutError):
+            return False
+        return True
+
+    async def _move(self, url: str) -> None:
+        client = await connect(url, self._options)
+        for subject, called in self._subscriptions.items():
+            await client.subscribe(subject, cb=called)
+        self._leave()
+        self._client, self.url = client, url
+
+    def _leave(self) -> None:
+        if self._client is not None:
+            task = asyncio.get_running_loop().create_task(_close(self._client))
+            self._leaving.add(task)
+            task.add_done_callback(self._leaving.discard)
+            self._client, self.url = None, ""
+
+    async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
+        """Call a coroutine function with each message, wherever this path moves."""
+        self._subscriptions[subject] = called
+        if self._client is not None:
+            await self._client.subscribe(subject, cb=called)
+
+    async def unsubscribe_all(self) -> None:
+        self._subscriptions.clear()
+
+    async def request(
+        self,
+        subject: str,
+        data: bytes = b"",
+        headers: dict[str, str] | None = None,
+        answer_s: float = ANSWER_S,
+    ) -> Msg:
+        """Return the answer. Raises Unsure where none comes in time, FleetError where nobody was asked."""
+        client = self._connected()
+        try:
+            return await client.request(subject, data, answer_s, headers=headers)
+        except nats.errors.NoRespondersError:
+            raise FleetError(f"nobody answers {subject} at {self.url}") from None
+        except (NatsError, OSError, TimeoutError) as failure:
+            raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
+
+    async def publish(self, subject: str, data: bytes) -> None:
+        """Send a message to whoever listens."""
+        with suppress(NatsError, OSError):
+            await self._connected().publish(subject, data)
+
+    async def collect(self, subject: str, data: bytes, is_last: Callable[[Msg], bool]) -> list[Msg]:
+        """Return all answers up to one that says that it is the last. Raises Unsure as `request` does."""
+        client = self._connected()
+        found: list[Msg] = []
+        try:
+            inbox = client.new_inbox()
+            subscription = await client.subscribe(inbox)
+            try:
+                await client.publish(subject, data, reply=inbox)
+                while True:
+                    message = await subscription.next_msg(ANSWER_S)
+                    if is_last(message):
+                        return found
+                    found.append(message)
+            finally:
+                with suppress(NatsError, OSError):
+                    await subscription.unsubscribe()
+        except (NatsError, OSError, TimeoutError) as failure:
+            raise Unsure(f"{self.url} gave no whole answer to {subject}: {failure}") from None
+
+    def _connected(self) -> Client:
+        if self._client is None or not self._client.is_connected:
+            raise FleetError(f"no connection to {self.urls[0]}")
+        return self._client
+
+    async def close(self) -> None:
+        """Leave the server."""
+        self._leave()
+        await asyncio.gather(*self._leaving)
+
+
+async def connect(url: str, options: Mapping[str, Any]) -> Client:
+    """Return a connection to this very server. Raises FleetError, in one sentence."""
+    refusals: list[Exception] = []
+
+    async def note(failure: Exception) -> None:
+        refusals.append(failure)
+
+    client = Client()
+    settings = {"allow_reconnect": False, "max_reconnect_attempts": 0, "connect_timeout": CONNECT_S}
+    try:
+        await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
+    except asyncio.CancelledError:
+        _cut(client)
+        raise
+    except (NatsError, OSError, TimeoutError, ValueError) as failure:
+        _cut(client)
+        why = str(refusals[-1] if refusals else failure) or type(failure).__name__
+        raise FleetError(f"no NATS server answers at {url}: {why}") from None
+    return client
+
+
+async def _close(client: Client) -> None:
+    try:
+        with suppress(NatsError, OSError, TimeoutError):
+            await asyncio.wait_for(client.close(), CONNECT_S)
+    finally:
+        _cut(client)
+
+
+def _cut(client: Client) -> None:
+    """Close the socket: nats-py leaves it open where it is cancelled, or the server does not answer."""
+    writer = getattr(client._transport, "_io_writer", None)
+    if writer is not None and writer.transport is not None:
+        writer.transport.abort()
+
+
+def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[Path]:
+    """Return three paths: each has another of the servers as its home, where there are so many."""
+    return [Path([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]

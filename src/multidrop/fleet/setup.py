@@ -1,0 +1,139 @@
+"""Setup: makes a fleet's buckets and streams, after a trial of what the servers are good for."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
+from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.leaders import bring_leaders_home
+from multidrop.fleet.servers import OLDEST, Path
+
+CONTEST = "contest"
+ROUNDS = 40  # 2.9.10 fails in the first few of them
+CLAIMANTS = 6
+MOST_REPLICAS = 3
+WAIT_S = 10.0  # an election takes 4 to 9 s
+
+
+async def set_up(paths: Sequence[Path]) -> dict[str, Any]:
+    """Make what is missing, and return what there is. Raises FleetError, in one sentence.
+
+    Buckets that are there stay as they are.
+    """
+    await open_all(paths)
+    replicas = min(MOST_REPLICAS, len({path.server_name for path in paths}))
+    await _contest(paths, replicas)
+    for bucket in names.BUCKETS:
+        await _create(paths[0], bucket_settings(bucket, replicas))
+    await bring_leaders_home(paths[0])
+    servers = {path.server_name: ".".join(map(str, path.version)) for path in paths}
+    return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
+
+
+async def open_all(paths: Sequence[Path]) -> None:
+    """Connect all paths. Raises FleetError where none is reached, or a server is too old."""
+    results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
+    failures = [result for result in results if isinstance(result, Exception)]
+    if len(failures) == len(paths):
+        raise failures[0]
+    for path in paths:
+        if path.is_open:
+            check_version(path)
+
+
+def check_version(path: Path) -> None:
+    """Raise FleetError where the server is too old for leases."""
+    if path.version < OLDEST:
+        found, oldest = ".".join(map(str, path.version)), ".".join(map(str, OLDEST))
+        raise FleetError(
+            f"the NATS server at {path.url} is {found}; a fleet needs {oldest} or newer: older ones may "
+            "give one lease to two gateways"
+        )
+
+
+async def check_buckets(path: Path) -> None:
+    """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
+    for bucket in names.BUCKETS:
+        try:
+            await ask(path, f"STREAM.INFO.KV_{bucket}")
+        except ServerError as failure:
+            if failure.is_missing:
+                raise FleetError(
+                    f"{path.url} has no bucket {bucket}: run `multidrop fleet init` first"
+                ) from None
+            raise
+        except FleetError as failure:
+            raise no_quorum(path, failure) from None
+
+
+def no_quorum(path: Path, failure: Exception) -> FleetError:
+    """Return the sentence for a cluster that does not decide anything."""
+    return FleetError(
+        f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "
+        f"other ({failure})"
+    )
+
+
+async def _create(path: Path, settings: Mapping[str, Any]) -> None:
+    ends = asyncio.get_running_loop().time() + WAIT_S
+    while True:
+        try:
+            await ask(path, f"STREAM.INFO.{settings['name']}")
+        except ServerError as failure:
+            if not failure.is_missing:
+                raise
+        except FleetError as failure:
+            if asyncio.get_running_loop().time() > ends:
+                raise no_quorum(path, failure) from None
+            await asyncio.sleep(0.2)
+            continue
+        else:
+            return
+        try:
+            await ask(path, f"STREAM.CREATE.{settings['name']}", settings)
+        except ServerError:
+            if asyncio.get_running_loop().time() > ends:
+                raise
+            await asyncio.sleep(0.2)  # no leader yet, or it is under way
+        except FleetError as failure:
+            if asyncio.get_running_loop().time() > ends:
+                raise no_quorum(path, failure) from None
+
+
+async def _contest(paths: Sequence[Path], replicas: int) -> None:
+    """Let several claimants ask for the same revision, again and again: one alone may get it."""
+    settings = bucket_settings(CONTEST, replicas)
+    await _create(paths[0], settings)
+    try:
+        claimants = [Bucket(CONTEST, partial(_itself, path)) for path in paths if path.is_open]
+        revision, unsure = NONE_YET, 0
+        while revision == NONE_YET or unsure < ROUNDS:
+            unsure += 1
+            claims = [_claim(claimants[at % len(claimants)], revision, at) for at in range(CLAIMANTS)]
+            granted = [found for found in await asyncio.gather(*claims) if found is not None]
+            if len(granted) > 1:
+                raise FleetError(
+                    f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
+                    f"{CLAIMANTS} claimants at once; no lease is safe there"
+                )
+            revision = granted[0] if granted else (await claimants[0].get(CONTEST)).revision
+            if unsure > 2 * ROUNDS:
+                raise no_quorum(paths[0], Unsure("a key was never granted"))
+    finally:
+        await ask(paths[0], f"STREAM.DELETE.{settings['name']}")
+
+
+def _itself(path: Path) -> Path:
+    return path
+
+
+async def _claim(bucket: Bucket, revision: int, claimant: int) -> int | None:
+    try:
+        return await bucket.put(CONTEST, claimant, revision)
+    except (Conflict, FleetError):
+        return None

@@ -1,0 +1,34 @@
+"""A cluster of three real NATS servers for each module, with a fleet's buckets."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+
+import pytest
+from nats_clusters import Cluster, cluster
+from peers import require_module
+
+
+@pytest.fixture(scope="module")
+def nats(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Return three servers that have nothing of a fleet yet."""
+    require_module("nats")
+    with cluster(tmp_path_factory.mktemp("nats")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def fleet(nats: Cluster) -> Cluster:
+    """Return them after `fleet init`."""
+    from multidrop.fleet.servers import paths_of
+    from multidrop.fleet.setup import set_up
+
+    async def main() -> None:
+        paths = paths_of(nats.urls)
+        await set_up(paths)
+        for path in paths:
+            await path.close()
+
+    asyncio.run(main())
+    return nats

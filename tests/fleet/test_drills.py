@@ -1,0 +1,54 @@
+"""Drills with real processes, judged by what the lines saw: no overlap, and how long a line was silent.
+
+`python -m bench.questions.fleet_drills --rounds 40` does more of them.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+from fleet_drills import DEEDS, FleetDrill, drilled
+from peers import require_module
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
+    require_module("nats")
+    require_module("pyarrow")
+    with drilled(tmp_path_factory.mktemp("drill")) as found:
+        found.settle()
+        yield found
+
+
+def test_a_gateway_that_stands_still_is_killed_and_its_lines_go_on(drill: FleetDrill) -> None:
+    gaps = drill.judge(drill.stop_gateway, seconds=1.0)
+    assert 2.0 < max(gaps.values()) < 10.0  # it had lines, and they were taken over
+    ends = [running.poll() for running in drill.gateways.values()]
+    assert sorted(map(str, ends)) == sorted(["None", "None", str(-signal.SIGKILL)])
+    assert drill.hall.overlaps() == 0
+
+
+@pytest.mark.long
+def test_a_drained_gateway_gives_its_lines_away_without_a_gap(drill: FleetDrill) -> None:
+    drill.settle()
+    drill.hall.reset()
+    drained = drill.run("drain", "gw-b")
+    assert drained.returncode == 0, drained.stderr
+    assert "gw-b has 0 lines left" in drained.stdout
+    drill.wait(lambda: drill.hall.are_polled(0.5), "all lines are polled")
+    assert max(drill.hall.gaps().values()) < 3.0
+    drill.gateways["gw-b"].send_signal(signal.SIGTERM)
+    assert drill.gateways["gw-b"].wait(20) == 0
+    assert drill.hall.overlaps() == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("deed", DEEDS)
+def test_no_deed_makes_two_masters(drill: FleetDrill, deed: str) -> None:
+    drill.settle()
+    drill.judge(lambda: DEEDS[deed](drill))
+    assert drill.hall.overlaps() == 0

@@ -1,0 +1,366 @@
+"""A session's begin, renewals and end, on records in memory and a clock that the test sets."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fleets import HandClock, MemoryBucket, NotedMastership
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import lease as lease_module  # noqa: E402
+from multidrop.fleet.errors import FleetError  # noqa: E402
+from multidrop.fleet.lease import Lease, LifeLock  # noqa: E402
+from multidrop.fleet.lease_rules import SECOND, USUAL  # noqa: E402
+from multidrop.fleet.observer import Observer  # noqa: E402
+
+
+class Trial:
+    """Three buckets and a clock; gateways are made by `lease` and `observer`."""
+
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        self.buckets = [MemoryBucket(f"lease_{path}") for path in range(3)]
+        self.masterships: list[NotedMastership] = []
+
+    def lease(self, name: str = "a", lock: LifeLock | None = None) -> Lease:
+        self.masterships.append(NotedMastership(self.clock))
+        buckets: Any = self.buckets
+        return Lease(name, buckets, self.masterships[-1], lock=lock, clock=self.clock)
+
+    def observer(self, name: str = "b") -> Observer:
+        buckets: Any = self.buckets
+        return Observer(name, buckets, USUAL, self.clock)
+
+    def values(self, name: str = "a") -> list[Any]:
+        return [bucket.records[name].value for bucket in self.buckets]
+
+
+async def renew(lease: Lease) -> None:
+    for path in range(3):
+        await lease.renew_once(path)
+
+
+async def look(observer: Observer) -> None:
+    for path in range(3):
+        await observer.look(path)
+
+
+def test_a_session_begins_on_all_paths_and_counts_from_what_was_sent() -> None:
+    async def main() -> None:
+        trial = Trial()
+        for bucket in trial.buckets:
+            bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes its time
+        lease, began = trial.lease(), trial.clock.now
+        assert await lease.try_to_begin()
+        assert lease.session == 1
+        assert lease.until <= began + 0.25 * SECOND + USUAL.lease
+        assert trial.masterships[0].until == lease.until
+
+    asyncio.run(main())
+
+
+def test_the_deadline_is_the_second_latest() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        began = trial.clock.now
+        trial.clock.pass_s(1)
+        await lease.renew_once(0)
+        assert lease.until == began + USUAL.lease
+        trial.clock.pass_s(1)
+        await lease.renew_once(1)
+        assert lease.until == began + SECOND + USUAL.lease
+
+    asyncio.run(main())
+
+
+def test_one_path_that_is_down_costs_nothing_and_two_cost_the_lease() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.buckets[1].is_down = True
+        for _ in range(20):
+            trial.clock.pass_s(0.5)
+            await renew(lease)
+            assert lease.is_valid
+        trial.buckets[2].is_down = True
+        for _ in range(6):
+            trial.clock.pass_s(0.5)
+            await renew(lease)
+        assert not lease.is_valid
+        trial.buckets[1].is_down = False  # nobody has ended it: the same session goes on
+        await renew(lease)
+        assert lease.is_valid
+        assert lease.session == 1
+
+    asyncio.run(main())
+
+
+def test_a_renewal_without_an_answer_is_found_again_and_not_counted() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        until = lease.until
+        for bucket in trial.buckets:
+            bucket.loses_answers = True
+        trial.clock.pass_s(1)
+        await renew(lease)
+        assert lease.until == until
+        for bucket in trial.buckets:
+            bucket.loses_answers = False
+        await renew(lease)
+        assert lease.until == until + SECOND
+
+    asyncio.run(main())
+
+
+def test_a_late_answer_of_an_earlier_session_is_not_counted() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(1)
+
+        async def end_meanwhile() -> None:
+            trial.buckets[0].before_put = lambda key: None
+            await lease.end()
+
+        ending: list[asyncio.Task[None]] = []
+        trial.buckets[0].before_put = lambda key: ending.append(asyncio.ensure_future(end_meanwhile()))
+        await lease.renew_once(0)
+        await ending[0]
+        assert lease.until == 0
+        assert not lease.is_valid
+
+    asyncio.run(main())
+
+
+def test_sessions_are_numbered_by_the_record_and_by_no_clock() -> None:
+    """CLOCK_BOOTTIME begins anew when a machine does."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        await lease.end()
+        trial.clock.now = 3 * SECOND
+        after = trial.lease()
+        assert await after.try_to_begin()
+        assert after.session == 2
+        assert [value["session"] for value in trial.values()] == [2, 2, 2]
+
+    asyncio.run(main())
+
+
+def test_a_stranger_of_the_same_name_waits_for_lease_and_guard() -> None:
+    async def main() -> None:
+        trial = Trial()
+        first, second = trial.lease(), trial.lease()
+        assert await first.try_to_begin()
+        for _ in range(10):
+            trial.clock.pass_s(0.5)
+            await renew(first)
+            assert not await second.try_to_begin()
+        assert "a gateway called a is registered on" in second.trouble
+        assert not await second.try_to_begin()
+        trial.clock.pass_s(USUAL.patience / SECOND - 0.01)
+        assert not await second.try_to_begin()
+        assert not first.is_valid
+        trial.clock.pass_s(0.02)
+        assert await second.try_to_begin()
+        assert second.session == 2
+        await renew(first)
+        assert first.is_over
+        assert not first.is_valid
+
+    asyncio.run(main())
+
+
+def test_two_that_begin_at_once_are_never_both_valid() -> None:
+    async def main() -> None:
+        trial = Trial()
+        first, second = trial.lease(), trial.lease()
+        begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
+        assert sum(begun) == 1
+        assert [first.is_valid, second.is_valid] == begun
+
+    asyncio.run(main())
+
+
+def test_who_holds_the_lock_file_knows_that_the_one_before_is_dead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+
+    async def main() -> None:
+        trial = Trial()
+        lock = LifeLock(tmp_path / "a.lock")
+        assert await trial.lease(lock=lock).try_to_begin()
+        with pytest.raises(FleetError, match="another gateway of this machine runs with"):
+            LifeLock(tmp_path / "a.lock")
+        lock.close()  # as the kernel does for a process that is killed
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            again = trial.lease(lock=lock)
+            assert await again.try_to_begin()
+            assert again.session == 2
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("machine", ["another machine", ""])
+def test_a_lock_file_of_another_machine_proves_nothing(
+    machine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        trial = Trial()
+        monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+        lock = LifeLock(tmp_path / "a.lock")
+        assert await trial.lease(lock=lock).try_to_begin()
+        lock.close()
+        monkeypatch.setattr(lease_module, "machine_id", lambda: machine)
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            assert not await trial.lease(lock=lock).try_to_begin()
+
+    asyncio.run(main())
+
+
+def test_another_file_at_the_same_path_proves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two containers of one machine may both have /var/lib/multidrop/a.lock."""
+    monkeypatch.setattr(lease_module, "machine_id", lambda: "this machine")
+
+    async def main() -> None:
+        trial = Trial()
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            assert await trial.lease(lock=lock).try_to_begin()
+            (tmp_path / "a.lock").unlink()
+            with closing(LifeLock(tmp_path / "a.lock")) as other:
+                assert not await trial.lease(lock=other).try_to_begin()
+
+    asyncio.run(main())
+
+
+def test_two_machines_without_an_id_prove_nothing_to_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        trial = Trial()
+        monkeypatch.setattr(lease_module, "machine_id", lambda: "")
+        lock = LifeLock(tmp_path / "a.lock")
+        assert await trial.lease(lock=lock).try_to_begin()
+        lock.close()
+        with closing(LifeLock(tmp_path / "a.lock")) as lock:
+            assert not await trial.lease(lock=lock).try_to_begin()
+
+    asyncio.run(main())
+
+
+# ---- those who watch ----
+
+
+def test_a_dead_gateway_is_ended_after_lease_and_guard_by_the_watchers_clock() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        trial.clock.pass_s(100)  # the watcher comes late: it cannot know when the record was written
+        await look(observer)
+        assert observer.dead() == {}
+        trial.clock.pass_s(USUAL.patience / SECOND)
+        await observer.end_the_dead()
+        assert observer.is_over("a", 1)
+        assert [value["ended"] for value in trial.values()] == [True, True, True]
+        assert observer.sessions() == {}
+
+    asyncio.run(main())
+
+
+def test_what_is_judged_is_what_is_ended() -> None:
+    """A record that is renewed between the judgement and its end stays, even if it was read meanwhile."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(USUAL.patience / SECOND)
+        judged = observer.dead()["a"]
+        await renew(lease)  # the network heals just now
+        await look(observer)
+        assert lease.is_valid
+        for path, record in judged.items():
+            assert not await observer._end(path, record)
+        await observer.end_the_dead()
+        assert not observer.is_over("a", 1)
+        await renew(lease)
+        assert not lease.is_over
+
+    asyncio.run(main())
+
+
+def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
+    """Its path would stay ended for as long as it lives."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        for _ in range(20):
+            await look(observer)
+            trial.clock.pass_s(0.5)
+            await lease.renew_once(0)
+            await lease.renew_once(2)
+        assert observer.dead() == {}
+
+    asyncio.run(main())
+
+
+def test_an_ended_path_stays_ended_for_this_session() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        value = trial.values()[1]
+        trial.buckets[1].store("a", {**value, "ended": True})
+        for _ in range(3):
+            await renew(lease)
+        assert lease.held[1] is None
+        assert trial.values()[1]["ended"]
+        assert lease.is_valid
+
+    asyncio.run(main())
+
+
+def test_a_path_that_was_down_at_the_beginning_is_taken_later() -> None:
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[2].is_down = True
+        lease = trial.lease()
+        assert await lease.try_to_begin()
+        assert lease.held[2] is None
+        trial.buckets[2].is_down = False
+        await renew(lease)
+        assert lease.held[2] is not None
+
+    asyncio.run(main())
+
+
+def test_without_two_paths_no_session_begins() -> None:
+    async def main() -> None:
+        trial = Trial()
+        trial.buckets[1].is_down = trial.buckets[2].is_down = True
+        lease = trial.lease()
+        assert not await lease.try_to_begin()
+        assert lease.trouble == "1 of 3 lease buckets answer, 2 are needed"
+
+    asyncio.run(main())

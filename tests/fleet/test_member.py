@@ -1,0 +1,219 @@
+"""Gateways' state machines on a real cluster, with lines that are not there."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from itertools import count
+
+import pytest
+from fleets import Hall, NotedMastership
+from nats_clusters import Cluster
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import member as member_module  # noqa: E402
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.buckets import Bucket  # noqa: E402
+from multidrop.fleet.lease import boottime_ns  # noqa: E402
+from multidrop.fleet.member import Member, MemberState  # noqa: E402
+from multidrop.fleet.plant_store import store  # noqa: E402
+from multidrop.fleet.servers import paths_of  # noqa: E402
+from multidrop.fleet.setup import open_all  # noqa: E402
+
+LINES = [f"line-{at}" for at in range(30)]
+PATIENCE_S = 30.0
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
+
+
+async def until(condition: Callable[[], bool], what: str) -> float:
+    """Return how long it took."""
+    begun = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun < PATIENCE_S, what
+        await asyncio.sleep(0.01)
+    return time.monotonic() - begun
+
+
+class Gateways:
+    """Members of one fleet, each with connections of its own."""
+
+    _names = count()
+
+    def __init__(self, cluster: Cluster) -> None:
+        self.cluster = cluster
+        self.hall = Hall()
+        self.members: dict[str, Member] = {}
+        self.tasks: dict[str, asyncio.Task[None]] = {}
+
+    async def join(self, name: str) -> Member:
+        paths = paths_of(self.cluster.urls)
+        await open_all(paths)
+        mastership = NotedMastership(boottime_ns)
+        member = Member(name, paths, self.hall.add(name, mastership), mastership)
+        self.members[name] = member
+        self.tasks[name] = asyncio.create_task(member.run())
+        return member
+
+    async def die(self, name: str) -> None:
+        """End it as SIGKILL does: it says nothing more, and its sockets are gone."""
+        member, task = self.members.pop(name), self.tasks.pop(name)
+        member._leave = _do_nothing  # type: ignore[method-assign]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        for path in member.paths:
+            await path.close()
+        self.hall.gateways = [lines for lines in self.hall.gateways if lines.name != name]
+
+    async def leave(self, name: str) -> None:
+        member, task = self.members.pop(name), self.tasks.pop(name)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        for path in member.paths:
+            await path.close()
+
+    def taken(self) -> dict[str, set[str]]:
+        return {name: set(member.polled) for name, member in self.members.items()}
+
+    def all_are_polled(self) -> bool:
+        return sorted(line for lines in self.taken().values() for line in lines) == sorted(LINES)
+
+
+async def _do_nothing() -> None:
+    pass
+
+
+@asynccontextmanager
+async def gateways(cluster: Cluster, *members: str) -> AsyncIterator[Gateways]:
+    paths = paths_of(cluster.urls)
+    await open_all(paths)
+    bucket = Bucket(names.PLANT, lambda: paths[0])
+    await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+    running = Gateways(cluster)
+    try:
+        await asyncio.gather(*(running.join(name) for name in members))
+        await until(running.all_are_polled, "cold start")
+        yield running
+        assert running.hall.overlaps == []
+    finally:
+        await asyncio.gather(*(running.leave(name) for name in list(running.members)))
+        for path in paths:
+            await path.close()
+
+
+def test_each_takes_its_share_and_a_dead_ones_lines_are_taken_over(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c") as running:
+            assert all(5 <= len(lines) <= 11 for lines in running.taken().values())
+            lost = running.members["b"].polled.keys()
+            assert lost
+            await running.die("b")
+            seconds = await until(running.all_are_polled, "takeover")
+            assert 2.0 < seconds < 5.0
+            again = await running.join("b")
+            assert not again.polled
+            await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
+            assert again.lease.session == 2
+
+    asyncio.run(main())
+
+
+def test_a_drained_gateway_gives_all_away_and_takes_none(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b", "c") as running:
+            drained = running.members["c"]
+            drained.drain()
+            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
+            assert drained.state is MemberState.DRAINING
+            assert drained.lease.is_valid
+            await asyncio.sleep(0.5)
+            assert not drained.polled
+
+    asyncio.run(main())
+
+
+def test_who_leaves_in_order_is_not_waited_for(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a", "b") as running:
+            await running.leave("a")
+            assert await until(running.all_are_polled, "leave") < 2.0
+
+    asyncio.run(main())
+
+
+def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
+    async def main() -> None:
+        async with gateways(fleet, "a") as running:
+            lines, member = running.hall.gateways[0], running.members["a"]
+            bucket = Bucket(names.PLANT, member.best)
+            records = {line: {"line": {"name": line}, "files": {}} for line in LINES}
+            records["line-1"] = {"line": {"name": "line-1", "port": "another"}, "files": {}}
+            del records["line-2"]
+            records["line-new"] = {"line": {"name": "line-new"}, "files": {}}
+            before = dict(member.polled)
+            told = await store(bucket, records)
+            assert told == {"new": 1, "changed": 1, "removed": 1, "kept": 28}
+            await until(lambda: lines.taken == set(records), "the lines of the other plant")
+            await until(lambda: member.polled["line-1"] != before["line-1"], "the changed line")
+            assert all(
+                member.polled[line] == before[line] for line in LINES if line not in ("line-1", "line-2")
+            )
+            owned = [name for one in member.owners.values() for name, record in one.records.items()]
+            assert "line-new" in owned
+            del records["line-new"]
+            await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+            await until(running.all_are_polled, "the plant as before")
+
+    asyncio.run(main())
+
+
+@pytest.mark.long
+def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
+    """The gap is judged over 11 s: an election comes 5 s after the death."""
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b") as running:
+            member = running.members["a"]
+            await asyncio.sleep(2.5)  # leaders and paths come home
+            before, moves = dict(member.polled), member.moves
+            least = member.lease.left_s
+            fleet.nodes[1].kill()
+            ends = time.monotonic() + 11
+            while time.monotonic() < ends:
+                least = min(least, *(one.lease.left_s for one in running.members.values()))
+                await asyncio.sleep(0.02)
+            assert least > member_module.SILENT_S
+            assert (member.polled, member.moves) == (before, moves)
+            fleet.nodes[1].start()
+            await asyncio.to_thread(fleet.wait)
+            await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")
+
+    asyncio.run(main())
+
+
+def test_without_servers_all_fall_silent_and_nobody_is_killed(fleet: Cluster) -> None:
+    """The timer is called off after the lines were let go, and never set to the past."""
+
+    async def main() -> None:
+        async with gateways(fleet, "a", "b") as running:
+            for node in fleet.nodes:
+                node.pause()
+            await until(lambda: not any(running.taken().values()), "silence")
+            for lines in running.hall.gateways:
+                await until(lambda lines=lines: lines.mastership.ends > 0, "the timer")  # type: ignore[misc]
+                assert lines.mastership.events[-1] == "end"
+                assert "let go" in lines.mastership.events
+            for node in fleet.nodes:
+                node.go_on()
+            await until(running.all_are_polled, "they come back")
+
+    asyncio.run(main())

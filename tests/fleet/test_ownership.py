@@ -1,0 +1,105 @@
+"""Whose a line is: the balance, and who may claim and give away when."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+
+import pytest
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.balance import Balance  # noqa: E402
+from multidrop.fleet.buckets import Record  # noqa: E402
+from multidrop.fleet.ownership import Step, decide, owner_value  # noqa: E402
+
+LINES = [f"hall-{hall}-line-{line}" for hall in range(20) for line in range(50)]
+GATEWAYS = [f"gw{at:02}" for at in range(20)]
+
+
+def moved(before: dict[str, str], after: dict[str, str]) -> int:
+    return sum(before[line] != after[line] for line in before)
+
+
+def test_nobody_has_more_than_110_percent_of_the_mean() -> None:
+    shares = Counter(Balance().assign(LINES, GATEWAYS).values())
+    assert sum(shares.values()) == len(LINES)
+    assert max(shares.values()) <= 55
+    assert min(shares.values()) >= 25
+
+
+def test_few_lines_move_when_a_gateway_leaves_or_comes() -> None:
+    balance = Balance()
+    all_of_them = balance.assign(LINES, GATEWAYS)
+    without = balance.assign(LINES, GATEWAYS[1:])
+    must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
+    assert must <= moved(all_of_them, without) <= must + len(LINES) // 20
+    assert balance.assign(LINES, GATEWAYS) == all_of_them
+
+
+def test_all_gateways_find_the_same_in_any_order() -> None:
+    lines, gateways = LINES[:], GATEWAYS[:]
+    random.Random(1).shuffle(lines)
+    random.Random(2).shuffle(gateways)
+    assert Balance().assign(lines, gateways) == Balance().assign(LINES, GATEWAYS)
+
+
+def test_no_gateway_no_share() -> None:
+    assert Balance().assign(LINES, []) == {}
+
+
+ME = ("a", 7)
+LIVING = ("b", 2)
+DEAD = ("c", 4)
+
+
+def one_step(
+    owner: tuple[str, int] | None, wanted: str, *, settled: bool = True, drains: bool = False
+) -> Step:
+    record = None if owner is None else Record("x", 9, owner_value(*owner, 0))
+    return decide(
+        ME,
+        ["x"],
+        {"x": wanted},
+        lambda line: record,
+        lambda name, session: (name, session) == DEAD or (name == ME[0] and session < ME[1]),
+        is_settled=settled,
+        is_draining=drains,
+    )
+
+
+NOTHING = Step({}, set())
+CASES = {
+    "mine stays": (one_step(ME, "a"), NOTHING),
+    "mine that is another's goes": (one_step(ME, "b"), Step({}, {"x"})),
+    "mine goes when I drain": (one_step(ME, "a", drains=True), Step({}, {"x"})),
+    "another's stays its": (one_step(LIVING, "b"), NOTHING),
+    "a living one's is waited for": (one_step(LIVING, "a"), NOTHING),
+    "a dead one's is claimed": (one_step(DEAD, "a", settled=False), Step({"x": 9}, set())),
+    "a dead one's is not mine by the balance": (one_step(DEAD, "b"), NOTHING),
+    "my session's before is claimed": (one_step(("a", 6), "a"), Step({"x": 9}, set())),
+    "one that was given away": (one_step(("", 0), "a", settled=False), Step({"x": 9}, set())),
+    "one that nobody had": (one_step(None, "a"), Step({"x": 0}, set())),
+    "one that nobody had, too early": (one_step(None, "a", settled=False), NOTHING),
+    "none while I drain": (one_step(None, "a", drains=True), NOTHING),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_claims_and_releases(case: str) -> None:
+    found, wanted = CASES[case]
+    assert found == wanted
+
+
+@pytest.mark.parametrize("name", ["", "hall.1", "hall 1", "hall*", ">", "Größe", "a/b", "x\n"])
+def test_names_that_cannot_be_in_a_subject(name: str) -> None:
+    with pytest.raises(ValueError, match="may have letters, digits, _ and - alone"):
+        names.checked_name("line", name)
+
+
+def test_records_of_lines_are_in_all_three_buckets() -> None:
+    shares = Counter(map(names.owner_bucket, LINES))
+    assert set(shares) == set(names.OWNERS)
+    assert min(shares.values()) > len(LINES) / 4

@@ -1,0 +1,126 @@
+"""`fleet init` on real servers: what it makes, and what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from pathlib import Path
+
+import pytest
+from nats_clusters import Cluster, cluster, free_ports, old_server_program
+
+from multidrop.fleet import servers, setup
+from multidrop.fleet.buckets import ask
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.servers import paths_of
+
+
+async def _init(urls: list[str]) -> dict[str, object]:
+    paths = paths_of(urls)
+    try:
+        return await setup.set_up(paths)
+    finally:
+        for path in paths:
+            await path.close()
+
+
+def test_buckets_are_made_on_all_three_servers(nats: Cluster) -> None:
+    made = asyncio.run(_init(nats.urls))
+    assert made["replicas"] == 3
+    assert set(made["servers"]) == {"n1", "n2", "n3"}
+    assert asyncio.run(_init(nats.urls)) == made  # a second time changes nothing
+
+
+def test_each_path_is_at_a_server_of_its_own_and_so_is_each_leader(fleet: Cluster) -> None:
+    async def main() -> None:
+        paths = paths_of(fleet.urls)
+        await setup.open_all(paths)
+        assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
+        ends = time.monotonic() + 20
+        while True:
+            await setup.bring_leaders_home(paths[0])
+            infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
+            leaders = [info["cluster"].get("leader") for info in infos]
+            if leaders == ["n1", "n2", "n3"]:
+                break
+            assert time.monotonic() < ends, leaders
+            await asyncio.sleep(0.2)
+        for path in paths:
+            await path.close()
+
+    asyncio.run(main())
+
+
+def test_no_server_is_one_sentence() -> None:
+    [port] = free_ports(1)
+    with pytest.raises(FleetError, match=f"no NATS server answers at nats://127.0.0.1:{port}") as failure:
+        asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
+    assert "\n" not in str(failure.value)
+
+
+def test_an_old_server_is_refused(tmp_path: Path) -> None:
+    sentence = r"is 2\.\d+; a fleet needs 2\.12 or newer"
+    with cluster(tmp_path, 1, old_server_program()) as old, pytest.raises(FleetError, match=sentence):
+        asyncio.run(_init(old.urls))
+
+
+@pytest.mark.slow
+def test_a_cluster_that_grants_a_key_twice_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An old server does, even if its version is not looked at."""
+    monkeypatch.setattr(setup, "OLDEST", (0, 0))
+    with cluster(tmp_path, 3, old_server_program()) as old:
+        sentence = re.escape("claimants at once; no lease is safe there")
+        with pytest.raises(FleetError, match=sentence):
+            asyncio.run(_init(old.urls))
+
+
+@pytest.mark.slow
+def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "WAIT_S", 1.0)
+    with cluster(tmp_path, 3) as three:
+        for node in three.nodes[1:]:
+            node.kill()
+        with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
+            asyncio.run(_init(three.urls))
+
+
+def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
+    with cluster(tmp_path, 3) as three:
+
+        async def main() -> None:
+            path = paths_of(three.urls)[1]
+            await path.open()
+            assert path.server_name == "n2"
+            three.nodes[1].pause()
+            await path.look_after()
+            assert path.server_name == "n3"
+            three.nodes[1].go_on()
+            await path.look_after()
+            assert path.server_name == "n2"
+            three.nodes[1].kill()
+            while path.is_open:
+                await asyncio.sleep(0.01)
+            await path.look_after()
+            assert path.server_name == "n3"
+            await path.close()
+
+        asyncio.run(main())
+
+
+def test_a_home_that_is_silent_keeps_nobody_waiting_for_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(servers, "CONNECT_S", 0.3)
+    with cluster(tmp_path, 2) as two:
+        two.nodes[0].pause()
+
+        async def main() -> None:
+            path = paths_of(two.urls)[0]
+            await path.open()
+            assert path.server_name == "n2"
+            await path.close()
+
+        asyncio.run(main())

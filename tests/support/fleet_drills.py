@@ -1,0 +1,180 @@
+"""Drills: gateways as processes, three NATS nodes, and a hall of lines that judges who sent what when."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from nats_clusters import Cluster, cluster
+from serial_hall import SerialHall
+
+GATEWAYS = ("gw-a", "gw-b", "gw-c")
+PATIENCE_S = 60.0
+JUDGED_S = 11.0  # an election comes up to 9 s after a death
+
+
+class FleetDrill:
+    """A fleet of processes; each round does something to it, and tells what the lines saw."""
+
+    def __init__(self, folder: Path, nats: Cluster, lines: int = 12, seed: int = 1) -> None:
+        self.nats = nats
+        self.hall = SerialHall(lines)
+        self.random = random.Random(seed)
+        self._folder = folder
+        self._environment = {
+            **os.environ,
+            "MULTIDROP_NATS": ",".join(nats.urls),
+            "XDG_STATE_HOME": str(folder / "state"),
+        }
+        self.gateways: dict[str, subprocess.Popen[str]] = {}
+        (folder / "plant.toml").write_text(self.hall.plant())
+        made = self.run("init", str(folder / "plant.toml"))
+        assert made.returncode == 0, made.stderr
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run `multidrop fleet` with these words."""
+        command = [sys.executable, "-m", "multidrop", "fleet", *words]
+        return subprocess.run(
+            command, env=self._environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S
+        )
+
+    def status(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.run("status", "--json").stdout)
+        return found
+
+    def start(self, *names: str) -> None:
+        for name in names:
+            with (self._folder / f"{name}.log").open("a") as log:
+                self.gateways[name] = subprocess.Popen(
+                    [sys.executable, "-m", "multidrop", "fleet", "serve", name],
+                    env=self._environment,
+                    stdout=subprocess.DEVNULL,
+                    stderr=log,
+                    text=True,
+                )
+
+    def log(self, name: str) -> str:
+        return (self._folder / f"{name}.log").read_text()
+
+    def settle(self) -> None:
+        """Start what died, and wait until all lines are polled by gateways of which each has some."""
+        for node in self.nats.nodes:
+            with suppress(ProcessLookupError):
+                node.go_on()
+            if node.process.poll() is not None:
+                node.start()
+        self.nats.wait()
+        for name in GATEWAYS:
+            running = self.gateways.get(name)
+            if running is None or running.poll() is not None:
+                self.start(name)
+        self.wait(lambda: self.hall.are_polled(0.5), "all lines are polled")
+
+        def is_shared() -> bool:
+            found = self.status()
+            return len(found["gateways"]) == len(GATEWAYS) and all(
+                one["lines"] for one in found["gateways"].values()
+            )
+
+        self.wait(is_shared, "each gateway has lines")
+        time.sleep(2.5)  # paths and leaders come home
+
+    def wait(self, condition: Callable[[], bool], what: str) -> float:
+        begun = time.monotonic()
+        while not condition():
+            assert time.monotonic() - begun < PATIENCE_S, what
+            time.sleep(0.05)
+        return time.monotonic() - begun
+
+    def judge(self, deed: Callable[[], object], seconds: float = JUDGED_S) -> dict[str, float]:
+        """Do it, and return each line's longest gap (s) in the seconds that follow."""
+        self.hall.reset()
+        deed()
+        time.sleep(seconds)
+        self.wait(lambda: self.hall.are_polled(1.0), "all lines are polled again")
+        return self.hall.gaps()
+
+    # ---- deeds ----
+
+    def kill_gateway(self) -> None:
+        self._kill(self.random.choice(GATEWAYS))
+
+    def kill_two_gateways(self) -> None:
+        for name in self.random.sample(GATEWAYS, 2):
+            self._kill(name)
+
+    def kill_gateway_and_node(self) -> None:
+        self.kill_gateway()
+        self.kill_node()
+
+    def stop_gateway(self) -> None:
+        """Let it stand still for longer than a lease; the kernel kills it meanwhile."""
+        running = self.gateways[self.random.choice(GATEWAYS)]
+        running.send_signal(signal.SIGSTOP)
+        time.sleep(self.random.uniform(3.5, 6.0))
+        running.send_signal(signal.SIGCONT)
+
+    def stop_gateway_shortly(self) -> None:
+        running = self.gateways[self.random.choice(GATEWAYS)]
+        running.send_signal(signal.SIGSTOP)
+        time.sleep(self.random.uniform(0.2, 3.2))
+        running.send_signal(signal.SIGCONT)
+
+    def kill_node(self) -> None:
+        self.random.choice(self.nats.nodes).kill()
+
+    def stop_node(self) -> None:
+        node = self.random.choice(self.nats.nodes)
+        node.pause()
+        time.sleep(self.random.uniform(1, 6))
+        node.go_on()
+
+    def kill_all_nodes(self) -> None:
+        for node in self.nats.nodes:
+            node.kill()
+        time.sleep(1)
+        for node in self.nats.nodes:
+            node.start()
+
+    def _kill(self, name: str) -> None:
+        self.gateways[name].kill()
+        self.gateways[name].wait()
+
+    def close(self) -> None:
+        for running in self.gateways.values():
+            with suppress(ProcessLookupError):
+                running.send_signal(signal.SIGCONT)
+            running.kill()
+            running.wait()
+        self.hall.close()
+
+
+DEEDS: dict[str, Callable[[FleetDrill], None]] = {
+    "gateway killed": FleetDrill.kill_gateway,
+    "two gateways killed": FleetDrill.kill_two_gateways,
+    "gateway and node killed": FleetDrill.kill_gateway_and_node,
+    "gateway stands still": FleetDrill.stop_gateway,
+    "gateway stands still shortly": FleetDrill.stop_gateway_shortly,
+    "node killed": FleetDrill.kill_node,
+    "node stands still": FleetDrill.stop_node,
+    "all nodes killed": FleetDrill.kill_all_nodes,
+}
+
+
+@contextmanager
+def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
+    with cluster(folder / "nats") as nats:
+        drill = FleetDrill(folder, nats, lines, seed)
+        try:
+            yield drill
+        finally:
+            drill.close()

@@ -1,0 +1,134 @@
+"""A fleet in a test: records in memory, lines and a mastership that note what is done with them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from multidrop.fleet.buckets import Record
+from multidrop.fleet.errors import Conflict, Unsure
+from multidrop.fleet.lease_rules import SECOND
+
+
+class HandClock:
+    """A clock that a test sets, in ns."""
+
+    def __init__(self, now: int = 1000 * SECOND) -> None:
+        self.now = now
+
+    def __call__(self) -> int:
+        return self.now
+
+    def pass_s(self, seconds: float) -> None:
+        self.now += round(seconds * SECOND)
+
+
+class MemoryBucket:
+    """A bucket that decides by the revision, as the servers do, and fails as a test wants."""
+
+    def __init__(self, name: str = "lease") -> None:
+        self.name = name
+        self.records: dict[str, Record] = {}
+        self.last = 0
+        self.is_down = False
+        self.loses_answers = False
+        self.before_put: Callable[[str], object] = lambda key: None  # called when a put arrives
+
+    async def put(self, key: str, value: Any, revision: int) -> int:
+        self.before_put(key)
+        if self.is_down:
+            raise Unsure("down")
+        if self.revision(key) != revision:
+            raise Conflict(key)
+        self.store(key, value)
+        if self.loses_answers:
+            raise Unsure("no answer")
+        return self.last
+
+    def store(self, key: str, value: Any) -> None:
+        self.last += 1
+        self.records[key] = Record(key, self.last, value)
+
+    def revision(self, key: str) -> int:
+        return self.records[key].revision if key in self.records else 0
+
+    async def get(self, key: str) -> Record:
+        if self.is_down:
+            raise Unsure("down")
+        return self.records.get(key, Record(key, 0, None))
+
+    async def changes(self, after: int) -> list[Record]:
+        if self.is_down:
+            raise Unsure("down")
+        found = [record for record in self.records.values() if record.revision > after]
+        return sorted(found, key=lambda record: record.revision)
+
+
+class NotedMastership:
+    """Notes until when the engine may send, and refuses what the engine refuses."""
+
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self.clock = clock
+        self.until = 0
+        self.ends = 0
+        self.events: list[str] = []
+        self.lines: NotedLines | None = None
+
+    def extend(self, until_ns: int) -> None:
+        assert until_ns > self.clock(), "armed at a time that is past"
+        assert until_ns >= self.until, "went backwards"
+        self.until = until_ns
+        if self.events[-1:] != ["extend"]:
+            self.events.append("extend")
+
+    def end(self) -> None:
+        assert self.lines is None or not self.lines.taken, (
+            "the timer is called off before the lines are closed"
+        )
+        self.until = 0
+        self.ends += 1
+        self.events.append("end")
+
+    @property
+    def may_send(self) -> bool:
+        return self.clock() < self.until
+
+
+class NotedLines:
+    """Lines that are not there: who has which when, and whether two ever had one at a time."""
+
+    def __init__(self, name: str, mastership: NotedMastership, hall: Hall) -> None:
+        self.name = name
+        self.mastership = mastership
+        self.hall = hall
+        self.taken: set[str] = set()
+        mastership.lines = self
+
+    async def take(self, line: str, description: Any) -> None:
+        self.hall.look(line, self)
+        self.taken.add(line)
+        self.hall.at[line] = asyncio.get_running_loop().time()
+
+    async def let_go(self, line: str) -> None:
+        self.mastership.events.append("let go")
+        self.taken.discard(line)
+
+
+class Hall:
+    """All gateways' lines, seen from the drives' side."""
+
+    def __init__(self) -> None:
+        self.gateways: list[NotedLines] = []
+        self.overlaps: list[str] = []
+        self.at: dict[str, float] = {}  # when each line was taken last
+
+    def add(self, name: str, mastership: NotedMastership) -> NotedLines:
+        lines = NotedLines(name, mastership, self)
+        self.gateways.append(lines)
+        return lines
+
+    def look(self, line: str, taker: NotedLines) -> None:
+        for other in self.gateways:
+            if other is not taker and line in other.taken and other.mastership.may_send:
+                self.overlaps.append(f"{line}: {other.name} and {taker.name}")

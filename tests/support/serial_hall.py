@@ -1,0 +1,159 @@
+"""Serial servers of many lines, which see who sends what when: each new connection is another master.
+
+A request of an older connection that comes after the first request of a newer one is an overlap. Old
+connections are not closed, so that it would be seen.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass, field
+
+REQUEST = 8  # bytes of a Modbus RTU read
+
+
+@dataclass
+class LineSeen:
+    """A line's requests so far, and its masters in the order in which they first sent."""
+
+    name: str
+    port: int
+    masters: list[int] = field(default_factory=list)
+    last_s: float = 0.0
+    longest_s: float = 0.0  # between two requests, since `reset`
+    requests: int = 0
+    overlaps: int = 0
+
+    def note(self, connection: int, now: float) -> None:
+        if connection not in self.masters:
+            self.masters.append(connection)
+        elif connection != self.masters[-1]:
+            self.overlaps += 1
+        if self.last_s:
+            self.longest_s = max(self.longest_s, now - self.last_s)
+        self.last_s = now
+        self.requests += 1
+
+
+class SerialHall:
+    """Listens on a port for each line, and answers Modbus RTU reads of address 1 with zeros."""
+
+    def __init__(self, number: int, delay: float = 0.0) -> None:
+        self._selector = selectors.DefaultSelector()
+        self.lines: dict[str, LineSeen] = {}
+        self._buffers: dict[socket.socket, tuple[LineSeen, int, bytearray]] = {}
+        self._listeners: list[socket.socket] = []
+        self._count = 0
+        self._lock = threading.Lock()
+        self._is_over = False
+        for at in range(number):
+            listener = socket.create_server(("127.0.0.1", 0))
+            listener.setblocking(False)
+            line = LineSeen(f"line-{at}", listener.getsockname()[1])
+            self.lines[line.name] = line
+            self._selector.register(listener, selectors.EVENT_READ, line)
+            self._listeners.append(listener)
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def plant(self, every: str = "100 ms") -> str:
+        """Return a plant file with all lines."""
+        return "\n".join(
+            f'[[line]]\nname = "{line.name}"\nport = "socket://127.0.0.1:{line.port}"\n'
+            f'[[line.drive]]\nname = "drive-{line.name}"\nmodel = "innovert-ibd"\naddress = 1\n'
+            f'poll = ["output_current"]\nevery = "{every}"\n'
+            for line in self.lines.values()
+        )
+
+    # ---- what was seen ----
+
+    def reset(self) -> None:
+        """Measure gaps from now on."""
+        with self._lock:
+            for line in self.lines.values():
+                line.longest_s = 0.0
+
+    def overlaps(self) -> int:
+        with self._lock:
+            return sum(line.overlaps for line in self.lines.values())
+
+    def gaps(self) -> dict[str, float]:
+        """Return the longest gap of each line (s), the present one included."""
+        now = time.monotonic()
+        with self._lock:
+            return {line.name: max(line.longest_s, now - line.last_s) for line in self.lines.values()}
+
+    def are_polled(self, within_s: float) -> bool:
+        now = time.monotonic()
+        with self._lock:
+            return all(now - line.last_s < within_s for line in self.lines.values())
+
+    # ---- the thread ----
+
+    def _serve(self) -> None:
+        while not self._is_over:
+            for key, _ in self._selector.select(0.1):
+                one = key.fileobj
+                assert isinstance(one, socket.socket)
+                if one in self._buffers:
+                    self._read(one)
+                else:
+                    self._accept(one, key.data)
+
+    def _accept(self, listener: socket.socket, line: LineSeen) -> None:
+        client, _ = listener.accept()
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._count += 1
+        self._buffers[client] = (line, self._count, bytearray())
+        self._selector.register(client, selectors.EVENT_READ)
+
+    def _read(self, client: socket.socket) -> None:
+        line, number, buffer = self._buffers[client]
+        try:
+            data = client.recv(4096)
+        except OSError:
+            data = b""
+        if not data:
+            self._selector.unregister(client)
+            del self._buffers[client]
+            client.close()
+            return
+        now = time.monotonic()
+        buffer += data
+        while len(buffer) >= REQUEST:
+            request = bytes(buffer[:REQUEST])
+            del buffer[:REQUEST]
+            with self._lock:
+                line.note(number, now)
+            _answer(client, request)
+
+    def close(self) -> None:
+        self._is_over = True
+        self._thread.join()
+        for one in (*self._listeners, *self._buffers):
+            one.close()
+        self._selector.close()
+
+
+def _answer(client: socket.socket, request: bytes) -> None:
+    address, function, _, count = struct.unpack(">BBHH", request[:6])
+    body = struct.pack(">BBB", address, function, 2 * count) + bytes(2 * count)
+    try:
+        client.sendall(body + _crc(body))
+    except OSError:
+        return  # it has gone
+
+
+def _crc(data: bytes) -> bytes:
+    """Return the checksum as the standard says it (Modbus over serial line V1.02, 6.2.2)."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
+    return crc.to_bytes(2, "little")
