@@ -84,10 +84,10 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count no lines in stories, to note which takes minutes more, nor where a full disk is tried."""
+    """Count no lines where that takes minutes more, or is done already, or where a full disk is tried."""
     coverage = sys.modules.get("coverage")
     counting = coverage.Coverage.current() if coverage else None
-    if counting is None or not (item.get_closest_marker("story") or item.get_closest_marker("uncounted")):
+    if counting is None or _is_counted(item):
         return (yield)
     kept = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("COVERAGE_PROCESS_")}
     counting.stop()
@@ -96,6 +96,13 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     finally:
         counting.start()
         os.environ.update(kept)
+
+
+def _is_counted(item: pytest.Item) -> bool:
+    """Return False for stories, for tests marked so, and for more examples of what was counted with fewer."""
+    if item.get_closest_marker("story") or item.get_closest_marker("uncounted"):
+        return False
+    return "THOROUGH" not in os.environ or item.get_closest_marker("long") is not None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
