@@ -9,7 +9,7 @@ from contextlib import suppress
 from importlib import import_module
 from itertools import count, islice
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 from commands import Run
@@ -20,7 +20,8 @@ from patient import patient_peer
 from multidrop.cli import main
 from multidrop.transport import exchange as exchanges
 
-TESTS = Path(__file__).parent
+ALL_TESTS = sorted(Path(__file__).parent.glob("*/test_*.py"))
+COMPILED_BEFORE = any((test.parent / "__pycache__").exists() for test in ALL_TESTS)
 
 # A busy machine is slow, and nothing is wrong with it.
 settings.register_profile(
@@ -37,29 +38,26 @@ def pytest_xdist_auto_num_workers() -> int:
     return min(2 * len(os.sched_getaffinity(0)) + 1, 12)
 
 
+@pytest.hookimpl(optionalhook=True)  # of xdist
+def pytest_configure_node(node: Any) -> None:
+    """Tell a worker whether it has to compile its share of the tests."""
+    node.workerinput["compiles"] = not sys.dont_write_bytecode and not COMPILED_BEFORE
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile the tests before the workers begin: each of them would do it at the same time."""
-    is_worker = hasattr(config, "workerinput")
-    if is_worker or not config.getoption("numprocesses", None) or sys.dont_write_bytecode:
-        return
-    tests = sorted(TESTS.glob("*/test_*.py"))
-    if any((test.parent / "__pycache__").exists() for test in tests):
-        return
-    halves = [_compiling(half) for half in (tests[::2], tests[1::2])]
-    for child in halves:
-        os.waitpid(child, 0)
+    """Compile a share of the tests: pytest rewrites their assertions, and keeps what it compiled.
 
-
-def _compiling(tests: list[Path]) -> int:
-    """Import them in a child: pytest rewrites their assertions then, and keeps what it compiled."""
-    child = os.fork()
-    if child:
-        return child
-    for test in tests:
-        sys.path.insert(0, str(test.parent))
-        with suppress(BaseException):  # the workers tell what is wrong with it
+    Each worker would compile all of them at the same time.
+    """
+    given = getattr(config, "workerinput", {})
+    if not given.get("compiles"):
+        return
+    number = int(given["workerid"].removeprefix("gw"))
+    for test in ALL_TESTS[number :: given["workercount"]]:
+        if str(test.parent) not in sys.path:
+            sys.path.insert(0, str(test.parent))
+        with suppress(BaseException):  # whoever collects it is told what is wrong with it
             import_module(test.stem)
-    os._exit(0)
 
 
 @pytest.hookimpl(trylast=True)  # when what is not wanted has been left out
@@ -84,10 +82,10 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count no lines in stories, to note which takes minutes more, nor where a full disk is tried."""
+    """Count no lines where that takes minutes more, or is done already, or where a full disk is tried."""
     coverage = sys.modules.get("coverage")
     counting = coverage.Coverage.current() if coverage else None
-    if counting is None or not (item.get_closest_marker("story") or item.get_closest_marker("uncounted")):
+    if counting is None or _is_counted(item):
         return (yield)
     kept = {name: os.environ.pop(name) for name in [*os.environ] if name.startswith("COVERAGE_PROCESS_")}
     counting.stop()
@@ -96,6 +94,13 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     finally:
         counting.start()
         os.environ.update(kept)
+
+
+def _is_counted(item: pytest.Item) -> bool:
+    """Return False for stories, for tests marked so, and for more examples of what was counted with fewer."""
+    if item.get_closest_marker("story") or item.get_closest_marker("uncounted"):
+        return False
+    return "THOROUGH" not in os.environ or item.get_closest_marker("long") is not None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 SYSTEM = ("engine", "port", "waiter", "wakeup", "row_queue")  # parts of the core that need one
+OPTIONS = ("-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}")
 
 
-def command(name: str, program: Path, companion: str, *compiler: str) -> list[str]:
-    """Return the command that compiles harness, companion (mutator.c, replay.c) and the pure core."""
-    core = [str(path) for path in sorted((ROOT / "csrc").glob("*.c")) if not path.stem.startswith(SYSTEM)]
-    sources = [str(HERE / f"fuzz_{name}.c"), str(HERE / companion), *core]
-    options = ["-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}"]
-    return [*compiler, *options, *sources, "-lm", "-o", str(program)]
+def command(
+    name: str, program: Path, companion: str, *compiler: str, core: Sequence[Path] | None = None
+) -> list[str]:
+    """Return the command that compiles harness, companion (mutator.c, replay.c) and the pure core.
+
+    `core` may be what `compiled` returned for the same compiler, for many harnesses.
+    """
+    parts = [HERE / f"fuzz_{name}.c", HERE / companion, *(_core() if core is None else core)]
+    return [*compiler, *OPTIONS, *map(str, parts), "-lm", "-o", str(program)]
+
+
+def compiled(folder: Path, *compiler: str) -> list[Path]:
+    """Compile the pure core into a folder; return its objects."""
+    subprocess.run([*compiler, *OPTIONS, "-c", *map(str, _core())], cwd=folder, check=True)
+    return sorted(folder.glob("*.o"))
+
+
+def _core() -> list[Path]:
+    return [path for path in sorted((ROOT / "csrc").glob("*.c")) if not path.stem.startswith(SYSTEM)]

@@ -357,6 +357,7 @@ def test_the_timing_diagrams_are_what_their_tables_say(monkeypatch: pytest.Monke
         assert (DOCS / "pictures" / f"{name}.svg").read_text("utf-8") == diagrams.draw(name)
 
 
+@pytest.mark.uncounted
 @pytest.mark.long
 def test_the_pages_are_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")

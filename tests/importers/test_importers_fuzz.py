@@ -237,6 +237,7 @@ COSTLY = (  # up to a second each; the first is always tried
 )
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize("name", [*(name for name in HOSTILE if name not in COSTLY), *usually(*COSTLY)])
 def test_a_hostile_file_takes_bounded_time(tmp_path: Path, name: str) -> None:
     begin = process_time()

@@ -37,6 +37,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 # ---- nothing stated ----
 
 
+@pytest.mark.uncounted
 @pytest.mark.parametrize(
     ("table", "most"), usually((HOLDING, 125), (INPUT, 125), (COIL, 2000), (DISCRETE, 2000))
 )

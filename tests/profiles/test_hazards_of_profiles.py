@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
+from examples import usually
 from profile_families import ALL, MAKE, SHIPPED_AS, STARTS
 from simulated_bus import SimulatedBus, is_write, one
 
@@ -87,7 +88,7 @@ def test_a_start_that_never_arrives_is_sent_once(line: Line) -> None:
     assert not line.sim.motor.energised
 
 
-@pytest.mark.parametrize("lost", [1, 2, 3, 7])
+@pytest.mark.parametrize("lost", usually(7, 1, 2, 3))
 @pytest.mark.parametrize("how", ["loses", "deafens"])
 def test_a_stop_whose_replies_are_lost(line: Line, lost: int, how: str) -> None:
     """It is sent until it is confirmed and the motor stands."""

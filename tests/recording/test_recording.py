@@ -331,6 +331,7 @@ def test_converting_keeps_everything(tmp_path: Path, suffix: str, target: str) -
     assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
 
 
+@pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.long
 def test_converting_does_not_gather_the_recording_in_memory(tmp_path: Path) -> None:
