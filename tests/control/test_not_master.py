@@ -19,7 +19,7 @@ from toy import Status, Toy
 
 from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, core, insist
 from multidrop.bus import Bus
-from multidrop.errors import NoReply, Unconfirmed
+from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.sim import Simulator, Wire, simulated
 
 if sys.platform != "linux":
@@ -61,8 +61,10 @@ class Scene:
         self.simulator.__enter__()
         self.mastership = Mastership()
         path = self.simulator.wires[0].path
+        self.become_master()
         self.bus = Bus(path, mastership=self.mastership, audit=audit, ledger=audit.with_name("ledger"))
         self.drive = self.bus.attach(Brief(1, name="pump"))
+        self.mastership.end()
 
     def close(self) -> None:
         self.bus.close()
@@ -132,9 +134,9 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
     mastership = Mastership(guard_s=1000)
     path = scene.simulator.wires[0].path
     scene.bus.close()
+    mastership.extend(until_ns := now_ns() + 3 * S)
     with Bus(path, mastership=mastership) as bus:
         drive = bus.attach(Brief(1, name="pump"))
-        mastership.extend(until_ns := now_ns() + 2 * S)
         bus.read(drive, Toy.output_current)
         read_ns, before = now_ns(), scene.requests
         assert read_ns < until_ns, "the machine is too busy for this"
@@ -311,6 +313,23 @@ def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership
 
 
 # ---- ports and arguments that cannot be ----
+
+
+def test_who_is_not_the_master_opens_no_port(scene: Scene) -> None:
+    path = scene.simulator.wires[0].path
+    scene.bus.close()
+    with pytest.raises(LineError, match=r": it is not opened: this process is not its master"):
+        Bus(path, mastership=scene.mastership)
+
+
+def test_a_stop_on_a_port_that_is_not_opened_says_that_it_was_not_sent(scene: Scene) -> None:
+    scene.bus.line.drop()
+    with pytest.raises(NotMaster, match="the stop was NOT sent"):
+        scene.drive.stop()
+    assert scene.bus.line.is_lost
+    scene.become_master()
+    scene.drive.stop()  # which opens it again
+    assert scene.requests > 0
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
