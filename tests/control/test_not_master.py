@@ -312,6 +312,24 @@ def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership
     assert b"\x01\x06\x00\x14\x00\x00" in sent_on(far)
 
 
+@pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
+def test_a_network_s_port_is_held_back_too(port: str) -> None:
+    mastership, sim = Mastership(), simulated(Brief(1))
+    mastership.extend(now_ns() + 1000 * S)
+    simulator = Simulator([Wire([sim], unpaced=True, port=port)])
+    with simulator, Bus(simulator.wires[0].path, mastership=mastership) as bus:
+        drive = bus.attach(Brief(1))
+        begun = time.monotonic()
+        bus.read(drive, Toy.output_current)
+        # a gateway of Modbus TCP is its line's one master, and hands on no other's bytes
+        assert port.startswith("tcp") or time.monotonic() - begun >= LISTENING
+        asked = sim.counters.requests
+        mastership.end()
+        with pytest.raises(NotMaster):
+            bus.read(drive, Toy.output_current)
+        assert sim.counters.requests == asked > 0
+
+
 # ---- ports and arguments that cannot be ----
 
 
