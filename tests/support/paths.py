@@ -140,7 +140,7 @@ def bus_over(
     wire.delay = delay
     wire.open()
     line = PathLine(wire)
-    monkeypatch.setattr(bus, "Line", lambda port, echo, ids: line)
+    monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)
     opened = Bus(line.port)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -18,7 +19,6 @@ from lines import plant, polled, rows_of, until
 from multidrop._core import lib
 from toy import Toy
 
-import multidrop.transport.line
 from multidrop import Bus, Poller
 from multidrop.core import Counters, Exchange, Framing, Message, Peer, delay_edge
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
@@ -173,7 +173,7 @@ def test_what_the_port_lost_is_read_from_its_driver(monkeypatch: pytest.MonkeyPa
 
     with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has none
-        monkeypatch.setattr(multidrop.transport.overruns.fcntl, "ioctl", counts)
+        monkeypatch.setattr(fcntl, "ioctl", counts)
         assert bus.line.overruns() == 120
 
 
