@@ -99,7 +99,6 @@ class PathLine:
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = False
-        self.may_send = True  # it has no mastership
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
 
@@ -141,7 +140,7 @@ def bus_over(
     wire.delay = delay
     wire.open()
     line = PathLine(wire)
-    monkeypatch.setattr(bus, "Line", lambda port, echo, ids, rs485, mastership: line)
+    monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)
     opened = Bus(line.port)

@@ -52,7 +52,7 @@ class SimulatedBus:
         self.queue = object()  # the open port
         self.has_echo = False
         self.port = self.identity = "hall"
-        monkeypatch.setattr(bus, "Line", lambda port, echo, ids, rs485, mastership: self)
+        monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(clock, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
@@ -62,7 +62,6 @@ class SimulatedBus:
         self.seconds += seconds
 
     is_lost = is_tcp = False
-    may_send = True  # it has no mastership
 
     def close(self) -> None:
         pass

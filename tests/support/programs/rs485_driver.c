@@ -1,7 +1,7 @@
 /* A driver of serial ports with RTS, for a library put before the system's: pseudo-terminals have none. What it
  * is told of RTS, and what is written to a port that has been told, stands line by line in the file RS485_LOG:
  * time in ns, what, how many bytes. A UART tells when its last bit has left, at RS485_CHARACTER_NS each. After
- * RS485_CALLS calls RTS is broken. RS485_FLAGS: it has an RS-485 mode of its own, with these flags. */
+ * RS485_CALLS calls RTS is broken; 0: there is none. RS485_FLAGS: it has an RS-485 mode of its own, with these flags. */
 #define _GNU_SOURCE
 #include <asm/ioctls.h>
 #include <errno.h>
@@ -55,7 +55,7 @@ static int switch_rts(int fd, int is_up)
     port = fd;
     if (number("RS485_CALLS") >= 0 && calls++ >= number("RS485_CALLS")) {
         note(now_ns(), "broken", 0);
-        return refuse(EIO);
+        return refuse(number("RS485_CALLS") ? EIO : ENOTTY);
     }
     note(now_ns(), is_up ? "up" : "down", 0);
     return 0;
@@ -83,7 +83,9 @@ int ioctl(int fd, unsigned long request, ...)
         return switch_rts(fd, request == TIOCMBIS);
     if (request == TIOCGRS485 || request == TIOCSRS485)
         return own_mode(request, argument);
-    if (request == TIOCSERGETLSR && fd == port) {
+    if (request == TIOCMBIS || request == TIOCMBIC)
+        return 0; /* DTR: pyserial gives up RTS where it is refused */
+    if (request == TIOCSERGETLSR) {
         *(unsigned *)argument = now_ns() >= end_ns ? TIOCSER_TEMT : 0;
         return 0;
     }
