@@ -20,7 +20,7 @@ from spooled import NOON, STEP, exchanges_in, numbered, rows_of
 from multidrop import History
 from multidrop.fleet import hub as hub_module
 from multidrop.fleet import samples_stream
-from multidrop.fleet.hub import Commit, Hub, HubState, Kept, NotThisHubs, Sink, SinkError
+from multidrop.fleet.hub import Commit, HubState, KeptPlace, NotThisHubs, SampleHub, SampleSink, SinkError
 from multidrop.fleet.message import RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.postgres_sink import PostgresSink
@@ -89,9 +89,11 @@ class Memory:
         self.fates = iter(fates)
         self.begun = 0
 
-    def begin(self, stream: str) -> Kept:
+    def begin(self, stream: str) -> KeptPlace:
         self.begun += 1
-        return Kept(self.commits[-1].last, self.commits[-1].sources) if self.commits else Kept(0, {})
+        return (
+            KeptPlace(self.commits[-1].last, self.commits[-1].sources) if self.commits else KeptPlace(0, {})
+        )
 
     def write(self, commit: Commit) -> None:
         fate = next(self.fates, "ok")
@@ -109,9 +111,9 @@ class Memory:
         return [row for commit in self.commits for table in commit.tables for row in rows_of(table)]
 
 
-async def read_all(client: Client, sink: Sink, place: int) -> HubState:
+async def read_all(client: Client, sink: SampleSink, place: int) -> HubState:
     """Run a hub until it has kept so much."""
-    hub = Hub(client, sink, every=0.02)
+    hub = SampleHub(client, sink, every=0.02)
     task = asyncio.create_task(hub.run())
     try:
         async with asyncio.timeout(PATIENCE_S):
@@ -147,7 +149,7 @@ def test_messages_of_several_answers(running: Cluster, monkeypatch: pytest.Monke
             for number in range(1, 12):
                 await say(client, number, message(number * 5))
             sink = Memory()
-            hub = Hub(client, sink)
+            hub = SampleHub(client, sink)
             await hub.run(once=True)
             assert hub.state().place == 11
             assert exchanges_in(sorted(sink.rows())) == list(range(5, 60))
@@ -213,7 +215,7 @@ def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
             with pytest.raises(
                 NotThisHubs, match="the stream ends at message 1, and 5 are kept: it lost some"
             ):
-                await Hub(client, sink).run()
+                await SampleHub(client, sink).run()
 
     asyncio.run(live())
 
@@ -268,7 +270,7 @@ def test_files_are_a_history_and_read_by_duckdb(running: Cluster, tmp_path: Path
 
 
 def test_a_file_that_was_begun_is_no_commit(running: Cluster, tmp_path: Path) -> None:
-    """As a killed hub leaves it: the rows are read again."""
+    """A killed hub leaves one: the rows are read again."""
 
     async def live() -> None:
         async with client_of(running) as client:
@@ -293,9 +295,9 @@ def commit_of(
 
 def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> None:
     sink = ParquetSink(tmp_path)
-    assert sink.begin("then") == Kept(0, {})
+    assert sink.begin("then") == KeptPlace(0, {})
     sink.write(commit_of())
-    assert sink.begin("then") == Kept(1, {"a.x": 1})
+    assert sink.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
         NotThisHubs, match="of a stream that was made at then, and this one was made at now: name"
     ):
@@ -363,12 +365,12 @@ def test_values_that_are_missing_in_part(empty: Postgres) -> None:
 
 def test_a_second_hub_of_one_database_is_kept_out(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
-    assert one.begin("then") == other.begin("then") == Kept(0, {})
+    assert one.begin("then") == other.begin("then") == KeptPlace(0, {})
     one.write(commit_of())
     with pytest.raises(SinkError, match="another hub writes into this database"):
         other.write(commit_of())
     assert empty.ask("select count(*) from multidrop.exchanges") == [(5,)]
-    assert other.begin("then") == Kept(1, {"a.x": 1})
+    assert other.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
         NotThisHubs, match="made at then, and this one was made at now: name another database"
     ):

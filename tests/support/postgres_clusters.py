@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 import psycopg
 import pytest
@@ -100,7 +101,7 @@ class Postgres:
             **self._as_owner(),
         )
 
-    def _as_owner(self) -> dict[str, int | list[int]]:
+    def _as_owner(self) -> dict[str, Any]:
         if not self._user:
             return {}
         return {"user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}

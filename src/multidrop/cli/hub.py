@@ -15,7 +15,7 @@ from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import logging_to, print_text, warn
 
 if TYPE_CHECKING:
-    from multidrop.fleet.hub import HubState, Sink
+    from multidrop.fleet.hub import HubState, SampleSink
 
 EVERY_S = 10.0
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     return int(state.alarms > 0)
 
 
-def _sink(arguments: argparse.Namespace) -> Sink:
+def _sink(arguments: argparse.Namespace) -> SampleSink:
     if arguments.postgres:
         from multidrop.fleet.postgres_sink import PostgresSink
 
@@ -71,13 +71,13 @@ def _sink(arguments: argparse.Namespace) -> Sink:
     return ParquetSink(arguments.parquet)
 
 
-async def _read(arguments: argparse.Namespace, sink: Sink, options: dict[str, Any]) -> HubState:
-    from multidrop.fleet.hub import Hub
+async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
+    from multidrop.fleet.hub import SampleHub
     from multidrop.fleet.samples_stream import connect
 
     client = await connect(arguments.servers, **options)
     try:
-        hub = Hub(client, sink, every=arguments.every)
+        hub = SampleHub(client, sink, every=arguments.every)
         await hub.run(once=arguments.once)
         return hub.state()
     finally:

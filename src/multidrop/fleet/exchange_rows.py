@@ -26,7 +26,7 @@ _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 
 
-class Exchange(NamedTuple):
+class ExchangeRow(NamedTuple):
     """Rows of one drive that were asked at one time."""
 
     time_ns: int
@@ -37,19 +37,19 @@ class Exchange(NamedTuple):
     misses: list[str] | None  # None where all is ok; else "ok" or the reason
 
 
-class Exchanges(NamedTuple):
+class ExchangeRows(NamedTuple):
     """The exchanges of a message, and the names in them."""
 
-    exchanges: list[Exchange]
+    exchanges: list[ExchangeRow]
     drives: frozenset[str]
     sets: frozenset[tuple[str, ...]]
 
 
-def exchanges_of(table: Any) -> Exchanges:
+def exchanges_of(table: Any) -> ExchangeRows:
     """Return the exchanges of a table of `message.ROWS`, in order of time and drive."""
     table = table.combine_chunks()
     if not len(table):
-        return Exchanges([], frozenset(), frozenset())
+        return ExchangeRows([], frozenset(), frozenset())
     drives = table.column("drive").chunk(0)
     keys = pa.table({"time": table.column("time").cast(pa.int64()), "drive": drives.indices})
     table = table.take(
@@ -75,8 +75,8 @@ def exchanges_of(table: Any) -> Exchanges:
         one = uncertainties[begin:end]
         uncertainty = next((known for known in one if known is not None), None) if misses else one[0]
         drive = texts["drive"][codes["drive"][begin]]
-        found.append(Exchange(times[begin], uncertainty, drive, names, values[begin:end], misses))
-    return Exchanges(found, frozenset(one.drive for one in found), frozenset(sets.values()))
+        found.append(ExchangeRow(times[begin], uncertainty, drive, names, values[begin:end], misses))
+    return ExchangeRows(found, frozenset(one.drive for one in found), frozenset(sets.values()))
 
 
 def _numbers(column: Any, kind: str) -> list[Any]:
@@ -97,7 +97,7 @@ def _changes(first: Any, second: Any) -> list[int]:
 
 
 def copied(
-    found: Iterable[Exchanges], drives: Mapping[str, int], sets: Mapping[tuple[str, ...], int]
+    found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[tuple[str, ...], int]
 ) -> Iterator[bytes]:
     """Yield pieces of a COPY of the columns that `PostgresSink` names."""
     piece = [HEAD]
@@ -112,7 +112,7 @@ def copied(
     yield b"".join([*piece, END])
 
 
-def _row(exchange: Exchange, drive: int, names: int) -> bytes:
+def _row(exchange: ExchangeRow, drive: int, names: int) -> bytes:
     time, uncertainty = exchange.time_ns, exchange.uncertainty_ns
     return b"".join(
         (

@@ -23,7 +23,7 @@ from multidrop.fleet.samples_stream import (
     end_if_cancelled,
     read_after,
 )
-from multidrop.fleet.sources import Sources
+from multidrop.fleet.sources import SourceCheck
 
 MOST_READ = 64  # messages in one answer
 MOST_READ_BYTES = 8 << 20
@@ -43,7 +43,7 @@ class NotThisHubs(SinkError):
     """A sink of another stream, or of another hub: trying again is of no use."""
 
 
-class Kept(NamedTuple):
+class KeptPlace(NamedTuple):
     """The place of the last message that a sink has, and the last sequence of each log."""
 
     place: int
@@ -61,10 +61,10 @@ class Commit(NamedTuple):
     rows: int
 
 
-class Sink(Protocol):
+class SampleSink(Protocol):
     """A store of rows. Methods run on a thread that waits; they raise SinkError."""
 
-    def begin(self, stream: str) -> Kept:
+    def begin(self, stream: str) -> KeptPlace:
         """Return what is kept of this stream: at the start, and after each failure."""
 
     def write(self, commit: Commit) -> None:
@@ -96,12 +96,12 @@ class HubState(NamedTuple):
     trouble: str | None
 
 
-class Hub:
+class SampleHub:
     """Reads a stream into a sink: a commit each `every` s or million rows."""
 
-    def __init__(self, client: Client, sink: Sink, *, every: float = 10.0) -> None:
+    def __init__(self, client: Client, sink: SampleSink, *, every: float = 10.0) -> None:
         self._client, self._sink, self._every = client, sink, every
-        self._sources = Sources({})
+        self._sources = SourceCheck({})
         self._place = self._end = self._rows = 0
         self._trouble: str | None = None
 

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from multidrop.fleet.hub import Commit, Kept, NotThisHubs, SinkError
+from multidrop.fleet.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.message import ROWS
 
 KEY = "multidrop"  # of the files' metadata, as of all recordings
@@ -71,7 +71,7 @@ class ParquetSink:
             os.close(self._lock)
             self._lock = -1
 
-    def begin(self, stream: str) -> Kept:
+    def begin(self, stream: str) -> KeptPlace:
         """Return what the newest file says."""
         try:
             for part in self._rows.glob(".*.part"):
@@ -80,7 +80,7 @@ class ParquetSink:
         except OSError as failure:
             raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
         if newest is None:
-            return Kept(0, {})
+            return KeptPlace(0, {})
         last, path = newest
         found = _metadata(path).get("hub")
         if not isinstance(found, dict) or not isinstance(found.get("sources"), dict):
@@ -90,7 +90,7 @@ class ParquetSink:
                 f"{self.folder} holds samples of a stream that was made at {found.get('stream')}, "
                 f"and this one was made at {stream}: name another folder"
             )
-        return Kept(last, {str(name): int(number) for name, number in found["sources"].items()})
+        return KeptPlace(last, {str(name): int(number) for name, number in found["sources"].items()})
 
     def _files(self) -> list[tuple[int, Path]]:
         found = [(_NAME.fullmatch(path.name), path) for path in self._rows.iterdir()]

@@ -21,8 +21,8 @@ from typing import Any
 
 import psycopg
 
-from multidrop.fleet.exchange_rows import Exchanges, copied, exchanges_of
-from multidrop.fleet.hub import Commit, Kept, NotThisHubs, SinkError
+from multidrop.fleet.exchange_rows import ExchangeRows, copied, exchanges_of
+from multidrop.fleet.hub import Commit, KeptPlace, NotThisHubs, SinkError
 
 ANSWER_S = 10  # to connect
 TABLES = """
@@ -65,7 +65,7 @@ class PostgresSink:
             self._connection.close()
             self._connection = None
 
-    def begin(self, stream: str) -> Kept:
+    def begin(self, stream: str) -> KeptPlace:
         """Connect anew, make what is missing, and return the row of `multidrop.hub`."""
         self.close()
         try:
@@ -78,7 +78,7 @@ class PostgresSink:
         except psycopg.Error as failure:
             raise SinkError(f"PostgreSQL: {_sentence(failure)}") from failure
 
-    def _begin(self, connection: psycopg.Connection[Any], stream: str) -> Kept:
+    def _begin(self, connection: psycopg.Connection[Any], stream: str) -> KeptPlace:
         connection.execute("select pg_advisory_xact_lock(hashtext('multidrop hub'))")  # two may begin
         if connection.execute("select to_regclass('multidrop.samples')").fetchone() == (None,):
             connection.execute(TABLES)
@@ -96,7 +96,7 @@ class PostgresSink:
         self._drives = dict(connection.execute("select name, id from multidrop.drives").fetchall())
         sets = connection.execute("select names, id from multidrop.register_sets").fetchall()
         self._sets = {tuple(names): number for names, number in sets}
-        return Kept(found[1], found[2])
+        return KeptPlace(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
         """Move the place on and copy the rows, in one transaction."""
@@ -113,13 +113,13 @@ class PostgresSink:
         )
         if moved.rowcount != 1:
             raise SinkError("another hub writes into this database: end one of them")
-        found: list[Exchanges] = [exchanges_of(table) for table in commit.tables]
+        found: list[ExchangeRows] = [exchanges_of(table) for table in commit.tables]
         self._name(connection, found)
         with connection.cursor() as cursor, cursor.copy(COPY) as copy:
             for piece in copied(found, self._drives, self._sets):
                 copy.write(piece)
 
-    def _name(self, connection: psycopg.Connection[Any], found: Sequence[Exchanges]) -> None:
+    def _name(self, connection: psycopg.Connection[Any], found: Sequence[ExchangeRows]) -> None:
         """Give ids to names that have none."""
         drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
         query = "insert into multidrop.drives (name) select unnest(%s::text[]) returning name, id"

@@ -1,4 +1,4 @@
-"""Sources: the check that no message of a log is missing, or there twice."""
+"""SourceCheck: the check that no message of a log is missing, or there twice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multidrop.fleet.samples_stream import StreamMessage
 _log = logging.getLogger("multidrop.fleet.hub")
 
 
-class Sources:
+class SourceCheck:
     """The last sequence of each log; alarms are logged as errors and counted."""
 
     def __init__(self, last: Mapping[str, int]) -> None:
