@@ -133,13 +133,20 @@ int64_t md_line_silent_ns(const struct md_line *line)
     return line->quiet_ns + line->silence_ns;
 }
 
+/* Return when the line is free for the exchange. */
+static int64_t free_ns(const struct md_line *line)
+{
+    int64_t silent_ns = md_line_silent_ns(line);
+    return md_listen_is_held(line) ? later(silent_ns, line->listened_ns) : silent_ns;
+}
+
 int md_line_want(struct md_line *line, int64_t now_ns)
 {
     switch (line->state) {
     case SILENCE: /* a line that babbles is not waited for without end */
-        line->wake_ns = sooner(md_listen_free_ns(line), line->give_up_ns);
+        line->wake_ns = sooner(free_ns(line), line->give_up_ns);
         if (now_ns < line->wake_ns)
-            return MD_WAIT;
+            return md_listen_is_held(line) ? MD_READ : MD_WAIT;
         go(line, MD_FELL_SILENT);
         return MD_READ;
     case CHECK:

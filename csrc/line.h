@@ -95,17 +95,20 @@ void md_line_abandon(struct md_line *line, int result, int error);
 /* Listen before the request that is ready to leave, for the time that the longest frame and the drive's
  * time-out take. Return 0 where that makes no sense: a network has no frames of others. */
 int md_listen_begin(struct md_line *line, int64_t now_ns);
-/* The exchange under way waits for the end of that, as all but stops do. */
-int md_listen_is_held(const struct md_line *line);
-void md_listen_put_back(struct md_line *line); /* such an exchange, as if it had never begun */
+void md_listen_put_back(struct md_line *line); /* an exchange that waits for it, as if it had never begun */
 /* cdef: end */
 
 /* ---- listen.c, of a line that is listened to ---- */
 
 void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns); /* bytes came */
-int64_t md_listen_free_ns(const struct md_line *line); /* from then on the line is free for the exchange */
 /* The line was looked at for the last time before the request; 0: it is not free. */
 int md_listen_end(struct md_line *line, int64_t now_ns);
+
+/* The exchange under way waits for the end of the listening, as all but stops do. */
+static inline int md_listen_is_held(const struct md_line *line)
+{
+    return line->listened_ns && line->state != MD_IDLE && !line->exchange->insists;
+}
 
 /* ---- line_end.c: the end of an exchange ---- */
 

@@ -21,11 +21,6 @@ int md_listen_begin(struct md_line *line, int64_t now_ns)
     return 1;
 }
 
-int md_listen_is_held(const struct md_line *line)
-{
-    return line->listened_ns && line->state != MD_IDLE && !line->exchange->insists;
-}
-
 void md_listen_put_back(struct md_line *line)
 {
     line->state = md_line_follows(line->state, MD_ENDED);
@@ -35,12 +30,6 @@ void md_listen_hear(struct md_line *line, size_t len, int64_t now_ns)
 {
     line->listened_ns = now_ns + line->listen_ns;
     line->foreign += (uint32_t)len;
-}
-
-int64_t md_listen_free_ns(const struct md_line *line)
-{
-    int64_t silent_ns = md_line_silent_ns(line);
-    return md_listen_is_held(line) ? later(silent_ns, line->listened_ns) : silent_ns;
 }
 
 int md_listen_end(struct md_line *line, int64_t now_ns)

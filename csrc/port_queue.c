@@ -52,7 +52,8 @@ void md_turn_tell_echo(struct md_turn *turn, int echo)
 int md_turn_end(struct md_turn *turn)
 {
     turn->is_ending = 1;
-    return turn->whose != MD_NOBODYS && turn->whose != MD_URGENT;
+    int is_waiting = turn->whose == MD_NOBODYS || md_listen_is_held(&turn->line);
+    return !is_waiting && turn->whose != MD_URGENT;
 }
 
 int md_turn_is_asking(const struct md_turn *turn, const struct md_drive *drive)

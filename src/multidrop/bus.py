@@ -59,7 +59,7 @@ class Bus:
     unless `stop_on_exit` was called, and nothing that moves a motor is sent after it.
 
     Where other processes may be masters of the line too, `mastership` holds requests back: what is too late
-    is not sent, a stop neither, and raises NotMaster.
+    is not sent, a stop neither, and raises NotMaster. Nor is the port opened unless it holds.
 
     The logger `multidrop.line` has the port's coming and going, and at DEBUG the frames; `multidrop.control`
     has writes, refusals and stops.

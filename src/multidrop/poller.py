@@ -38,7 +38,8 @@ class Poller(RowSource):
     Raises LineError when a port cannot be opened; later failures are rows that say why a value is
     missing. Any thread may take batches, and add or remove drives; commands go through `bus(line)`, ahead
     of the polling, and are counted in `ledger` and noted in `audit`, as Bus says. With a `mastership` nothing
-    is sent on any line unless that holds: each value that is due meanwhile has a row that says so.
+    is sent on any line, and no port opened, unless that holds: each value that is due meanwhile has a row
+    that says so.
 
     The logger `multidrop.line` has no polled frames: they never enter Python. `multidrop poll --capture`
     writes them to a file for Wireshark.

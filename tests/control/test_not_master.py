@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import sys
 import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from lines import until
+from lines import PATIENCE, until
 from toy import Status, Toy
 
 from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, core, insist
 from multidrop.bus import Bus
-from multidrop.errors import NoReply, Unconfirmed
+from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.sim import Simulator, Wire, simulated
 
 if sys.platform != "linux":
@@ -39,6 +41,12 @@ class Brief(Toy):
     response_timeout = 0.05
 
 
+class Slow(Toy):
+    """Is listened to for longer than a busy machine holds another master up."""
+
+    response_timeout = 1.5
+
+
 def halt() -> Script[None]:
     yield from insist(Toy.control, Status(0))
 
@@ -53,8 +61,10 @@ class Scene:
         self.simulator.__enter__()
         self.mastership = Mastership()
         path = self.simulator.wires[0].path
+        self.become_master()
         self.bus = Bus(path, mastership=self.mastership, audit=audit, ledger=audit.with_name("ledger"))
         self.drive = self.bus.attach(Brief(1, name="pump"))
+        self.mastership.end()
 
     def close(self) -> None:
         self.bus.close()
@@ -124,9 +134,9 @@ def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
     mastership = Mastership(guard_s=1000)
     path = scene.simulator.wires[0].path
     scene.bus.close()
+    mastership.extend(until_ns := now_ns() + 3 * S)
     with Bus(path, mastership=mastership) as bus:
         drive = bus.attach(Brief(1, name="pump"))
-        mastership.extend(until_ns := now_ns() + 2 * S)
         bus.read(drive, Toy.output_current)
         read_ns, before = now_ns(), scene.requests
         assert read_ns < until_ns, "the machine is too busy for this"
@@ -232,40 +242,43 @@ def sent_on(far: int) -> bytes:
         return b""
 
 
-def test_the_line_is_listened_to_before_the_first_request(shared: tuple[int, Bus, Mastership]) -> None:
-    far, bus, _ = shared
-    drive = bus.attach(Brief(1, name="pump"))
-    listening = LISTENING + 0.05
-    for is_first in (True, False):
-        begun = time.monotonic()
-        with pytest.raises(NoReply):
+def waits(far: int, bus: Bus, drive: Slow) -> float:
+    """Ask once, and return after how many seconds the request was on the line."""
+
+    def ask() -> None:
+        with suppress(NoReply):
             bus.ask(drive, 3, 1, 1, expiry=60)
-        assert not is_first or time.monotonic() - begun >= listening
-        assert sent_on(far)
+
+    begun = time.monotonic()
+    asking = threading.Thread(target=ask)
+    asking.start()
+    assert select.select([far], [], [], PATIENCE)[0]
+    seconds = time.monotonic() - begun
+    asking.join()
+    assert sent_on(far)
+    return seconds
 
 
-def test_it_listens_anew_where_it_was_not_master_for_a_while(shared: tuple[int, Bus, Mastership]) -> None:
+def test_the_line_is_listened_to_where_another_one_may_have_been_master(
+    shared: tuple[int, Bus, Mastership],
+) -> None:
     far, bus, mastership = shared
-    drive = bus.attach(Brief(1, name="pump"))
-    with pytest.raises(NoReply):
-        bus.ask(drive, 3, 1, 1, expiry=60)
-    sent_on(far)
+    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # each has no late reply due
+    listening = LISTENING + Slow.response_timeout
+    assert waits(far, bus, drives[0]) >= listening
+    assert waits(far, bus, drives[1]) < listening
     mastership.end()
     with pytest.raises(NotMaster):
-        bus.ask(drive, 3, 1, 1, expiry=60)
+        bus.ask(drives[1], 3, 1, 1, expiry=60)
     mastership.extend(now_ns() + 1000 * S)
-    begun = time.monotonic()
-    with pytest.raises(NoReply):
-        bus.ask(drive, 3, 1, 1, expiry=60)
-    assert time.monotonic() - begun >= LISTENING
-    assert sent_on(far)
+    assert waits(far, bus, drives[2]) >= listening
 
 
 def test_another_master_is_told_and_nothing_is_sent(
     shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
 ) -> None:
     far, bus, _ = shared
-    drive = bus.attach(Brief(1, name="pump"))
+    drive = bus.attach(Slow(1, name="pump"))
     other = Babbler(far)
     try:
         for call in (
@@ -275,9 +288,8 @@ def test_another_master_is_told_and_nothing_is_sent(
             with pytest.raises(NotMaster) as failure:
                 call()
             assert failure.value.heard
-            assert "before anything was asked, which another master causes (07 03 00 01 " in str(
-                failure.value
-            )
+            assert "before anything was asked, which another master causes (" in str(failure.value)
+            assert b"\x07\x03\x00\x01\x00\x01\xd5\xac" in failure.value.heard
         assert sent_on(far) == b""
         until(lambda: "another master: " in caplog.text)
         assert bus.line.foreign > 0
@@ -290,7 +302,7 @@ def test_another_master_is_told_and_nothing_is_sent(
 
 def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership]) -> None:
     far, bus, _ = shared
-    drive = bus.attach(Brief(1, name="pump"))
+    drive = bus.attach(Slow(1, name="pump"))
     other = Babbler(far)
     try:
         with pytest.raises(Unconfirmed, match=r"^pump: it is not known whether the stop took effect"):
@@ -300,7 +312,42 @@ def test_a_stop_is_sent_beside_another_master(shared: tuple[int, Bus, Mastership
     assert b"\x01\x06\x00\x14\x00\x00" in sent_on(far)
 
 
+@pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
+def test_a_network_s_port_is_held_back_too(port: str) -> None:
+    mastership, sim = Mastership(), simulated(Brief(1))
+    mastership.extend(now_ns() + 1000 * S)
+    simulator = Simulator([Wire([sim], unpaced=True, port=port)])
+    with simulator, Bus(simulator.wires[0].path, mastership=mastership) as bus:
+        drive = bus.attach(Brief(1))
+        begun = time.monotonic()
+        bus.read(drive, Toy.output_current)
+        # a gateway of Modbus TCP is its line's one master, and hands on no other's bytes
+        assert port.startswith("tcp") or time.monotonic() - begun >= LISTENING
+        asked = sim.counters.requests
+        mastership.end()
+        with pytest.raises(NotMaster):
+            bus.read(drive, Toy.output_current)
+        assert sim.counters.requests == asked > 0
+
+
 # ---- ports and arguments that cannot be ----
+
+
+def test_who_is_not_the_master_opens_no_port(scene: Scene) -> None:
+    path = scene.simulator.wires[0].path
+    scene.bus.close()
+    with pytest.raises(LineError, match=r": it is not opened: this process is not its master"):
+        Bus(path, mastership=scene.mastership)
+
+
+def test_a_stop_on_a_port_that_is_not_opened_says_that_it_was_not_sent(scene: Scene) -> None:
+    scene.bus.line.drop()
+    with pytest.raises(NotMaster, match="the stop was NOT sent"):
+        scene.drive.stop()
+    assert scene.bus.line.is_lost
+    scene.become_master()
+    scene.drive.stop()  # which opens it again
+    assert scene.requests > 0
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])

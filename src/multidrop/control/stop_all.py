@@ -115,7 +115,7 @@ class Stopper:
 
     def _regain(self) -> None:
         line, now = self._exchanges.line, clock.now_ns()
-        if not self.is_tended and line.is_lost and now >= self._regain_ns:
+        if not self.is_tended and line.is_lost and now >= self._regain_ns and line.may_send:
             self._regain_ns = now + REGAIN_NS
             line.regain()
 

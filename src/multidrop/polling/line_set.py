@@ -106,6 +106,8 @@ class LineSet:
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
+            if self._mastership and not self._mastership.holds:  # it is opened once this process is master
+                return self.await_port(line)
             return self._bus(Bus, line)
         except OSError as failure:  # of the port, which is a LineError, or of the audit log
             return failure

@@ -160,8 +160,11 @@ class PolledLine:
             port = self.bus.line.queue
             if self._is_left or not self._is_started:
                 return
-            if port is None:
+            if port is None and self.bus.line.may_send:
                 self._regain(now_ns)
+                return
+            if port is None:
+                self._stand_by(now_ns)
                 return
             if port is not self._queue.port:
                 self._queue.move_to(port)
@@ -172,7 +175,8 @@ class PolledLine:
                 return
             self.bus.line.note_foreign()
             if not self.bus.line.may_send:
-                self._stand_by(port, now_ns)
+                self._queue.pause(port)
+                self._stand_by(now_ns)
                 return
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
@@ -205,9 +209,8 @@ class PolledLine:
 
     # ---- not the master, a port that is lost, and the end ----
 
-    def _stand_by(self, port: Port, now_ns: int) -> None:
+    def _stand_by(self, now_ns: int) -> None:
         """Queue nothing; until this process is the line's master, every value that is due is missed."""
-        self._queue.pause(port)
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), Status.NOT_MASTER)

@@ -21,7 +21,7 @@ from multidrop.drive.own import check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached
+from multidrop.errors import BadReply, DriveRefused, Expired, NoReply, NotAttached, NotMaster, PortLost
 from multidrop.planning.blocks import Block, blocks, text_blocks
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs
@@ -287,7 +287,12 @@ class Exchanges:
         Where that is after `expires_ns`, so long is enough. Raises NotMaster.
         """
         late_until_ns = made.peer.late_until_ns
-        completion = self.line.carry_out(made, expires_ns=expires_ns)
+        try:
+            completion = self.line.carry_out(made, expires_ns=expires_ns)
+        except PortLost as failure:
+            if failure.is_sent or self.line.may_send:
+                raise
+            raise NotMaster(drive.name, self.line.port) from None
         if completion.result != Failure.LATE_ANSWER_DUE:
             check_master(drive, completion)
             return completion

@@ -52,6 +52,7 @@ LEAVING_NS = 1_000_000_000  # for callers to leave a port that was stopped
 LOGGING_S = 1.0  # that closing waits for loggers
 _log = logging.getLogger("multidrop.line")
 
+UNOPENED = "it is not opened: this process is not its master, whose connection that could end"
 FOREIGN = (
     "%s: another master: %d bytes came before anything was asked; nothing but stops is sent until the "
     "line has been silent"
@@ -140,6 +141,8 @@ class Line:
     def _open(self) -> None:
         self._why_closed = "it is closed"
         self._is_over = False
+        if not self.may_send:
+            raise LineError(self.port, UNOPENED)
         try:
             port = self._serial = unopened(self.port)
             port.timeout = 0

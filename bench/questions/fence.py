@@ -1,0 +1,75 @@
+"""Requests of a master that stood still, on lines that another one has taken over: how many the far end saw.
+
+A process polls 10 socket:// lines under a lease, and is stopped (SIGSTOP) at a random moment. Another takes
+over when the last renewal is older than lease and guard by its own clock; then the first one goes on. Three
+kinds: the look and the kernel's timer, the look alone, and neither. Ends with 1 when the first let
+anything through, or when the last did not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+
+from fencing import Fence, Round
+
+from bench.support import tables
+
+AN_HOUR = 3600.0
+KINDS: dict[str, dict[str, float]] = {
+    "look and timer": {},
+    "look alone": {"timer": AN_HOUR},
+    "neither": {"timer": AN_HOUR, "beyond": AN_HOUR},
+}
+HEADS = ("held back by", "stops", "killed", "rounds with stale requests", "stale requests")
+
+
+def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: int) -> list[Round]:
+    chance = random.Random(seed)
+    fence = Fence(lines, lease, guard, **KINDS[kind])
+    try:
+        return [fence.stop_once(chance) for _ in range(stops)]
+    finally:
+        fence.close()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--stops", type=int, default=2000, help="of the first kind; a tenth of the others")
+    parser.add_argument("--lines", type=int, default=10)
+    parser.add_argument("--lease", type=float, default=0.3, metavar="S")
+    parser.add_argument("--guard", type=float, default=0.3, metavar="S")
+    parser.add_argument("--seed", type=int, default=1)
+    details = parser.parse_args()
+    tables.heading(
+        f"{details.lines} lines, lease {details.lease:g} s, guard {details.guard:g} s; a master is stopped "
+        "at a random moment."
+    )
+    stops = {"look and timer": details.stops, "look alone": details.stops // 10, "neither": 20}
+    found = {
+        kind: rounds(kind, stops[kind], details.lines, details.lease, details.guard, details.seed)
+        for kind in KINDS
+    }
+    tables.show(
+        HEADS,
+        [
+            (
+                kind,
+                len(each),
+                sum(one.is_killed for one in each),
+                sum(one.stale > 0 for one in each),
+                sum(one.stale for one in each),
+            )
+            for kind, each in found.items()
+        ],
+    )
+    is_held = not any(one.stale for one in found["look and timer"])
+    return 0 if is_held and all(one.stale for one in found["neither"]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

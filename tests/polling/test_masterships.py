@@ -1,0 +1,349 @@
+"""A poller whose lines other processes may take over: what is polled when, and what its rows say."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+
+import pytest
+from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
+from toy import Toy
+
+from multidrop import Mastership, NoSuchPort, NotMaster
+from multidrop.plant.loader import PlantError
+from multidrop.plant.model import PlantLine, PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+S = 1_000_000_000
+CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
+LONGEST = 256 * 10 / 9600  # s, of a frame
+NOT_MASTER, OTHER_MASTER = "not sent: not master", "not sent: another master"
+paces = pytest.mark.parametrize("every", [None, 0.02], ids=["as fast as it goes", "on a grid"])
+
+
+class Quick(Toy):
+    """Answers soon, if at all."""
+
+    response_timeout = 0.05
+
+
+class Slow(Toy):
+    """Is listened to for longer than a busy machine holds another master up."""
+
+    response_timeout = 1.5
+
+
+def now_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def quick(name: str, address: int, every: float | None) -> PolledDrive:
+    return polled(Quick(address, name=name), [CURRENT, STATUS], every)
+
+
+@pytest.fixture
+def mastership() -> Iterator[Mastership]:
+    made = Mastership()
+    yield made
+    made.end()
+
+
+def hold(mastership: Mastership) -> None:
+    mastership.extend(now_ns() + 1000 * S)
+
+
+@contextmanager
+def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[SimulatedDrive], list[PlantLine]]]:
+    """Two lines with a simulated drive each."""
+    drives = [simulated(Quick(1)) for _ in range(2)]
+    with Simulator([Wire([drive], unpaced=True, port=port) for drive in drives]) as simulator:
+        paths = [wire.path for wire in simulator.wires]
+        names = ("hall", "pump"), ("yard", "fan")
+        declared = [
+            line(path, quick(drive, 1, every), name=name)
+            for path, (name, drive) in zip(paths, names, strict=True)
+        ]
+        yield drives, declared
+
+
+class Rows:
+    """What the rows of a poller say, by drive."""
+
+    def __init__(self, poller: Poller) -> None:
+        self._poller = poller
+
+    def statuses(self, drive: str) -> set[str]:
+        return {row.status for row in rows_of(self._poller) if row.drive == drive}
+
+    def until(self, drive: str, status: str) -> None:
+        until(lambda: status in self.statuses(drive))
+
+    def settle_unpolled(self, drive: str) -> None:
+        """Let it be missed several times."""
+        for _ in range(3):
+            rows_of(self._poller)
+            self.until(drive, NOT_MASTER)
+
+    def settle(self, *drives: str) -> None:
+        """Take all that was under way before, until each drive has a value again."""
+        for drive in drives:
+            self.until(drive, "ok")
+
+
+@paces
+def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, every: float | None) -> None:
+    with lines(every) as (sims, made), Poller(plant(*made), mastership=mastership) as poller:
+        rows = Rows(poller)
+        rows.until("pump", NOT_MASTER)
+        assert [sim.counters.requests for sim in sims] == [0, 0]
+        hold(mastership)
+        rows.settle("pump", "fan")
+        mastership.end()
+        rows.settle_unpolled("pump")  # what left before has reached its drive by then
+        asked = [sim.counters.requests for sim in sims]
+        rows_of(poller)
+        rows.until("fan", NOT_MASTER)
+        assert "ok" not in rows.statuses("pump")
+        with pytest.raises(NotMaster):
+            poller.bus("hall").read(poller.bus("hall").drives[0], CURRENT)
+        assert [sim.counters.requests for sim in sims] == asked
+        hold(mastership)
+        rows.settle("pump", "fan")
+        summary = poller.summary()["lines"]["hall"]
+        assert summary["misses"][NOT_MASTER] > 0
+        assert summary["foreign_bytes"] == 0
+
+
+@paces
+def test_rows_of_a_line_without_its_master_are_few(mastership: Mastership, every: float | None) -> None:
+    """Nothing runs round in circles."""
+    with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
+        Rows(poller).until("pump", NOT_MASTER)
+        begun = time.monotonic()
+        found = 0
+        while time.monotonic() < begun + 1.5:
+            found += sum(row.drive == "pump" for row in rows_of(poller))
+            time.sleep(0.05)
+        most = (time.monotonic() - begun + 1) * 2 * (2 if every is None else 1 / every)
+        assert 0 < found <= most
+
+
+def test_a_poller_without_a_mastership_says_nothing_of_others() -> None:
+    with lines(None) as (_, made), Poller(plant(*made)) as poller:
+        Rows(poller).settle("pump")
+        assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
+
+
+# ---- another master ----
+
+
+@contextmanager
+def seen_line(mastership: Mastership, every: float | None) -> Iterator[tuple[int, Poller]]:
+    """A polled line on which nobody answers, and its far end."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    os.set_blocking(far, False)
+    try:
+        declared = line(os.ttyname(near), polled(Slow(1, name="pump"), [CURRENT, STATUS], every))
+        with Poller(plant(declared), mastership=mastership) as poller:
+            yield far, poller
+    finally:
+        os.close(far)
+        os.close(near)
+
+
+def wait_for_bytes(far: int) -> bytes:
+    assert select.select([far], [], [], PATIENCE)[0]
+    return os.read(far, 4096)
+
+
+@paces
+def test_a_line_is_listened_to_before_its_first_request(mastership: Mastership, every: float | None) -> None:
+    hold(mastership)
+    begun = time.monotonic()
+    with seen_line(mastership, every) as (far, _):
+        wait_for_bytes(far)
+        assert time.monotonic() - begun >= LONGEST + Slow.response_timeout
+
+
+@paces
+def test_another_master_is_told_and_polling_begins_when_it_is_silent(
+    mastership: Mastership, every: float | None
+) -> None:
+    hold(mastership)
+    is_over = threading.Event()
+    with seen_line(mastership, every) as (far, poller):
+
+        def ask() -> None:
+            while not is_over.wait(0.02):
+                os.write(far, b"\x07\x03\x00\x01\x00\x01\xd5\xac")
+
+        other = threading.Thread(target=ask)
+        other.start()
+        try:
+            Rows(poller).until("pump", OTHER_MASTER)
+            with suppress(BlockingIOError):
+                assert os.read(far, 4096) == b""
+            summary = poller.summary()["lines"]["line"]
+            assert summary["foreign_bytes"] > 0
+            assert summary["misses"][OTHER_MASTER] > 0
+        finally:
+            is_over.set()
+            other.join()
+        silent = time.monotonic()
+        wait_for_bytes(far)
+        assert time.monotonic() - silent >= LONGEST
+
+
+# ---- lines that come and go ----
+
+
+class Listener:
+    """A far end that answers nothing and keeps what comes, by connection."""
+
+    def __init__(self) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.url = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
+        self.received: list[bytes] = []
+        self.ends: list[str] = []
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = self._server.accept()
+                self.received.append(b"")
+                self._take(connection)
+
+    def _take(self, connection: socket.socket) -> None:
+        with connection:
+            try:
+                while chunk := connection.recv(4096):
+                    self.received[-1] += chunk
+                self.ends.append("closed")
+            except ConnectionResetError:
+                self.ends.append("reset")
+
+    def close(self) -> None:
+        self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+
+
+@pytest.fixture
+def far() -> Iterator[Listener]:
+    made = Listener()
+    yield made
+    made.close()
+
+
+def test_a_line_that_was_removed_is_closed_and_gets_no_byte(mastership: Mastership, far: Listener) -> None:
+    hold(mastership)
+    yard = line(far.url, quick("fan", 1, None), name="yard")
+    with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
+        Rows(poller).settle("pump")
+        for n in (1, 2):
+            poller.add_line(yard)
+            until(lambda n=n: len(far.received) == n and far.received[-1])
+            begun = time.monotonic()
+            poller.remove_line("yard")
+            took = time.monotonic() - begun
+            until(lambda n=n: len(far.ends) == n)
+            asked = list(far.received)
+            Rows(poller).settle("pump")
+            assert far.received == asked
+            assert took < 1.0 + LONGEST  # what is under way is waited for
+        assert list(poller.buses) == ["hall"]
+
+
+def test_no_port_is_opened_by_who_is_not_the_master(mastership: Mastership, far: Listener) -> None:
+    """Not at first, and not where it was lost: that could cut the master's connection off."""
+    yard = line(far.url, quick("fan", 1, None), name="yard")
+    with lines(0.02) as (_, (hall, _)), Poller(plant(hall, yard), mastership=mastership) as poller:
+        Rows(poller).until("fan", NOT_MASTER)
+        assert far.received == []
+        hold(mastership)
+        until(lambda: far.received and far.received[-1])
+        mastership.end()
+        Rows(poller).until("fan", NOT_MASTER)
+        poller.bus("yard").line.drop()
+        Rows(poller).settle_unpolled("fan")
+        assert len(far.received) == 1
+        hold(mastership)
+        until(lambda: len(far.received) == 2 and far.received[-1])
+
+
+def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
+    """Add the pump's new rows of one register to those that there are."""
+    rows += [row for row in rows_of(poller) if (row.drive, row.register) == ("pump", "status")]
+    return rows
+
+
+def test_rows_of_other_lines_go_on_while_lines_come_and_go(mastership: Mastership, far: Listener) -> None:
+    hold(mastership)
+    yard = line(far.url, quick("fan", 1, None), name="yard")
+    with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
+        Rows(poller).settle("pump")
+        rows_of(poller)
+        rows: list[Row] = []
+        for n in range(1, 6):
+            poller.add_line(yard)
+            poller.remove_line("yard")
+            until(lambda n=n: len(taken_of(poller, rows)) >= 10 * n)
+        assert {row.status for row in rows} <= {"ok", *HOST_LATE}
+        due = [row.monotonic_ns for row in rows]
+        assert max(later - at for at, later in pairwise(due)) < S  # of 0.02 s each, on a machine that is busy
+
+
+def test_a_name_that_is_taken_or_unknown_is_one_sentence(mastership: Mastership) -> None:
+    hold(mastership)
+    with lines(None) as (_, (hall, yard)), Poller(plant(hall), mastership=mastership) as poller:
+        again = line(yard.port, quick("fan", 2, None), name="hall")
+        with pytest.raises(PlantError) as mistake:
+            poller.add_line(again)
+        assert str(mistake.value).count("\n") == 0
+        assert "hall" in str(mistake.value)
+        with pytest.raises(ValueError, match=r"^there is no line 'yard'; there are hall$"):
+            poller.remove_line("yard")
+        assert list(poller.buses) == ["hall"]
+        Rows(poller).settle("pump")
+
+
+def test_a_bridged_port_is_refused_and_nothing_changes(mastership: Mastership) -> None:
+    hold(mastership)
+    bridged = line("rfc2217://127.0.0.1:1", quick("fan", 1, None), name="yard")
+    with pytest.raises(NoSuchPort, match="needs a port that the core writes to itself"):
+        Poller(plant(bridged), mastership=mastership)
+    with lines(None) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
+        with pytest.raises(NoSuchPort):
+            poller.add_line(bridged)
+        with pytest.raises(NoSuchPort):
+            poller.adopt(plant(bridged))
+        assert list(poller.buses) == ["hall"]
+        Rows(poller).settle("pump")
+
+
+def test_many_ports_are_opened_side_by_side_and_closed_at_once(mastership: Mastership) -> None:
+    """pyserial's own sockets sleep for 0.3 s when they are closed: 64 of them for 19 s."""
+    wires = [Wire([simulated(Quick(1))], unpaced=True, port="socket://127.0.0.1:0") for _ in range(64)]
+    with Simulator(wires) as simulator:
+        declared = [
+            line(wire.path, quick(f"pump-{n}", 1, 1.0), name=f"line-{n}")
+            for n, wire in enumerate(simulator.wires)
+        ]
+        with Poller(plant(*declared), mastership=mastership) as poller:
+            assert len(poller.buses) == 64
+            begun = time.monotonic()
+        assert time.monotonic() - begun < 6

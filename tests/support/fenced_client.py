@@ -1,0 +1,77 @@
+"""A master of several lines that is forked, polls while its lease is renewed, and is stopped by others.
+
+Each line of standard input is a life: FD LEASE GUARD BEYOND PORT... FD is a socket, inherited, on which it
+asks for each renewal by a byte and has it by another. LEASE and GUARD are in s. BEYOND is how long, in s, it
+may send beyond its lease: 0 but where the test wants to see what the look is for. The id of each life is
+printed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import time
+import traceback
+from pathlib import Path
+
+from multidrop import Mastership, Plant, PlantLine, Polled, PolledDrive, Poller
+from multidrop.drive import Drive, Framing
+from multidrop.drive.declare import reading
+from multidrop.drive.table import HOLDING
+
+
+class Counted(Drive):
+    """A drive of one register, which answers at once."""
+
+    framings = (Framing.RTU,)
+    baudrates = (115_200,)
+    most_registers = {HOLDING: 1}
+    response_delay = 0.0
+    response_timeout = 0.02
+
+    number = reading(0)
+
+
+def now_ns() -> int:
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def live(observer: socket.socket, lease: float, guard: float, beyond: float, ports: list[str]) -> None:
+    mastership = Mastership(guard)
+    drives = [
+        PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
+    ]
+    lines = [
+        PlantLine(f"line-{n}", port, None, None, (drive,))
+        for n, (port, drive) in enumerate(zip(ports, drives, strict=True))
+    ]
+    with Poller(Plant(tuple(lines), Path("plant.toml")), mastership=mastership) as poller:
+        while True:
+            asked_ns = now_ns()
+            observer.send(b"?")
+            if not observer.recv(1):
+                return
+            mastership.extend(asked_ns + round((lease + beyond) * 1e9))
+            poller.take()
+            time.sleep(lease / 3)
+
+
+def main() -> None:
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system buries them
+    for words in map(str.split, sys.stdin):
+        fd, lease, guard, beyond, *ports = words
+        if child := os.fork():
+            print(child, flush=True)
+            continue
+        try:
+            live(socket.socket(fileno=int(fd)), float(lease), float(guard), float(beyond), ports)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

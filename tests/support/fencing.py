@@ -1,0 +1,186 @@
+"""A master that is stopped at random moments, one that takes over, and the lines' far end, which counts.
+
+The observer grants renewals, and takes over when the last one is older than lease and guard by its own
+clock, as a fleet does. What the far end is sent after that is stale: another master would be on the line.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from checksums import rtu
+
+CLIENT = Path(__file__).with_name("fenced_client.py")
+REQUEST = 8  # bytes
+REPLY = rtu("01 03 02 00 07")
+IDLE_S = 0.005  # in which everything that was sent on this machine is there
+WATCHED_S = 0.08  # after it goes on
+PATIENCE_S = 60.0
+
+
+def now_s() -> float:
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class FarEnd:
+    """Serial servers with a drive each; they answer at once, and count requests."""
+
+    def __init__(self, lines: int) -> None:
+        self.requests = 0
+        self._idle = 0  # looks that found nothing
+        self._selector = selectors.DefaultSelector()
+        self._servers = [socket.create_server(("127.0.0.1", 0)) for _ in range(lines)]
+        self.ports = [f"socket://127.0.0.1:{server.getsockname()[1]}" for server in self._servers]
+        for server in self._servers:
+            self._selector.register(server, selectors.EVENT_READ, self._accept)
+        self._is_over = False
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._is_over:
+            ready = self._selector.select(IDLE_S)
+            for key, _ in ready:
+                key.data(key.fileobj)
+            self._idle += not ready
+
+    def _accept(self, server: socket.socket) -> None:
+        self._selector.register(server.accept()[0], selectors.EVENT_READ, self._answer)
+
+    def _answer(self, connection: socket.socket) -> None:
+        received = b""
+        with suppress(ConnectionError):
+            received = connection.recv(4096)
+            if received:
+                self.requests += -(-len(received) // REQUEST)
+                connection.send(REPLY)
+        if not received:
+            self._selector.unregister(connection)
+            connection.close()
+
+    def settle(self, seconds: float) -> None:
+        """Wait until nothing more comes, but not for longer than this."""
+        before, end = self._idle, now_s() + seconds
+        while self._idle < before + 2 and now_s() < end:
+            time.sleep(0.001)
+
+    def close(self) -> None:
+        self._is_over = True
+        self._thread.join()
+        for key in [*self._selector.get_map().values()]:
+            key.fileobj.close()  # type: ignore[union-attr]
+        self._selector.close()
+
+
+@dataclass
+class Round:
+    """One stop: requests that came after the takeover, and whether the kernel had killed the old master."""
+
+    stale: int
+    is_killed: bool
+
+
+class Fence:
+    """Masters of so many lines, one after another; of `beyond` s of each mastership nobody else knows."""
+
+    def __init__(
+        self, lines: int, lease: float, guard: float, *, timer: float = 0.0, beyond: float = 0.0
+    ) -> None:
+        self.far = FarEnd(lines)
+        self._lease, self._guard, self._beyond = lease, guard, beyond
+        self._timer = timer or guard  # of the master's own guard: a long one is no timer
+        self._ours, self._theirs = socket.socketpair()
+        self._theirs.set_inheritable(True)
+        self._client = subprocess.Popen(
+            [sys.executable, str(CLIENT)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            pass_fds=[self._theirs.fileno()],
+        )
+
+    def close(self) -> None:
+        assert self._client.stdin
+        assert self._client.stdout
+        self._client.stdin.close()
+        self._client.wait(PATIENCE_S)
+        self._client.stdout.close()
+        self._ours.close()
+        self._theirs.close()
+        self.far.close()
+
+    @contextmanager
+    def _master(self) -> Iterator[int]:
+        """A life that polls; it is dead at the end."""
+        assert self._client.stdin
+        assert self._client.stdout
+        words = [self._theirs.fileno(), self._lease, self._timer, self._beyond, *self.far.ports]
+        self._client.stdin.write(" ".join(map(str, words)) + "\n")
+        self._client.stdin.flush()
+        pid = int(self._client.stdout.readline())
+        watched = os.pidfd_open(pid)
+        try:
+            yield watched
+        finally:
+            _tell(watched, signal.SIGKILL)
+            _await_death(watched, PATIENCE_S)
+            os.close(watched)
+            while select.select([self._ours], [], [], 0)[0]:
+                self._ours.recv(4096)
+
+    def _grant(self, seconds: float) -> bool:
+        """Wait for a renewal that is asked for, and grant it; False where none is."""
+        if not select.select([self._ours], [], [], max(seconds, 0))[0]:
+            return False
+        self._ours.recv(4096)
+        self._ours.send(b"!")
+        return True
+
+    def stop_once(self, chance: random.Random) -> Round:
+        """Let a master poll, stop it at a random moment, take over, and let it go on."""
+        with self._master() as master:
+            asked = self.far.requests
+            end = now_s() + PATIENCE_S
+            while self.far.requests < asked + 20 * len(self.far.ports):
+                self._grant(0.01)
+                assert now_s() < end, "the master does not poll"
+            stop_s = now_s() + chance.uniform(0, self._lease)
+            seen_s = now_s()
+            while (left := stop_s - now_s()) > 0:
+                if self._grant(left):
+                    seen_s = now_s()
+            _tell(master, signal.SIGSTOP)
+            while (left := seen_s + self._lease + self._guard - now_s()) > 0:
+                if self._grant(left):  # what it had asked for before it stopped
+                    seen_s = now_s()
+            # taken over: nobody is granted anything from here on
+            self.far.settle(1.0)
+            before = self.far.requests
+            is_killed = _await_death(master, 0)
+            time.sleep(chance.uniform(0, 0.02))
+            _tell(master, signal.SIGCONT)
+            time.sleep(WATCHED_S)
+            self.far.settle(0.1)
+            return Round(self.far.requests - before, is_killed)
+
+
+def _tell(master: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        signal.pidfd_send_signal(master, number)
+
+
+def _await_death(master: int, seconds: float) -> bool:
+    return bool(select.select([master], [], [], seconds)[0])

@@ -1,0 +1,61 @@
+"""A master that stood still sends nothing on lines that another took over, by what their far end saw.
+
+`python -m bench.questions.fence` does the same 2,000 times.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from fencing import Fence, Round
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+LINES, LEASE, GUARD = 10, 0.4, 0.3  # s
+
+
+@contextmanager
+def fence(**details: Any) -> Iterator[Fence]:
+    made = Fence(LINES, LEASE, GUARD, **details)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def rounds(made: Fence, stops: int) -> list[Round]:
+    chance = random.Random(15)
+    return [made.stop_once(chance) for _ in range(stops)]
+
+
+@pytest.mark.slow
+def test_a_master_that_stood_still_sends_nothing_and_is_killed() -> None:
+    with fence() as made:
+        found = rounds(made, 10)
+    assert [each.stale for each in found] == [0] * 10
+    assert all(each.is_killed for each in found)
+
+
+@pytest.mark.slow
+def test_a_master_that_goes_on_sends_nothing() -> None:
+    """Without the kernel's timer, for it is hours away: only the look at the clock holds it back."""
+    with fence(timer=3600) as made:
+        found = rounds(made, 6)
+    assert not any(each.is_killed for each in found)
+    # a stop between look and write lets one request through, once in a thousand stops
+    assert sum(each.stale for each in found) <= 1
+
+
+@pytest.mark.slow
+def test_without_the_look_it_sends() -> None:
+    """So the tests above can fail: the master believes that it may send for longer than others know."""
+    with fence(beyond=1000) as made:
+        found = rounds(made, 4)
+    assert all(each.stale > 0 for each in found)
+    assert not any(each.is_killed for each in found)
