@@ -1,4 +1,4 @@
-"""Messages of a fleet: bytes and CPU a value, and what a spool takes with each message on the disk.
+"""Samples of a fleet: bytes and CPU a value of messages, and what their stores take and need.
 
 The rows are those of a plant in operation: each line asks its drives in turn, ten registers at once, every
 12 ms and some; speeds, currents and voltages move by a step or two at three of five polls, temperatures at
@@ -9,16 +9,30 @@ from __future__ import annotations
 
 import argparse
 import heapq
+import os
 import random
 import resource
+import sys
 import time
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import UTC as UTC_ZONE
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+
+from postgres_clusters import Postgres, postgres
 
 from bench.support import tables
 from multidrop import BatchColumns
+from multidrop.fleet.hub import Commit, SampleSink
 from multidrop.fleet.message import Packed, RowBuffer, unpack
+from multidrop.fleet.parquet_sink import ParquetSink
+from multidrop.fleet.postgres_sink import PostgresSink
+from multidrop.fleet.spool_folder import SpoolFolder
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # a line
@@ -112,14 +126,107 @@ def messages() -> Iterator[tuple[object, ...]]:
         yield made, lines, len(found), f"{size / made:.2f}", f"{packing:.0f}", f"{reading:.0f}"
 
 
+def stores(folder: Path) -> Iterator[tuple[object, ...]]:
+    """Write the same half million rows of 500 lines by each store, in two commits."""
+    found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
+    sent = [one.data for columns in found for one in packed(columns)]
+    rows = sum(len(columns.time) for columns in found)
+    spool = SpoolFolder(folder / "spool", "gateway-1", "fleet")
+
+    def spooled() -> int:
+        for columns in found:
+            for one in packed(columns):
+                spool.add(spool.write(one.data, one.rows))
+        return size_of(folder / "spool")
+
+    yield ("spool, packed and fsynced", rows, *timed(rows, spooled))
+    yield ("hub, Parquet", rows, *timed(rows, lambda: in_files(folder / "hub", sent)))
+    with postgres() as database:
+        yield ("hub, PostgreSQL", rows, *timed(rows, lambda: in_database(database, sent)))
+        yield (
+            "PostgreSQL, a row a value, COPY by psycopg",
+            rows,
+            *timed(rows, lambda: narrow(database, sent)),
+        )
+
+
+def in_files(folder: Path, sent: list[bytes]) -> int:
+    sink = ParquetSink(folder)
+    commit(sink, sent)
+    sink.close()
+    return size_of(folder)
+
+
+def in_database(database: Postgres, sent: list[bytes]) -> int:
+    sink = PostgresSink(database.where)
+    sink.begin("bench")
+    commit(sink, sent)
+    sink.close()
+    ((size,),) = database.ask("select pg_total_relation_size('multidrop.exchanges')")
+    return int(str(size))
+
+
+def commit(sink: SampleSink, sent: list[bytes]) -> None:
+    """Write the messages in two commits."""
+    for first in range(0, len(sent), len(sent) // 2):
+        tables = [unpack(data) for data in sent[first : first + len(sent) // 2]]
+        last = first + len(tables)
+        sink.write(Commit("bench", first + 1, last, {"gateway-1.log": last}, tables, sum(map(len, tables))))
+
+
+def narrow(database: Postgres, sent: list[bytes]) -> int:
+    """Write a row a value, with an index by drive, register and time, as one would do at first."""
+    import psycopg
+
+    database.ask(
+        "create table narrow (time timestamptz, drive int, register int, value float8, status int);"
+        "create index on narrow (drive, register, time)"
+    )
+    query = "copy narrow from stdin (format binary)"
+    with psycopg.connect(database.where) as connection, connection.cursor() as cursor:
+        with cursor.copy(query) as copy:
+            copy.set_types(["timestamptz", "int4", "int4", "float8", "int4"])
+            for data in sent:
+                table = unpack(data).combine_chunks()
+                codes = [table.column(name).chunk(0).indices for name in ("drive", "register", "status")]
+                drives, registers, statuses = (one.to_pylist() for one in codes)
+                times = [datetime.fromtimestamp(ns / 1e9, UTC_ZONE) for ns in times_of(table)]
+                values = table.column("value").to_pylist()
+                for row in zip(times, drives, registers, values, statuses, strict=True):
+                    copy.write_row(row)
+        connection.commit()
+    (size,) = database.ask("select pg_total_relation_size('narrow')")[0]
+    return int(str(size))
+
+
+def times_of(table: Any) -> list[int]:
+    times: list[int] = table.column("time").cast("int64").to_pylist()
+    return times
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def timed(rows: int, act: Callable[[], int]) -> tuple[str, str, str]:
+    """Return million rows a second, the CPU of this process in ns, and bytes on the disk, of a row."""
+    begun, used = time.monotonic(), cpu()
+    size = act()
+    seconds, used = time.monotonic() - begun, cpu() - used
+    return f"{rows / seconds / 1e6:.2f}", f"{used / rows * 1e9:.0f}", f"{size / rows:.1f}"
+
+
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
-    tables.heading("Messages of samples.")
-    begun = time.monotonic()
+    tables.heading("Messages of samples, and their stores.")
     tables.show(
         ("rows", "lines", "messages", "B/value", "pack ns/value", "unpack ns/value"), list(messages())
     )
-    print(f"\n{time.monotonic() - begun:.0f} s")
+    print(f"\nload now {os.getloadavg()[0]:.1f}\n")
+    with TemporaryDirectory(prefix="multidrop-samples-") as folder:
+        columns = ("store", "values", "million/s", "CPU ns/value", "B/value")
+        tables.show(columns, list(stores(Path(folder))))
+    print(f"\nload now {os.getloadavg()[0]:.1f}")
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def test_a_new_folder_is_a_new_log(tmp_path: Path) -> None:
 def test_a_newest_file_cut_at_every_byte_loses_nothing_that_was_stored_before(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
-    """As a disk leaves it that kept the name and not the bytes; and a file without its name is there too."""
+    """A disk that kept the name and not the bytes leaves it so; a file without its name is there too."""
     whole = tmp_path / "whole"
     filled(whole, 3, exchanges=2)
     newest = max(whole.glob("*.arrows"))

@@ -60,6 +60,8 @@ NOT_RUN = {
     "multidrop serve --new-token": "prints a secret: tests/gateway/test_serve.py",
     "multidrop serve --demo": "runs until it is told to end: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is told to end: tests/gateway/test_serve.py",
+    "pip install 'multidrop[fleet]'": "installs",
+    "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",
     "multidrop doctor": "is about a real adapter: tests/cli/test_doctor.py",

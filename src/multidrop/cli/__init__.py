@@ -42,6 +42,7 @@ COMMANDS = {  # name: module in this package, and help
     "doctor": ("doctor.command", "say what is amiss with a port and its adapter"),
     "serve": ("serve", "poll a plant for a browser, Prometheus, MQTT, Modbus TCP and a history"),
     "fleet": ("fleet", "share the lines of a plant out to several gateways, by NATS"),
+    "hub": ("hub", "keep a fleet's samples in Parquet files or in PostgreSQL"),
     "monitor": ("monitor.command", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "play the drives of a plant file on pseudo-terminals"),
     "sniff": ("sniff.command", "listen to a line that someone else masters"),

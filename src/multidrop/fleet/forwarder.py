@@ -22,6 +22,7 @@ from multidrop.fleet.samples_stream import (
     SEQUENCE,
     StreamError,
     digest_of,
+    end_if_cancelled,
     last_of,
     publish,
     subject_of,
@@ -91,11 +92,13 @@ class Forwarder:
             if stored is None:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._news.wait(), LOOKING_S)
+                end_if_cancelled()
                 continue
             data = await asyncio.to_thread(_read, stored.path)
             if data is None:  # removed meanwhile: the spool is full
                 continue
             found = await publish(self._client, self._subject, data, self._headers(stored, data, place))
+            end_if_cancelled()
             if found is None:  # an earlier attempt of ours came through
                 return
             place, sequence = found, stored.sequence
@@ -105,6 +108,7 @@ class Forwarder:
     async def _ask(self) -> tuple[int, int]:
         """Return the place and the sequence of the last message that the stream has of this log."""
         last = await last_of(self._client, self._subject)
+        end_if_cancelled()
         if last is None:
             sequence = self._last or 0  # the stream keeps no message for ever
             self._have(sequence)

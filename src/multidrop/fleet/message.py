@@ -30,7 +30,7 @@ MOST_BYTES = 900_000  # of a message: NATS takes 1 MiB from the factory, its hea
 MOST_ROWS = 1 << 16
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-NAMED = pa.dictionary(pa.uint16(), pa.utf8())
+NAMED = pa.dictionary(pa.int32(), pa.utf8())  # of many messages together: more names than one has
 TIMES = pa.timestamp("ns", "UTC")
 ROWS = pa.schema(  # as `unpack` gives them, and as recordings have them
     [

@@ -63,6 +63,13 @@ def digest_of(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
+def end_if_cancelled() -> None:
+    """Raise CancelledError again: `asyncio.wait_for` of 3.11 swallows one that meets an answer."""
+    task = asyncio.current_task()
+    if task and task.cancelling():
+        raise asyncio.CancelledError
+
+
 async def connect(servers: list[str], **options: Any) -> Client:
     """Return a connection that comes back by itself. Raises StreamError."""
     client = Client()

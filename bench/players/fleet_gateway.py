@@ -1,0 +1,65 @@
+"""A gateway of known samples: `python -m bench.players.fleet_gateway NAME FOLDER TOLD URL...`
+
+It appends exchanges that count up, and notes in the file TOLD how many it was told to be on the disk: lines
+of a run's first number and a count. With `-` for TOLD it forwards what it has. It is killed at any moment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+
+from spooled import numbered
+
+from multidrop.core import Names
+from multidrop.fleet.forwarder import Forwarder
+from multidrop.fleet.samples_stream import StreamError, connect
+from multidrop.fleet.spool import Spool
+
+EXCHANGES = 100  # of a batch
+RATE = 1000  # exchanges a second: 10,000 values
+GAP = 1_000_000  # between the first numbers of two runs
+
+
+async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:
+    spool = Spool(folder, name)
+    doing = [asyncio.create_task(forward(spool, urls))]
+    if told != "-":
+        drives = Names([f"{name}-{drive}" for drive in range(4)])
+        doing.append(asyncio.create_task(asyncio.to_thread(fill, spool, drives, Path(told))))
+    await asyncio.wait(doing, return_when=asyncio.FIRST_COMPLETED)
+
+
+def fill(spool: Spool, drives: Names, told: Path) -> None:
+    """Append for ever."""
+    runs = len({line.split()[0] for line in told.read_text().splitlines()}) if told.exists() else 0
+    first, count, begun = runs * GAP, 0, time.monotonic()
+    with told.open("a") as file:
+        file.write(f"{first} 0\n")
+        file.flush()
+        while True:
+            spool.append(numbered(first + count, EXCHANGES, drives))
+            count += EXCHANGES
+            if count % (3 * EXCHANGES) == 0 and spool.sync(5.0):
+                file.write(f"{first} {count}\n")
+                file.flush()
+            time.sleep(max(0.0, begun + count / RATE - time.monotonic()))
+
+
+async def forward(spool: Spool, urls: list[str]) -> None:
+    while True:
+        try:
+            client = await connect(urls)
+        except StreamError:
+            await asyncio.sleep(0.2)
+        else:
+            await Forwarder(spool, client).run()
+
+
+if __name__ == "__main__":
+    _, gateway, spooled, noted, *servers = sys.argv
+    asyncio.run(live(gateway, Path(spooled), noted, servers))

@@ -1,0 +1,84 @@
+"""The `hub` command: keeps the samples of a fleet in Parquet files or in PostgreSQL."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import ssl
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from multidrop.cli.support.arguments import add_json_argument, duration
+from multidrop.cli.support.extras import require_extra
+from multidrop.cli.support.output import logging_to, print_text, warn
+
+if TYPE_CHECKING:
+    from multidrop.fleet.hub import HubState, SampleSink
+
+EVERY_S = 10.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("servers", metavar="URL", nargs="+", help="servers of NATS: nats://host:4222")
+    sinks = parser.add_mutually_exclusive_group(required=True)
+    sinks.add_argument("--parquet", metavar="FOLDER", type=Path, help="keep samples in Parquet files there")
+    sinks.add_argument("--postgres", metavar="WHERE", help="keep them in PostgreSQL: 'host=db dbname=plant'")
+    parser.add_argument(
+        "--every", metavar="S", type=duration, default=EVERY_S, help="seconds of samples in a commit (10)"
+    )
+    parser.add_argument("--once", action="store_true", help="end when all is kept that is there now")
+    parser.add_argument("--credentials", metavar="FILE", type=Path, help="credentials of NATS (.creds)")
+    parser.add_argument("--ca", metavar="FILE", type=Path, help="certificate that the servers' are signed by")
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    for library in ("nats", "pyarrow"):
+        require_extra(library, "fleet", "hub")
+    if arguments.postgres:
+        require_extra("psycopg", "postgres", "hub")
+    options: dict[str, Any] = {"name": "multidrop hub"}
+    if arguments.credentials:
+        arguments.credentials.open().close()  # a wrong name is told at once
+        options["user_credentials"] = str(arguments.credentials)
+    if arguments.ca:
+        options["tls"] = ssl.create_default_context(cafile=arguments.ca)
+    sink = _sink(arguments)
+    try:
+        with logging_to(warn, "multidrop.fleet", logging.INFO):
+            state = asyncio.run(_read(arguments, sink, options))
+    finally:
+        sink.close()
+    if arguments.json:
+        print(json.dumps(state._asdict()))
+    else:
+        print_text(
+            f"{state.rows} rows kept, to message {state.place} of the stream; {state.alarms} alarms, "
+            f"{state.missing} messages missing, {state.doubled} left out because they came twice"
+        )
+    return int(state.alarms > 0)
+
+
+def _sink(arguments: argparse.Namespace) -> SampleSink:
+    if arguments.postgres:
+        from multidrop.fleet.postgres_sink import PostgresSink
+
+        return PostgresSink(arguments.postgres)
+    from multidrop.fleet.parquet_sink import ParquetSink
+
+    return ParquetSink(arguments.parquet)
+
+
+async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
+    from multidrop.fleet.hub import SampleHub
+    from multidrop.fleet.samples_stream import connect
+
+    client = await connect(arguments.servers, **options)
+    try:
+        hub = SampleHub(client, sink, every=arguments.every)
+        await hub.run(once=arguments.once)
+        return hub.state()
+    finally:
+        await client.close()

@@ -1,0 +1,111 @@
+"""`multidrop hub`: a stream into files by one command, and a sentence for each mistake."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from nats_clusters import Cluster, cluster, free_ports
+from spooled import exchanges_in, numbered
+
+from multidrop import History
+from multidrop.cli import main
+from multidrop.fleet import samples_stream
+from multidrop.fleet.forwarder import Forwarder
+from multidrop.fleet.samples_stream import connect, create_stream
+from multidrop.fleet.spool import Spool
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Servers whose stream has 40 exchanges in 4 messages, of one gateway's spool."""
+    folder = tmp_path_factory.mktemp("nats")
+
+    async def forward(url: str) -> None:
+        client = await connect([url])
+        await create_stream(client, replicas=1)
+        spool = Spool(folder / "spool", "gateway-1")
+        forwarder = Forwarder(spool, client)
+        task = asyncio.create_task(forwarder.run())
+        for number in range(4):
+            spool.append(numbered(number * 10, 10))
+            assert await asyncio.to_thread(spool.sync, 30.0)
+        while forwarder.state().last != 4:
+            await asyncio.sleep(0.01)
+        task.cancel()
+        await asyncio.wait([task])
+        spool.close()
+        await client.close()
+
+    with cluster(folder, 1) as one:
+        asyncio.run(asyncio.wait_for(forward(one.urls[0]), 60.0))
+        yield one
+
+
+def test_all_that_is_there_is_kept_once(
+    running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["hub", running.urls[0], "--parquet", str(tmp_path), "--once"]
+    assert main(words) == 0
+    assert capsys.readouterr().out == (
+        "400 rows kept, to message 4 of the stream; 0 alarms, 0 messages missing, "
+        "0 left out because they came twice\n"
+    )
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        **{"place": 4, "behind": 0, "rows": 0, "alarms": 0, "missing": 0, "doubled": 0, "trouble": None}
+    }
+    with History(tmp_path) as history:
+        rows = [tuple(row) for batch in history.read() for row in batch]
+    assert exchanges_in(sorted(rows)) == list(range(40))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    status = main(["hub", *words])
+    return status, capsys.readouterr().err
+
+
+def test_no_server(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples_stream, "ANSWER_S", 0.5)
+    url = f"nats://127.0.0.1:{free_ports(1)[0]}"
+    status, told = refused(capsys, url, "--parquet", str(tmp_path / "hub"))
+    assert status == 1
+    assert told.startswith(f"multidrop: no server of NATS answers at {url}: ")
+    assert told.count("\n") == 1
+
+
+def test_a_folder_of_something_else(
+    running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report.txt").write_text("mine")
+    assert refused(capsys, running.urls[0], "--parquet", str(tmp_path)) == (
+        1,
+        f"multidrop: {tmp_path} is no folder of a hub: it holds 'report.txt'; name an empty one\n",
+    )
+
+
+def test_no_sink_and_two(capsys: pytest.CaptureFixture[str]) -> None:
+    status, told = refused(capsys, "nats://127.0.0.1:4222")
+    assert status == 2
+    assert "one of the arguments --parquet --postgres is required" in told
+    status, told = refused(capsys, "nats://x", "--parquet", "a", "--postgres", "b")
+    assert status == 2
+    assert "not allowed with argument" in told
+
+
+def test_credentials_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "nobody.creds"
+    told = refused(capsys, "nats://x", "--parquet", str(tmp_path / "hub"), "--credentials", str(path))
+    assert told == (2, f"multidrop: {path}: No such file or directory\n")
+    assert not (tmp_path / "hub").exists()
+
+
+def test_no_stream(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with cluster(tmp_path / "nats", 1) as one:
+        told = refused(capsys, one.urls[0], "--parquet", str(tmp_path / "hub"), "--once")
+    assert told == (1, "multidrop: there is no stream 'samples': make it by `multidrop fleet init`\n")
