@@ -70,7 +70,7 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An old server does, even if its version is not looked at."""
-    monkeypatch.setattr(setup, "OLDEST", (0, 0))
+    monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = re.escape("claimants at once; no lease is safe there")
         with pytest.raises(FleetError, match=sentence):

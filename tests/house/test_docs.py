@@ -61,6 +61,8 @@ NOT_RUN = {
     "multidrop serve --demo": "runs until it is told to end: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is told to end: tests/gateway/test_serve.py",
     "pip install 'multidrop[fleet]'": "installs",
+    "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
+    "export MULTIDROP_NATS": "names servers: tests/support/fleet_drills.py does it",
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
     "systemctl": "is another program: tests/gateway/test_serve.py sends the same signal",
     "curl": "is another program: tests/gateway/test_gateway_stops.py sends the same",

@@ -99,6 +99,7 @@ class PathLine:
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = False
+        self.may_send = True  # it has no mastership
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
 

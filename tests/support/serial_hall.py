@@ -127,6 +127,9 @@ class SerialHall:
         buffer += data
         while len(buffer) >= REQUEST:
             request = bytes(buffer[:REQUEST])
+            if _crc(request[:-2]) != request[-2:]:
+                del buffer[0]
+                continue
             del buffer[:REQUEST]
             with self._lock:
                 line.note(number, now)
@@ -142,7 +145,10 @@ class SerialHall:
 
 def _answer(client: socket.socket, request: bytes) -> None:
     address, function, _, count = struct.unpack(">BBHH", request[:6])
-    body = struct.pack(">BBB", address, function, 2 * count) + bytes(2 * count)
+    if function in (3, 4) and count <= 125:
+        body = bytes([address, function, 2 * count]) + bytes(2 * count)
+    else:
+        body = bytes([address, function | 0x80, 1])
     try:
         client.sendall(body + _crc(body))
     except OSError:

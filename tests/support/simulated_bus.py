@@ -62,6 +62,7 @@ class SimulatedBus:
         self.seconds += seconds
 
     is_lost = is_tcp = False
+    may_send = True  # it has no mastership
 
     def close(self) -> None:
         pass

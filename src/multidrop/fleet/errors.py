@@ -7,6 +7,10 @@ class FleetError(OSError):
     """Tell a user, in one sentence, why the fleet's servers cannot be used."""
 
 
+class TooOld(FleetError):
+    """A server that may give one lease to two gateways."""
+
+
 class Unsure(FleetError):
     """A request without an answer in time: it may have been carried out, or still be."""
 

@@ -12,7 +12,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.errors import FleetError, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
@@ -55,6 +55,8 @@ class Path:
         for url in self.urls:
             try:
                 await self._move(url)
+            except TooOld:
+                raise
             except FleetError as failure:
                 failures.append(str(failure))
             else:
@@ -177,6 +179,13 @@ async def connect(url: str, options: Mapping[str, Any]) -> Client:
         _cut(client)
         why = str(refusals[-1] if refusals else failure) or type(failure).__name__
         raise FleetError(f"no NATS server answers at {url}: {why}") from None
+    found = client.connected_server_version
+    if (found.major, found.minor) < OLDEST:
+        await _close(client)
+        raise TooOld(
+            f"the NATS server at {url} is {found.major}.{found.minor}; a fleet needs "
+            f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
+        )
     return client
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
-from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.errors import Conflict, FleetError, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
-from multidrop.fleet.servers import OLDEST, Path
+from multidrop.fleet.servers import Path
 
 CONTEST = "contest"
 ROUNDS = 40  # 2.9.10 fails in the first few of them
@@ -39,21 +39,9 @@ async def open_all(paths: Sequence[Path]) -> None:
     """Connect all paths. Raises FleetError where none is reached, or a server is too old."""
     results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
     failures = [result for result in results if isinstance(result, Exception)]
-    if len(failures) == len(paths):
-        raise failures[0]
-    for path in paths:
-        if path.is_open:
-            check_version(path)
-
-
-def check_version(path: Path) -> None:
-    """Raise FleetError where the server is too old for leases."""
-    if path.version < OLDEST:
-        found, oldest = ".".join(map(str, path.version)), ".".join(map(str, OLDEST))
-        raise FleetError(
-            f"the NATS server at {path.url} is {found}; a fleet needs {oldest} or newer: older ones may "
-            "give one lease to two gateways"
-        )
+    too_old = [failure for failure in failures if isinstance(failure, TooOld)]
+    if too_old or len(failures) == len(paths):
+        raise (too_old or failures)[0]
 
 
 async def check_buckets(path: Path) -> None:

@@ -1,0 +1,146 @@
+"""`multidrop fleet`: one sentence for each thing that can be wrong, and what it shows of a fleet."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import Run
+from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from peers import require_module
+
+LINE = """
+[[line]]
+name = "{name}"
+port = "{port}"
+[[line.drive]]
+name = "pump-{name}"
+model = "{model}"
+address = 1
+poll = ["output_current"]
+"""
+
+
+def plant(folder: Path, name: str = "hall-1", port: str = "", model: str = "innovert-ibd") -> Path:
+    path = folder / "plant.toml"
+    path.write_text(LINE.format(name=name, port=port or "socket://127.0.0.1:4001", model=model))
+    return path
+
+
+def one_sentence(said: tuple[int, str, str]) -> str:
+    status, out, err = said
+    assert status in (1, 2)
+    assert out == ""
+    [line] = err.splitlines()
+    return line
+
+
+@pytest.fixture
+def nobody() -> str:
+    [port] = free_ports(1)
+    return f"nats://127.0.0.1:{port}"
+
+
+@pytest.fixture(autouse=True)
+def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    require_module("nats")
+    require_module("pyarrow")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+@pytest.mark.parametrize("words", [["init"], ["status"], ["lines"], ["drain", "gw-1"], ["serve", "gw-1"]])
+def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
+    said = one_sentence(run("fleet", *words, "--nats", nobody))
+    assert f"no NATS server answers at {nobody}" in said
+
+
+def test_servers_without_a_fleet(run: Run, tmp_path: Path) -> None:
+    with cluster(tmp_path / "one", 1) as one:
+        for action in ("status", "serve"):
+            said = one_sentence(run("fleet", action, "gw-1", "--nats", one.urls[0]))
+            assert "has no bucket lease_0: run `multidrop fleet init` first" in said
+
+
+def test_an_old_server(run: Run, tmp_path: Path) -> None:
+    with cluster(tmp_path / "old", 1, old_server_program()) as old:
+        for words in (["init"], ["serve", "gw-1"], ["status"]):
+            assert "a fleet needs 2.12 or newer" in one_sentence(run("fleet", *words, "--nats", old.urls[0]))
+
+
+MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "no such file": (lambda folder: folder / "none.toml", "cannot be read: No such file"),
+    "a mistake": (lambda folder: plant(folder, model="innovert"), "there is no model 'innovert'"),
+    "a name": (lambda folder: plant(folder, name="hall.1"), "the line's name 'hall.1' may have letters"),
+    "a device": (lambda folder: plant(folder, port="/dev/ttyUSB0"), "polls socket:// and tcp:// ports"),
+    "a bridged port": (lambda folder: plant(folder, port="rfc2217://h:4001"), "polls socket:// and tcp://"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_plant_with_a_mistake_changes_nothing(run: Run, nobody: str, tmp_path: Path, mistake: str) -> None:
+    make, sentence = MISTAKES[mistake]
+    assert sentence in one_sentence(run("fleet", "init", make(tmp_path), "--nats", nobody))
+
+
+def test_a_family_in_python_is_not_sent_to_gateways(run: Run, nobody: str, tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("from multidrop import Drive\nfrom toy import Toy\n")
+    path = plant(tmp_path, model="own.py:Toy")
+    path.write_text(path.read_text().replace('poll = ["output_current"]', ""))
+    _, _, said = run("fleet", "init", path, "--nats", nobody)
+    assert "is a Python file, and gateways run none that comes over the network" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["serve"], "name a gateway, such as `multidrop fleet serve gw-1`"),
+        (["drain"], "name a gateway, such as `multidrop fleet drain gw-1`"),
+        (["serve", "gw.1"], "the gateway's name 'gw.1' may have letters"),
+        (["status", "--nats", "127.0.0.1"], "127.0.0.1 is no address of a NATS server"),
+        (["dance"], "invalid choice: 'dance'"),
+    ],
+)
+def test_a_mistaken_call(run: Run, words: list[str], sentence: str) -> None:
+    assert sentence in one_sentence(run("fleet", *words))
+
+
+@pytest.mark.parametrize("library", ["nats", "pyarrow"])
+def test_a_missing_extra(run: Run, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == library else found(name))
+    said = one_sentence(run("fleet", "status"))
+    assert said.endswith(
+        f"`multidrop fleet` needs {library}, which is not installed: pip install 'multidrop[fleet]'"
+    )
+
+
+def test_two_gateways_of_one_name_on_one_machine(run: Run, tmp_path: Path, nobody: str) -> None:
+    from multidrop.fleet.lease import LifeLock
+
+    with closing(LifeLock(tmp_path / "gw-1.lock")):
+        said = one_sentence(run("fleet", "serve", "gw-1", "--folder", tmp_path, "--nats", nobody))
+    assert "another gateway of this machine runs with" in said
+
+
+def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None:
+    servers = ("--nats", ",".join(nats.urls))
+    status, out, err = run("fleet", "init", plant(tmp_path), *servers)
+    assert (status, err) == (0, "")
+    assert "n1 2." in out
+    assert "lines: 1 new, 0 changed, 0 removed, 0 kept" in out
+    status, out, _ = run("fleet", "init", plant(tmp_path, port="socket://127.0.0.1:4002"), "--json", *servers)
+    assert json.loads(out)["lines"] == {"new": 0, "changed": 1, "removed": 0, "kept": 0}
+    status, out, _ = run("fleet", "lines", "--json", *servers)
+    lines: dict[str, Any] = json.loads(out)
+    assert lines["hall-1"]["port"] == "socket://127.0.0.1:4002"
+    assert lines["hall-1"]["master"] is None
+    status, out, _ = run("fleet", "status", *servers)
+    assert status == 1  # a line without a master
+    assert "1 lines, 1 without a master" in out
+    said = one_sentence(run("fleet", "drain", "gw-9", *servers))
+    assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
