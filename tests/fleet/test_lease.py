@@ -308,6 +308,25 @@ def test_what_is_judged_is_what_is_ended() -> None:
     asyncio.run(main())
 
 
+def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
+    """Else all gateways would end each other when servers that were away come back."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        trial.clock.pass_s(60)
+        observer.begin_anew()
+        await observer.end_the_dead()
+        assert not observer.is_over("a", 1)
+        trial.clock.pass_s(USUAL.patience / SECOND)
+        await observer.end_the_dead()
+        assert observer.is_over("a", 1)
+
+    asyncio.run(main())
+
+
 def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
     """Its path would stay ended for as long as it lives."""
 

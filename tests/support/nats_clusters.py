@@ -151,7 +151,7 @@ class Cluster:
 @contextmanager
 def cluster(folder: Path, number: int = 3, program: str | None = None) -> Iterator[Cluster]:
     for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
-        running = Cluster(folder / str(attempt), number, program)
+        running = Cluster(folder / str(attempt) if attempt else folder, number, program)
         if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
             break
         running.close()

@@ -98,7 +98,7 @@ class Member:
         self._settled_at = 0
         self._looked: set[str] = set()  # buckets that were read at least once
         self._is_dirty = True
-        self._is_leaving = False
+        self._is_leaving = self._was_valid = False
         self._stepped: tuple[bool, bool] | None = None
         self._releasing: set[str] = set()
         self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
@@ -259,7 +259,13 @@ class Member:
 
     async def step(self) -> None:
         """Do what is to be done now; nothing here waits for a server, but the ending of dead gateways."""
-        await self.observer.end_the_dead()
+        if not self.lease.is_valid:
+            self._was_valid = False
+        elif not self._was_valid:
+            self._was_valid = True
+            self.observer.begin_anew()
+        else:
+            await self.observer.end_the_dead()
         await self._share_out()
         now = (self._is_settled, self._may_poll)
         if self._is_dirty or now != self._stepped:

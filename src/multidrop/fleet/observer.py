@@ -30,6 +30,12 @@ class Observer:
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._clock = clock
 
+    def begin_anew(self) -> None:
+        """Count from now on: whoever was cut off itself knows nothing of the others meanwhile."""
+        now = self._clock()
+        for seen in self._watched:
+            seen.update({name: one._replace(since=now) for name, one in seen.items()})
+
     async def look(self, path: int) -> None:
         """Read what changed on a path. Raises FleetError where it is not reached."""
         for record in await self.paths[path].look():
