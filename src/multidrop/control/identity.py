@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 
 from multidrop.control.echo_check import EchoCheck
-from multidrop.core import Status
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Read, Step, Wait, carry_out
 from multidrop.drives import MODELS
@@ -27,14 +26,23 @@ class IdentityCheck:
         self._exchanges = exchanges
         self._echo = echo
         self._known: dict[Drive, object] = {}  # the open port on which it was found to be of its family
+        self._silences: dict[Drive, int] = {}  # times that it had not answered before it was found so
         self._stoppable: dict[Drive, object] = {}  # or on which nothing was found against a stop
         self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
 
     def is_known(self, drive: Drive) -> bool:
         return self._known.get(drive, self) is self._exchanges.line.queue
 
+    def _is_the_same(self, drive: Drive) -> bool:
+        """Return True where it answered all since it was known: whoever changes a drive interrupts it."""
+        return self.is_known(drive) and self._silences.get(drive) == self._exchanges.peer(drive).silences
+
+    def _know(self, drive: Drive, port: object, silences: int) -> None:
+        self._known[drive], self._silences[drive] = port, silences
+
     def forget(self, drive: Drive) -> None:
         self._known.pop(drive, None)
+        self._silences.pop(drive, None)
         self._stoppable.pop(drive, None)
         self._suspected.pop(drive, None)
 
@@ -44,10 +52,10 @@ class IdentityCheck:
         """Check once; Refused when it is of another family, NoReply when it does not answer.
 
         At least one value is read, so that the echo of an adapter is known before it could be taken for
-        the drive's confirmation of a write. After the port was opened again it is checked again, because
-        something else may be on it. Each read is within `timed`.
+        the drive's confirmation of a write. After the port was opened again, and after it did not answer, it
+        is checked again, because something else may be there. Each read is within `timed`.
         """
-        if self.is_known(drive):
+        if self._is_the_same(drive):
             return
 
         def do(step: Step) -> object:
@@ -56,7 +64,7 @@ class IdentityCheck:
             with timed():
                 return self._read(drive, step, READ_ATTEMPTS)
 
-        port = self._exchanges.line.queue
+        port, silences = self._exchanges.line.queue, self._exchanges.peer(drive).silences
         try:
             carry_out(drive.identify.script(), do)
         except DriveRefused as refusal:
@@ -68,7 +76,7 @@ class IdentityCheck:
         if not self._exchanges.has_answered(drive):
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
-        self._known[drive] = port
+        self._know(drive, port, silences)
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
@@ -105,12 +113,12 @@ class IdentityCheck:
     def _is_in_step(self, drive: Drive) -> bool:
         """Return True where an answer from its address can only be to the request sent now."""
         peer = self._exchanges.peer(drive)
-        counters = peer.counters()
-        return not (counters.late or counters.ended[Status.NO_REPLY] or peer.late_until_ns)
+        return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
     def _suspicion(self, drive: Drive) -> Suspicion | None:
         """Run the family's `identify` once; None where nothing says that it is another."""
         port, refused = self._exchanges.line.queue, None
+        silences = self._exchanges.peer(drive).silences
 
         def do(step: Step) -> object:
             nonlocal refused
@@ -133,7 +141,7 @@ class IdentityCheck:
         except Exception:  # no answer; or the family's own code failed, which must not keep a stop back
             return None
         if self._is_in_step(drive):
-            self._known[drive] = port
+            self._know(drive, port, silences)
         return None
 
     def _lookalike(self, drive: Drive) -> Drive | None:

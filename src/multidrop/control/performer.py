@@ -49,7 +49,7 @@ class Performer:
         """
         with call.noted():
             call.check(f"the {call.verb}")
-            self.check_identity(call.drive, call)
+            self._look_at_identity(call.drive, call)
             result = self.perform(script, call)
             if not call.permit.is_good:
                 raise _unseen(call, call.overtaken(f"the {call.verb}"))
@@ -84,15 +84,18 @@ class Performer:
         with call.noted():
             return self._writer.raw(drive, request, call)
 
-    def check_identity(self, drive: Drive, call: Call | None = None) -> None:
+    def check_identity(self, drive: Drive) -> None:
         """Check once that it is of its family; the first check also logs what its watchdog does."""
+        if not self._writer.identity_check.is_known(drive):
+            self._look_at_identity(drive, self.call(drive))
+
+    def _look_at_identity(self, drive: Drive, call: Call) -> None:
         identity_check = self._writer.identity_check
-        if identity_check.is_known(drive):
-            return
-        call = call or self.call(drive)
+        is_first = not identity_check.is_known(drive)
         identity_check.check(drive, call.look)
-        with call.look():
-            _log.info("%s: %s", drive.name, self.watchdog(drive))
+        if is_first:
+            with call.look():
+                _log.info("%s: %s", drive.name, self.watchdog(drive))
 
     def watchdog(self, drive: Drive) -> str:
         """Say what the motor does when this client dies, as far as the drive can tell."""

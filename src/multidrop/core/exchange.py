@@ -98,6 +98,11 @@ class Peer:
         """The time-out of its next read, if it stays silent."""
         return int(lib.md_vain_ns(self.c))
 
+    @property
+    def silences(self) -> int:
+        """Exchanges that ended without a reply."""
+        return int(self.c.history.ended[Status.NO_REPLY])
+
     def counters(self) -> Counters:
         """Count its exchanges so far, and values that were due and not asked for."""
         return read_counters(self.c, int(lib.md_present_timeout_ns(self.c)), self.unasked)

@@ -1,0 +1,97 @@
+"""A drive that did not answer may be another now: the next start looks again; a stop does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from lines import line, plant, polled, until
+from motors import MAKE, ReceivedRequests
+
+from multidrop import Bus, InvtCHE, NoReply, Poller, Refused
+from multidrop.control import records
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+
+every_family = pytest.mark.parametrize("model", MAKE)
+GOODRIVE = 0x010A  # what another of INVT's series says it is, where a CHE says 0101H
+
+
+@contextmanager
+def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
+    """One drive on a line of its own, which was found to be what it is said to be."""
+    sim = simulated(MAKE[model](1))
+    assert isinstance(sim, MotorDrive)
+    sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
+    received = ReceivedRequests(sim)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
+        drive = bus.attach(MAKE[model](1))
+        bus.check_identity(drive)
+        yield bus, drive, received
+
+
+def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
+    received.loses = lambda request: True
+    with pytest.raises(NoReply):
+        bus.read(drive, next(register for register in drive.registers.values() if register.readable))
+    received.loses = lambda request: False
+    received.requests.clear()
+
+
+def test_another_drive_in_the_place_of_a_known_one_is_not_started() -> None:
+    with known("invt-che") as (bus, drive, received):
+        drive.set_frequency(10)
+        be_silent(bus, drive, received)
+        received.sim["device"] = GOODRIVE
+        for move in (drive.start, drive.jog, lambda: drive.set_frequency(20)):
+            with pytest.raises(Refused, match="010AH"):
+                move()
+        assert received.requests
+        assert received.writes == []
+
+
+@every_family
+def test_a_drive_that_was_silent_is_looked_at_once_before_the_next_write(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
+    with known(model) as (bus, drive, received):
+        looks: list[str] = []
+        monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
+        drive.set_frequency(10)
+        assert looks == []
+        be_silent(bus, drive, received)
+        drive.set_frequency(20)
+        drive.set_frequency(30)
+        assert looks == ["look"]
+
+
+@every_family
+def test_a_stop_of_a_drive_that_was_silent_asks_nothing_first(model: str) -> None:
+    with known(model) as (bus, drive, received):
+        drive.set_frequency(10)
+        drive.start()
+        be_silent(bus, drive, received)
+        drive.stop()
+        assert received.requests[0] == received.writes[0]
+
+
+def test_what_polling_missed_counts_too() -> None:
+    """Also while the drive was interrupted, its line was polled: nobody has to ask by hand."""
+    sim = simulated(MAKE["invt-che"](1))
+    assert isinstance(sim, MotorDrive)
+    received = ReceivedRequests(sim)
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        drive = InvtCHE(1, maximum_frequency=50)
+        hall = line(simulator.wires[0].path, polled(drive, [drive.registers["status"]], 0.02))
+        with Poller(plant(hall)) as poller:
+            bus = poller.bus(hall.name)
+            bus.check_identity(drive)
+            received.loses = lambda request: True
+            until(lambda: bus.peers[drive].silences > 0)
+            received.loses = lambda request: False
+            sim["device"] = GOODRIVE
+            with pytest.raises(Refused, match="010AH"):
+                drive.start()
+    assert received.writes == []
