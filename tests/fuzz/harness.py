@@ -8,7 +8,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-SYSTEM = ("engine", "port", "waiter", "wakeup", "row_queue")  # parts of the core that need one
+SYSTEM = ("engine", "port", "mastership", "waiter", "wakeup", "row_queue")  # parts of the core that need one
 OPTIONS = ("-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}")
 
 

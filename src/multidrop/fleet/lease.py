@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import logging
 import os
 import time
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop.fleet import lease_rules
 from multidrop.fleet.buckets import NONE_YET, Bucket, Record
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.file_lock import lock
 from multidrop.fleet.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
 
 _log = logging.getLogger("multidrop.fleet")
@@ -50,7 +50,7 @@ class LifeLock:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("a+b")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._file.fileno())
         except OSError:
             self._file.close()
             sentence = f"another gateway of this machine runs with {path}; end that one first"

@@ -12,7 +12,6 @@ file says what each source's last message was, and must stay. BEGIN and END are 
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
@@ -25,6 +24,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from multidrop.fleet.file_lock import lock
 from multidrop.fleet.hub import Commit, KeptPlace, NotThisHubs, SinkError
 from multidrop.fleet.message import ROWS
 
@@ -53,7 +53,7 @@ class ParquetSink:
         except OSError as failure:
             raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._lock)
         except BlockingIOError:
             self.close()
             raise NotThisHubs(f"another hub writes into {self.folder}") from None

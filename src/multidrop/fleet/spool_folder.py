@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from multidrop.fleet.file_lock import lock
 from multidrop.fleet.message import MessageError, unpack
 
 FORMAT = "multidrop spool 1"
@@ -64,10 +65,8 @@ class SpoolFolder:
             raise
 
     def _own(self, gateway: str, fleet: str) -> None:
-        import fcntl  # which Windows lacks
-
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._lock)
         except BlockingIOError:
             raise SpoolError(f"the spool {self.path} is being written by another process") from None
         try:
