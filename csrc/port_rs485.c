@@ -15,7 +15,7 @@
 #endif
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t MOST_HELD_NS = 100000000; /* behind its time a request leaves no more: the port is broken */
+static const int64_t MOST_HELD_NS = 100000000; /* behind its time: the port is broken, no request leaves */
 
 static int ask_driver(int fd)
 {
@@ -88,7 +88,7 @@ int md_rs485_begin(struct md_port *port, int mode)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.tells_end = is_shifted_out(port->fd) >= 0;
         failure = steer(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* RTS that falls as the port is closed would send for ever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* else it would fall with the port's end, and send for ever */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)
@@ -109,7 +109,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
     ssize_t written = write(port->fd, bytes, len);
     int error = errno;
     if (written > 0) {
-        rs485->character_ns = port->turn.line.exchange->character_ns; /* its exchange may be gone at the end */
+        rs485->character_ns = port->turn.line.exchange->character_ns; /* its exchange may end before */
         rs485->sent_ns = later(rs485->sent_ns, md_now_ns()) + written * rs485->character_ns;
         rs485->look_ns = rs485->sent_ns;
         rs485->empty_ns = 0;

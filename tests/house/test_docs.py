@@ -45,6 +45,7 @@ NOT_RUN = {
     ". .venv/bin/activate": "belongs to a shell",
     "mkdir ~/": "makes a directory outside the test's",
     ".venv/bin/pytest": "runs the tests themselves",
+    "env/bin/multidrop demo": "takes ten seconds: tools/bare runs it in a bare root",
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
     "tools/wheels": "compiles for five machines: many minutes",

@@ -80,7 +80,7 @@ def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_noise_hunt(tmp_path: Path) -> None:
-    printed = run(tmp_path, "noise_hunt.py", "2")
+    printed = run(tmp_path, "noise_hunt.py", "5")
     assert "pump-1: " in printed
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"

@@ -1,7 +1,8 @@
-/* A driver of serial ports with RTS, for a library put before the system's: pseudo-terminals have none. What it
- * is told of RTS, and what is written to a port that has been told, stands line by line in the file RS485_LOG:
- * time in ns, what, how many bytes. A UART tells when its last bit has left, at RS485_CHARACTER_NS each. After
- * RS485_CALLS calls RTS is broken; 0: there is none. RS485_FLAGS: it has an RS-485 mode of its own, with these flags. */
+/* A driver of serial ports with RTS, for a library put before the system's: pseudo-terminals have none. What
+ * it is told of RTS, and what is written to a port that has been told, stands line by line in the file
+ * RS485_LOG: time in ns, what, how many bytes. A UART tells when its last bit has left, at
+ * RS485_CHARACTER_NS each. After RS485_CALLS calls RTS is broken; 0: there is none. RS485_FLAGS: it has an
+ * RS-485 mode of its own, with these flags. */
 #define _GNU_SOURCE
 #include <asm/ioctls.h>
 #include <errno.h>
