@@ -16,7 +16,9 @@ from pathlib import Path
 
 from peers import require_program
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
+READY_S = 15.0
+ATTEMPTS = 4
 OLDEST = (2, 12)
 
 
@@ -77,7 +79,9 @@ class Node:
         """
         if len(routes) > 1:
             others = ", ".join(f"nats://127.0.0.1:{port}" for port in routes)
-            text += f"cluster {{ name: fleet, listen: 127.0.0.1:{cluster}, routes: [{others}] }}\n"
+            text += (
+                f"cluster {{ name: fleet-{routes[0]}, listen: 127.0.0.1:{cluster}, routes: [{others}] }}\n"
+            )
         (folder / f"{name}.conf").write_text(text)
         self.start()
 
@@ -101,9 +105,10 @@ class Node:
 
     def is_healthy(self) -> bool:
         """Say whether its JetStream is ready, and in a cluster has a leader."""
-        with suppress(OSError), closing(
-            urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)
-        ) as answer:
+        with (
+            suppress(OSError),
+            closing(urllib.request.urlopen(f"http://127.0.0.1:{self.monitor}/healthz", timeout=2)) as answer,
+        ):
             return bool(answer.status == 200)
         return False
 
@@ -123,12 +128,17 @@ class Cluster:
         return [node.url for node in self.nodes]
 
     def wait(self) -> None:
-        """Wait until all that run are ready."""
-        ends = time.monotonic() + PATIENCE_S
+        """Wait until all are ready."""
+        assert self.is_ready_within(PATIENCE_S), "a server of NATS is not ready: see its log"
+
+    def is_ready_within(self, seconds: float) -> bool:
+        ends = time.monotonic() + seconds
         for node in self.nodes:
-            while node.process.poll() is None and not node.is_healthy():
-                assert time.monotonic() < ends, f"{node.name} is not ready: see its log"
+            while not node.is_healthy():
+                if time.monotonic() > ends or node.process.poll() is not None:
+                    return False
                 time.sleep(0.05)
+        return True
 
     def close(self) -> None:
         for node in self.nodes:
@@ -140,7 +150,11 @@ class Cluster:
 
 @contextmanager
 def cluster(folder: Path, number: int = 3, program: str | None = None) -> Iterator[Cluster]:
-    running = Cluster(folder, number, program)
+    for attempt in range(ATTEMPTS):  # another program may have taken a port that was free just now
+        running = Cluster(folder / str(attempt) if attempt else folder, number, program)
+        if running.is_ready_within(READY_S) or attempt == ATTEMPTS - 1:
+            break
+        running.close()
     try:
         running.wait()
         yield running
