@@ -276,7 +276,7 @@ def test_a_file_that_was_begun_is_no_commit(running: Cluster, tmp_path: Path) ->
         async with client_of(running) as client:
             await say(client, 1, message(5))
             await kept_in_files(client, tmp_path, 1)
-            part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.part"
+            part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
             part.write_bytes(b"PAR1")
             await say(client, 2, message(10))
             state = await kept_in_files(client, tmp_path, 2)

@@ -78,7 +78,20 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
     client = await connect(arguments.servers, **options)
     try:
         hub = SampleHub(client, sink, every=arguments.every)
-        await hub.run(once=arguments.once)
+        tending = asyncio.create_task(_tend(arguments.parquet))
+        try:
+            await hub.run(once=arguments.once)
+        finally:
+            tending.cancel()
+            await asyncio.wait([tending])
         return hub.state()
     finally:
         await client.close()
+
+
+async def _tend(folder: Path | None) -> None:
+    """Merge files beside the reading; PostgreSQL needs none of it."""
+    if folder:
+        from multidrop.fleet.compaction import compact_for_ever
+
+        await compact_for_ever(folder)

@@ -74,7 +74,7 @@ class ParquetSink:
     def begin(self, stream: str) -> KeptPlace:
         """Return what the newest file says."""
         try:
-            for part in self._rows.glob(".*.part"):
+            for part in self._rows.glob(".*.writing"):
                 part.unlink()
             newest = max(self._files(), default=None)
         except OSError as failure:
@@ -100,7 +100,7 @@ class ParquetSink:
         """Write the rows into a file, which has its name once all of it is on the disk."""
         table = _joined(commit)
         path = self._rows / _name(commit, table)
-        part = path.with_name(f".{path.name}.part")
+        part = path.with_name(f".{path.name}.writing")
         try:
             with part.open("xb") as file:
                 with pq.ParquetWriter(file, table.schema, **WRITTEN) as writer:

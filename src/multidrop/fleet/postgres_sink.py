@@ -8,7 +8,7 @@
 | `multidrop.register_sets` | id and names, in the order of the values                                 |
 | `multidrop.hub`           | one row: the stream, the place of its last message here, the sources     |
 
-A row a value takes four times the disk and is written at a fifth of the speed. Rows come by COPY in the
+A row a value takes four and a half times the disk. Rows come by COPY in the
 transaction that moves the place on from where this hub left it: another hub's is refused then. A timestamptz
 has microseconds; `time_ns` is exact. The drive's monotonic clock is not kept.
 """

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from nats.aio.client import Client
@@ -85,6 +86,8 @@ async def connect(servers: list[str], **options: Any) -> Client:
             )
     except (Error, OSError, TimeoutError) as failure:
         last = client.last_error or failure
+        with suppress(Exception):  # of a client that is half connected
+            await client.close()
         raise StreamError(f"no server of NATS answers at {', '.join(servers)}: {_text(last)}") from failure
     version = client.connected_server_version
     if (version.major, version.minor) < OLDEST_SERVER:

@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.database import connect, copy_out, files_of, insert
+from multidrop.history.database import connect, copy_out, files_of, insert, kept_metadata
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
@@ -31,7 +31,10 @@ select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register
     arg_max(value, monotonic_ns) as last
 from recorded group by all order by drive, register, time
 """
+TENS_OF_FILE = TENS.replace("from recorded", "from {}")
 MERGED = "select * from {} order by drive, register, time"
+MERGED_ROWS = "select * from {} order by drive, time"
+MOST_MERGED = 200_000_000  # bytes of files of rows that become one
 
 
 def main(words: list[str] | None = None) -> int:
@@ -39,6 +42,7 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="multidrop.history.compact", description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--below", type=int, required=True, help="segments with a lower number are closed")
+    parser.add_argument("--merge-rows", action="store_true", help="for a folder of `multidrop hub`")
     arguments = parser.parse_args(words)
     folder: Path = arguments.folder
     try:
@@ -46,20 +50,28 @@ def main(words: list[str] | None = None) -> int:
     except BlockingIOError:
         return 0
     try:
-        compact(folder, arguments.below)
+        compact(folder, arguments.below, merge_rows=arguments.merge_rows)
     finally:
         lock.close()
     return 0
 
 
-def compact(folder: Path, below: int) -> None:
-    """Make Parquet of segments below this number, and one file of the tens of an hour or day that is over."""
+def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
+    """Make Parquet of segments below this number, and one file of the tens of an hour or day that is over.
+
+    With `merge_rows` the rows of an hour that is over become one file too, and files of rows get their tens.
+    """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
     clean(folder)
     for number, path in segments_of(folder / STEM):
         if number < below:
             _compact_segment(folder, number, path)
+    if merge_rows:
+        rows = widest(parquet_files(folder / "rows"))
+        _make_tens(folder, rows[:-1])  # first: a merged file hides the numbers of those without
+        for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
+            _merge_rows(folder, part)
     for seconds in (3600, 86400):
         tens = widest(parquet_files(folder / "tens"))
         for run in finished(tens, seconds, _without_tens(folder, tens)):
@@ -76,9 +88,10 @@ def clean(folder: Path) -> None:
     for number, path in segments_of(folder / STEM):
         if number in have:
             _put_away(folder, path, not _is_whole(path))
-    tens = parquet_files(folder / "tens")
-    for file in set(tens) - set(widest(tens)):
-        file.path.unlink(missing_ok=True)
+    for name in ("rows", "tens"):
+        files = parquet_files(folder / name)
+        for file in set(files) - set(widest(files)):
+            file.path.unlink(missing_ok=True)
 
 
 def _is_whole(path: Path) -> bool:
@@ -175,6 +188,43 @@ def _merge(folder: Path, run: list[HistoryFile]) -> None:
         _write(database, MERGED.format(files_of(file.path for file in run)), folder / "tens" / name)
     for file in run:
         file.path.unlink(missing_ok=True)
+
+
+def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
+    """Yield two files and more that follow each other without a hole, no larger together than may be."""
+    part: list[HistoryFile] = []
+    size = 0
+    for file in run:
+        own = file.path.stat().st_size
+        if part and (file.first != part[-1].last + 1 or size + own > MOST_MERGED):
+            if len(part) > 1:
+                yield part
+            part, size = [], 0
+        part.append(file)
+        size += own
+    if len(part) > 1:
+        yield part
+
+
+def _merge_rows(folder: Path, part: list[HistoryFile]) -> None:
+    """Make one file of these, with the metadata of the last one."""
+    begin, end = min(file.begin for file in part), max(file.end for file in part)
+    name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
+    with connect(MEMORY, folder / ".spill") as database:
+        metadata = kept_metadata(database, part[-1].path)
+        query = MERGED_ROWS.format(files_of(file.path for file in part))
+        _write(database, query, folder / "rows" / name, metadata)
+    for file in part:
+        file.path.unlink(missing_ok=True)
+
+
+def _make_tens(folder: Path, rows: list[HistoryFile]) -> None:
+    """Make the tens of files of rows that have none."""
+    missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
+    for file in rows:
+        if file.first in missing:
+            with connect(MEMORY, folder / ".spill") as database:
+                _write(database, TENS_OF_FILE.format(files_of([file.path])), folder / "tens" / file.path.name)
 
 
 def be_low() -> None:

@@ -98,6 +98,14 @@ def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Ro
         yield RecordedRows(assemble(array.length, *columns))
 
 
+def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
+    """Return the metadata that a Parquet file of a history has."""
+    query = f"select decode(value) from parquet_kv_metadata({quoted(str(path))}) where decode(key) = $key"
+    found = database.execute(query, {"key": METADATA_KEY}).fetchone()
+    metadata: dict[str, Any] = json.loads(found[0]) if found else {}
+    return metadata
+
+
 def quoted(text: str) -> str:
     return "'" + text.replace("'", "''") + "'"
 

@@ -90,7 +90,7 @@ def listing(folder: Path) -> Listing:
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
     segments = dict(segments_of(folder / STEM))  # first: what is removed next is in what is listed next
-    rows = {file.first: file for file in parquet_files(folder / "rows")}
+    rows = {file.first: file for file in widest(parquet_files(folder / "rows"))}
     tens = widest(parquet_files(folder / "tens"))
     left = {number: path for number, path in segments.items() if number not in rows}
     return Listing(left, rows, tens)

@@ -99,15 +99,25 @@ class History:
     def rows_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Iterator[Rows]:
         """Yield the rows of `read` for parsed series and times in ns."""
         found = self._sources.listing()
+        given = 0  # all numbers up to this one
         for number in sorted({*found.segments, *found.rows}):
+            if number <= given:
+                continue
             for _ in range(MOST_TRIES):
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end)
                     break
                 except Replaced:  # before the first of its rows: now they are elsewhere
                     found = self._sources.listing()
+                    self._check_merged(number, found)
             else:
                 raise self._sources.too_often()
+            given = found.rows[number].last if number in found.rows else number
+
+    def _check_merged(self, number: int, found: Listing) -> None:
+        """Raise OSError where the rows of this number are in a file with others that were given already."""
+        if any(file.first < number <= file.last for file in found.rows.values()):
+            raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
     def _rows_of_segment(
         self, number: int, found: Listing, series: Sequence[Series] | None, begin: int, end: int

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from multidrop.history.buckets import Accumulator, Grid
-from multidrop.history.database import copy_out, files_of, insert, quoted, rows_of
+from multidrop.history.database import copy_out, files_of, insert, kept_metadata, rows_of
 from multidrop.history.folder import HistoryFile
 from multidrop.history.kept_series import Series
 from multidrop.history.sources import Sources, while_there
 from multidrop.polling.batch import Rows
-from multidrop.recording.format import METADATA_KEY, Metadata
+from multidrop.recording.format import Metadata
 
 COLUMNS = "time, monotonic_ns, uncertainty_ns, drive, register, value, status"
 _IN_RANGE = "epoch_ns(time) >= $begin and epoch_ns(time) < $end"
@@ -53,13 +52,8 @@ def gather_files(
 
 def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
     """Return the metadata that a file's segment had. Raises Replaced."""
-    query = (
-        f"select decode(value) from parquet_kv_metadata({quoted(str(file.path))}) where decode(key) = $key"
-    )
     with sources.cursor() as cursor, while_there([file]):
-        found = cursor.execute(query, {"key": METADATA_KEY}).fetchone()
-    metadata: Metadata = json.loads(found[0]) if found else {}
-    return metadata
+        return kept_metadata(cursor, file.path)
 
 
 def write_parquet(
