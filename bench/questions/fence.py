@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import random
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
@@ -37,12 +39,25 @@ def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: 
         fence.close()
 
 
+def side_by_side(kind: str, stops: int, details: argparse.Namespace) -> list[Round]:
+    """Share the stops among processes; each has lines and masters of its own."""
+    jobs = details.jobs
+    shares = [stops // jobs + (job < stops % jobs) for job in range(jobs)]
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        found = [
+            pool.submit(rounds, kind, share, details.lines, details.lease, details.guard, details.seed + job)
+            for job, share in enumerate(shares)
+        ]
+        return [one for each in found for one in each.result()]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stops", type=int, default=2000, help="of the first kind; a tenth of the others")
     parser.add_argument("--lines", type=int, default=10)
     parser.add_argument("--lease", type=float, default=0.3, metavar="S")
     parser.add_argument("--guard", type=float, default=0.3, metavar="S")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that do this side by side")
     parser.add_argument("--seed", type=int, default=1)
     details = parser.parse_args()
     tables.heading(
@@ -50,10 +65,7 @@ def main() -> int:
         "at a random moment."
     )
     stops = {"look and timer": details.stops, "look alone": details.stops // 10, "neither": 20}
-    found = {
-        kind: rounds(kind, stops[kind], details.lines, details.lease, details.guard, details.seed)
-        for kind in KINDS
-    }
+    found = {kind: side_by_side(kind, stops[kind], details) for kind in KINDS}
     tables.show(
         HEADS,
         [

@@ -64,8 +64,10 @@ static int ends[2];
 static struct md_completion carry_out(const struct md_exchange *exchange)
 {
     struct md_completion found;
+    md_engine_enter(port->engine);
     drive.owed_count = 0; /* else late replies would hold the next one back */
     drive.late_until_ns = 0;
+    md_engine_leave(port->engine);
     atomic_store(&written, 0);
     md_port_carry_out(port, exchange, 0, 0, &found);
     return found;
@@ -138,7 +140,10 @@ static void check_listens_first(void)
 {
     struct md_completion found = carry_out(&reading);
     assert(found.sent_ns - found.begun_ns >= 30 * MS && atomic_load(&written) == REQUEST);
-    found = carry_out(&reading);
+    int tries = 0;
+    do /* a busy machine may hold one up for as long */
+        found = carry_out(&reading);
+    while (found.sent_ns - found.begun_ns >= 30 * MS && tries++ < 20);
     assert(found.sent_ns - found.begun_ns < 30 * MS);
 }
 
@@ -189,18 +194,27 @@ static void *read_meanwhile(void *argument)
     return NULL;
 }
 
+static int is_listening(void)
+{
+    md_engine_enter(port->engine);
+    int listens = port->turn.line.listened_ns != 0;
+    md_engine_leave(port->engine);
+    return listens;
+}
+
 static void check_other_master(void)
 {
     pthread_t other, reader;
     struct md_completion found, stopped;
     extend(MD_SECOND_NS);
+    reading.character_ns = 2 * MS; /* it listens for half a second: nothing holds the other one up so long */
     atomic_store(&is_babbling, 1);
     pthread_create(&other, NULL, babble, NULL);
     found = carry_out(&reading);
     assert(found.result == MD_OTHER_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
     assert(found.raw_len > 0 && md_port_progress(port)->foreign > 0);
     stopped = carry_out(&stop); /* it is not held up */
-    assert(stopped.sent_ns && stopped.sent_ns - stopped.begun_ns < 30 * MS);
+    assert(stopped.sent_ns && stopped.sent_ns - stopped.begun_ns < 300 * MS);
     assert(atomic_load(&written) == REQUEST);
     found = carry_out(&reading);
     assert(found.result == MD_OTHER_MASTER);
@@ -215,15 +229,14 @@ static void check_other_master(void)
     md_mastership_end(mastership);
     check_unsent(&reading);
     extend(MD_SECOND_NS);
-    reading.character_ns = 2 * MS; /* half a second */
     pthread_create(&reader, NULL, read_meanwhile, &found);
-    while (!__atomic_load_n(&port->turn.line.listened_ns, __ATOMIC_SEQ_CST))
+    while (!is_listening())
         usleep(100);
     int64_t called_ns = md_now_ns();
     stopped = carry_out(&stop);
     pthread_join(reader, NULL);
-    assert(stopped.sent_ns && stopped.sent_ns - called_ns < 100 * MS);
-    assert(found.sent_ns && found.sent_ns - stopped.sent_ns > 300 * MS);
+    assert(stopped.sent_ns && stopped.sent_ns - called_ns < 300 * MS);
+    assert(found.sent_ns && found.sent_ns - stopped.sent_ns > 200 * MS);
     reading.character_ns = 100000;
 }
 

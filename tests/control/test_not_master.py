@@ -11,14 +11,19 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 
 import pytest
+from completions import new_completion
 from lines import PATIENCE, until
 from toy import Status, Toy
 
-from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, core, insist
+from multidrop import Mastership, NoSuchPort, NotMaster, Script, Seen, insist, read_audit, verb, write
 from multidrop.bus import Bus
+from multidrop.core import Completion, Exchange, Failure
+from multidrop.core import Status as Missed
+from multidrop.drive import read
 from multidrop.errors import LineError, NoReply, Unconfirmed
 from multidrop.sim import Simulator, Wire, simulated
 
@@ -45,6 +50,16 @@ class Slow(Toy):
     """Is listened to for longer than a busy machine holds another master up."""
 
     response_timeout = 1.5
+
+
+class Watched(Brief):
+    """Its stop looks at what came of it."""
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        yield from insist(Toy.control, Status(0))
+        yield from read(Toy.status)
 
 
 def halt() -> Script[None]:
@@ -126,7 +141,7 @@ def test_a_lost_mastership_is_no_failure_of_the_drive(scene: Scene) -> None:
         with pytest.raises(NotMaster):
             scene.bus.read(scene.drive, Toy.output_current)
     assert scene.bus.peer(scene.drive).failures == 0
-    assert scene.bus.statistics().counters.ended == {core.Status.NOT_MASTER: 3}
+    assert scene.bus.statistics().counters.ended == {Missed.NOT_MASTER: 3}
 
 
 def test_a_deadline_that_passes_is_enough(scene: Scene) -> None:
@@ -198,6 +213,69 @@ def test_commands_go_on_when_it_is_master_again(scene: Scene) -> None:
     scene.become_master()
     scene.drive.stop()
     assert scene.requests > 0
+
+
+# ---- it ends in the middle ----
+
+
+def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:
+    """Have the core hold writes back from so many on, before or after a part of the request has left."""
+    carry_out, writes = scene.bus.line.carry_out, count()
+
+    def held_back(exchange: Exchange, **details: int) -> Completion:
+        if exchange.request.function == 6 and next(writes) >= after:
+            return Completion(new_completion(result=Failure.NOT_MASTER, begun_ns=1, sent_ns=sent_ns))
+        return carry_out(exchange, **details)
+
+    monkeypatch.setattr(scene.bus.line, "carry_out", held_back)
+
+
+def test_a_write_of_which_a_part_has_left_is_unconfirmed(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.become_master()
+    hold_back(monkeypatch, scene, sent_ns=1, after=0)
+    with pytest.raises(Unconfirmed, match="it is not known whether acceleration_time = 20"):
+        scene.bus.write(scene.drive, Toy.acceleration_time, 20.0)
+    (entry,) = read_audit(scene.audit)
+    assert "this process may not send on " in str(entry)
+
+
+def test_a_script_that_is_held_back_at_its_second_write_says_so(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first write is done and told of in the audit; the second was certainly not sent."""
+    scene.become_master()
+    hold_back(monkeypatch, scene, sent_ns=0, after=1)
+
+    def both() -> Script[None]:
+        yield from write(Toy.frequency, 5.0)
+        yield from write(Toy.frequency, 6.0)
+
+    with pytest.raises(NotMaster):
+        scene.bus.perform(scene.drive, both())
+    assert len([*read_audit(scene.audit)]) == 1
+
+
+def test_a_stop_that_left_and_cannot_be_followed_is_unconfirmed(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not told as unsent: it was sent."""
+    scene.become_master()
+    carry_out = scene.bus.line.carry_out
+
+    def end_after_write(exchange: Exchange, **details: int) -> Completion:
+        found = carry_out(exchange, **details)
+        if exchange.request.function == 6:
+            scene.mastership.end()
+        return found
+
+    monkeypatch.setattr(scene.bus.line, "carry_out", end_after_write)
+    scene.bus.detach(scene.drive)
+    scene.bus.attach(Watched(1, name="pump"))
+    found = scene.bus.stop_all()["pump"]
+    assert found.seen is not Seen.FAILED
+    assert "NOT sent" not in found.why
 
 
 # ---- another master ----
