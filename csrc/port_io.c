@@ -97,6 +97,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     int64_t begun_ns = md_now_ns();
     int refused = md_port_set(port->fd, settings);
     int64_t now_ns = md_now_ns();
+    port->turn.line.wake_ns += now_ns - begun_ns; /* so long the port could take nothing */
     progress->switching_ns += now_ns - begun_ns;
     __atomic_store_n(&progress->switches, progress->switches + 1, __ATOMIC_SEQ_CST);
     port->settings = *settings;

@@ -88,7 +88,7 @@ int md_rs485_begin(struct md_port *port, int mode)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.tells_end = is_shifted_out(port->fd) >= 0;
         failure = steer(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* else it would fall with the port's end, and send for ever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* else it would fall with the port, and send for ever */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)

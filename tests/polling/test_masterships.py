@@ -80,7 +80,7 @@ def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[Simulat
 
 
 class Rows:
-    """Rows of a poller, by drive."""
+    """Return what the rows of a poller say, by drive."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller
