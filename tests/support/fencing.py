@@ -87,7 +87,7 @@ class FarEnd:
 
 @dataclass
 class Round:
-    """One stop: requests that came after the takeover, and whether the kernel had killed the old master."""
+    """One stop: requests that came after the takeover, and whether the kernel killed the old master."""
 
     stale: int
     is_killed: bool
@@ -184,12 +184,11 @@ class Fence:
         # taken over: nobody is granted anything from here on
         self.far.settle(1.0)
         before = self.far.requests
-        is_killed = _await_death(master, 0)
         time.sleep(chance.uniform(0, 0.02))
         _tell(master, signal.SIGCONT)
         time.sleep(WATCHED_S)
         self.far.settle(0.1)
-        return Round(self.far.requests - before, is_killed)
+        return Round(self.far.requests - before, _await_death(master, 0))
 
 
 def _tell(master: int, number: int) -> None:
