@@ -243,7 +243,7 @@ def test_monitor_takes_other_ports(run: Run, plant: Path, monkeypatch: pytest.Mo
 
 
 def test_scan_takes_a_line_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
-    few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--quick", "--json")
+    few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--json")
     status, out, _ = run("scan", plant, "hall-1", at, *few)
     assert status == 0
     record = json.loads(out)

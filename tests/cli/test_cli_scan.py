@@ -61,7 +61,7 @@ def test_json_is_one_object(run: Run, port: str) -> None:
 def test_the_plant_file_can_be_used_as_it_is(run: Run, port: str, tmp_path: Path) -> None:
     out = tmp_path / "found.toml"
     words = (
-        *BRISKLY,
+        *PATIENTLY,
         "--model",
         TOY.replace(":Toy", ":Unsure"),
         "--model",
