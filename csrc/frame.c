@@ -86,7 +86,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
         return length;
     if (length == 0 ? len >= (size_t)whole : MD_TCP_HEAD + length != whole)
         return MD_BAD_LENGTH;
-    if (length == 0 || len < (size_t)whole)
+    if (len < (size_t)whole)
         return MD_INCOMPLETE;
     *body = bytes + MD_TCP_HEAD;
     return whole;

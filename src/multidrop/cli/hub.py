@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         sink.close()
     if arguments.json:
-        print(json.dumps(state._asdict()))
+        print_text(json.dumps(state._asdict()))
     else:
         print_text(
             f"{state.rows} rows kept, to message {state.place} of the stream; {state.alarms} alarms, "
