@@ -12,7 +12,7 @@ import pytest
 from fleet_drills import DEEDS, FleetDrill, drilled
 from peers import require_module
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(scope="module")

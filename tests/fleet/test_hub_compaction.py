@@ -89,6 +89,7 @@ class Broken(Exception):
     """The process ends here."""
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_broken_off_before_each_step(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -126,6 +127,7 @@ def test_broken_off_before_each_step(
     assert names(tmp_path, "rows")[:2] == ["00000001-00000008", "00000009-00000016"]
 
 
+@pytest.mark.long
 def test_a_reader_of_merged_files_is_told_or_has_every_row_once(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     told = []

@@ -27,7 +27,7 @@ from multidrop.fleet.setup import open_all  # noqa: E402
 LINES = [f"line-{at}" for at in range(30)]
 PATIENCE_S = 30.0
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 
 @pytest.fixture(autouse=True)

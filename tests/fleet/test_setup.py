@@ -111,6 +111,7 @@ def test_a_path_goes_elsewhere_and_comes_home(tmp_path: Path) -> None:
         asyncio.run(main())
 
 
+@pytest.mark.long
 def test_a_home_that_is_silent_keeps_nobody_waiting_for_long(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

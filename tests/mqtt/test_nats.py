@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +11,8 @@ from typing import Any
 import pytest
 from brokers import PLAIN_FAN, Broker, Listener, Published, Running, inside, nats, publish
 from lines import until
-from peers import require_module, require_program
+from nats_clusters import old_server_program, server_program
+from peers import require_module
 from sparkplug_host import ROOT, Host, command
 
 from multidrop.gateway.mqtt import MqttSettings, build
@@ -22,8 +21,9 @@ Start = Callable[..., tuple[Any, Running]]
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    with nats(tmp_path) as broker:
+def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Broker]:
+    program = getattr(request, "param", server_program)
+    with nats(tmp_path, program()) as broker:
         yield broker
 
 
@@ -108,19 +108,9 @@ def test_a_command_that_the_broker_keeps_is_not_carried_out(broker: Broker, star
         listener.close()
 
 
-def takes_a_dot_in_a_topic() -> bool:
-    told = subprocess.run(
-        [require_program("nats-server"), "--version"], capture_output=True, text=True
-    ).stdout
-    numbers = re.search(r"v(\d+)\.(\d+)", told)
-    assert numbers, told
-    return tuple(map(int, numbers.groups())) >= (2, 10)
-
-
+@pytest.mark.parametrize("broker", [old_server_program], indirect=True)
 def test_a_topic_that_it_does_not_take_costs_the_others_nothing(broker: Broker, start: Start) -> None:
-    """The namespace of Sparkplug has a dot, with which nats-server 2.9 closes the connection."""
-    if takes_a_dot_in_a_topic():
-        pytest.skip("this nats-server takes Sparkplug's topics")
+    """The namespace of Sparkplug has a dot, with which nats-server closes the connection before 2.10."""
     listener = Listener(broker)
     try:
         known, running = start(sparkplug="works", node="line")
@@ -140,8 +130,6 @@ def test_a_topic_that_it_does_not_take_costs_the_others_nothing(broker: Broker, 
 
 
 def test_births_data_rebirth_death_and_commands_of_sparkplug(broker: Broker, start: Start) -> None:
-    if not takes_a_dot_in_a_topic():
-        pytest.skip("nats-server takes a dot in a topic from 2.10 on, and spBv1.0 has one")
     host = Host(broker)
     try:
         known, running = start(sparkplug="works", node="line", commands=True)

@@ -28,6 +28,7 @@ def test_it_polls_and_records(tmp_path: Path) -> None:
     assert len((tmp_path / "run.csv").read_text().splitlines()) > 5
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_reads_a_recording_says_what_is_missing(tmp_path: Path) -> None:
     multidrop("demo", "--seconds", "1", "--out", "run.arrows", folder=tmp_path)

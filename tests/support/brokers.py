@@ -80,8 +80,8 @@ def mosquitto(folder: Path) -> Iterator[Broker]:
 
 
 @contextmanager
-def nats(folder: Path) -> Iterator[Broker]:
-    program = require_program("nats-server")
+def nats(folder: Path, program: str) -> Iterator[Broker]:
+    """Run a nats-server with its listener for MQTT."""
 
     def command(port: int) -> list[str]:
         (folder / "nats.conf").write_text(
