@@ -19,10 +19,10 @@ EXAMPLES = ROOT / "examples"
 PAGES = "\n".join(page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.md"))
 
 
-def run(directory: Path, name: str, *words: str) -> str:
+def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (patient.__file__,)) -> str:
     """Return what an example prints."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", patient.__file__, str(EXAMPLES / name), *words],
+        [sys.executable, "-W", "error", *through, str(EXAMPLES / name), *words],
         cwd=directory,
         env={**os.environ, "XDG_STATE_HOME": str(directory / "state")},
         capture_output=True,
@@ -80,7 +80,7 @@ def test_a_pump_is_stopped_when_its_program_ends(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_noise_hunt(tmp_path: Path) -> None:
-    printed = run(tmp_path, "noise_hunt.py", "5")
+    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # replies are lost there
     assert "pump-1: " in printed
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"
