@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
+import re
 import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
@@ -233,7 +234,8 @@ def test_servers_that_are_away_for_a_while(tmp_path: Path, caplog: pytest.LogCap
     asyncio.run(live())
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
-    assert told[-1] == "samples are forwarded again, behind message 3"
+    # The fourth may have come before the server was gone, and its answer not.
+    assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
 
 
 def test_the_largest_message_comes_back(running: Cluster) -> None:

@@ -197,9 +197,8 @@ def test_another_master_is_told_and_polling_begins_when_it_is_silent(
             Rows(poller).until("pump", OTHER_MASTER)
             with suppress(BlockingIOError):
                 assert os.read(far, 4096) == b""
-            summary = poller.summary()["lines"]["line"]
-            assert summary["foreign_bytes"] > 0
-            assert summary["misses"][OTHER_MASTER] > 0
+            until(lambda: poller.summary()["lines"]["line"]["foreign_bytes"] > 0)
+            assert poller.summary()["lines"]["line"]["misses"][OTHER_MASTER] > 0
         finally:
             is_over.set()
             other.join()
