@@ -183,7 +183,8 @@ class Chaos:
         ends = time.monotonic() + PATIENCE_S
         client = await connect(self.servers.urls)
         for name in GATEWAYS:
-            newest = max(int(path.name[:12]) for path in (self.folder / name).glob("*.arrows"))
+            stored = (int(path.name[:12]) for path in (self.folder / name).glob("*.arrows"))
+            newest = max(stored, default=0)  # it may have been killed each time before it stored anything
             log = subject_of(name, _log_of(self.folder / name))
             while True:
                 try:
