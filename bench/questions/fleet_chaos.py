@@ -183,15 +183,16 @@ class Chaos:
         ends = time.monotonic() + PATIENCE_S
         client = await connect(self.servers.urls)
         for name in GATEWAYS:
-            stored = (int(path.name[:12]) for path in (self.folder / name).glob("*.arrows"))
-            newest = max(stored, default=0)  # it may have been killed each time before it stored anything
+            stored = [int(path.name[:12]) for path in (self.folder / name).glob("*.arrows")]
+            if not stored:  # it was killed each time before it stored anything
+                continue
             log = subject_of(name, _log_of(self.folder / name))
             while True:
                 try:
                     last = await last_of(client, log)
                 except StreamError:
                     last = None
-                if last and last.sequence >= newest:
+                if last and last.sequence >= max(stored):
                     break
                 assert time.monotonic() < ends, f"{name} does not forward: see {self.folder}"
                 await asyncio.sleep(0.1)
