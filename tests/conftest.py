@@ -82,7 +82,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count no lines where that takes minutes more, or is done already, or where a full disk is tried."""
+    """Count no lines where that takes minutes more, or where a full disk is tried."""
     coverage = sys.modules.get("coverage")
     counting = coverage.Coverage.current() if coverage else None
     if counting is None or _is_counted(item):
@@ -97,10 +97,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def _is_counted(item: pytest.Item) -> bool:
-    """Return False for stories, for tests marked so, and for more examples of what was counted with fewer."""
-    if item.get_closest_marker("story") or item.get_closest_marker("uncounted"):
-        return False
-    return "THOROUGH" not in os.environ or item.get_closest_marker("long") is not None
+    """Return False for stories, and for tests marked so."""
+    return not (item.get_closest_marker("story") or item.get_closest_marker("uncounted"))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
