@@ -5,9 +5,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
+from importlib.machinery import ModuleSpec
 
 HIDDEN = {"pandas", "polars", "duckdb"}
+_find_spec = importlib.util.find_spec
 
 
 class Hiding:
@@ -19,4 +22,9 @@ class Hiding:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
+def find_spec(name: str, package: str | None = None) -> ModuleSpec | None:
+    return None if name.partition(".")[0] in HIDDEN else _find_spec(name, package)
+
+
 sys.meta_path.insert(0, Hiding)
+importlib.util.find_spec = find_spec
