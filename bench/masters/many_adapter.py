@@ -16,7 +16,7 @@ import numpy
 import pyarrow
 
 from bench.players.replay import Played, Unpaced, Unreliable
-from multidrop.core import RS485, Echo, Port, TransactionIds
+from multidrop.core import Port
 from multidrop.drive import Drive
 from multidrop.drives import MODELS
 from multidrop.planning.blocks import planned
@@ -40,8 +40,8 @@ class Inherited(Line):
             self.queue = None
 
 
-def _opened(port: str, echo: Echo, ids: TransactionIds, rs485: RS485) -> Line:
-    return Inherited(port, echo, ids) if port.isdigit() else Line(port, echo, ids, rs485)
+def _opened(port: str, *facts: Any) -> Line:
+    return (Inherited if port.isdigit() else Line)(port, *facts)
 
 
 @contextmanager
