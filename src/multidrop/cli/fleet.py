@@ -7,7 +7,6 @@ import asyncio
 import json
 import logging
 import os
-import signal
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -16,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.signals import on_end_signals
 from multidrop.cli.support.values import aligned
 
 if TYPE_CHECKING:
-    from multidrop.fleet.servers import Path as ServerPath
+    from multidrop.fleet.servers import ServerPath
 
 URLS = "nats://127.0.0.1:4222"
 DRAIN_S = 30.0
@@ -108,15 +108,7 @@ async def _serve(arguments: argparse.Namespace) -> int:
     name = _name(arguments, "serve gw-1")
     folder = arguments.folder or _state_folder() / name
     gateway = FleetGateway(name, _urls(arguments), folder, spool_bytes=parse_size(arguments.keep))
-    loop = asyncio.get_running_loop()
-
-    def end(number: signal.Signals) -> None:
-        loop.remove_signal_handler(number)
-        signal.signal(number, signal.default_int_handler)  # a second one interrupts
-        gateway.end()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end, number)
+    on_end_signals(gateway.end)
     await gateway.run(lambda: print_text(f"ready {name}", flush=True))
     return 0
 

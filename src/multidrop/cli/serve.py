@@ -23,6 +23,7 @@ from multidrop.cli.support.demo_plant import DRIVES, plant_file, simulator, star
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.plants import add_port_option, plant_of
+from multidrop.cli.support.signals import on_end_signals
 from multidrop.drives import MODELS
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
@@ -140,16 +141,8 @@ def _serve(
         gateway = Gateway(plant, replace(settings, port=DEMO_PORTS[1]))
 
     async def live() -> None:
-        loop = asyncio.get_running_loop()
-
-        def end(number: signal.Signals) -> None:
-            loop.remove_signal_handler(number)
-            signal.signal(number, signal.default_int_handler)  # a second one interrupts
-            gateway.end()
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, end, number)
-        loop.add_signal_handler(signal.SIGHUP, gateway.reload.begin)
+        on_end_signals(gateway.end)
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, gateway.reload.begin)
         await gateway.run(lambda: on_ready(gateway.port))
 
     asyncio.run(live())

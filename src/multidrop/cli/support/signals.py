@@ -49,3 +49,18 @@ def noting_signals() -> Iterator[Interruption]:
     interruption = Interruption()
     with handling(interruption.note, signal.SIGINT, signal.SIGTERM):
         yield interruption
+
+
+def on_end_signals(end: Callable[[], object]) -> None:
+    """Call `end` in the running asyncio loop at the first SIGINT or SIGTERM; a second one interrupts."""
+    import asyncio
+
+    loop = asyncio.get_running_loop()
+
+    def first(number: signal.Signals) -> None:
+        loop.remove_signal_handler(number)
+        signal.signal(number, signal.default_int_handler)
+        end()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, first, number)
