@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
-from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from nats.aio.client import Client
 from nats_clusters import Cluster, cluster
 from peers import require_module
 from postgres_clusters import Postgres, postgres
+from sample_streams import client_of
 from spooled import NOON, STEP, exchanges_in, numbered, rows_of
 
 from multidrop import History
@@ -24,7 +25,7 @@ from multidrop.fleet.hub import Commit, HubState, KeptPlace, NotThisHubs, Sample
 from multidrop.fleet.message import RowBuffer, unpack
 from multidrop.fleet.parquet_sink import ParquetSink
 from multidrop.fleet.postgres_sink import PostgresSink
-from multidrop.fleet.samples_stream import StreamError, connect, create_stream, publish
+from multidrop.fleet.samples_stream import publish
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0
@@ -52,19 +53,6 @@ def empty(database: Postgres) -> Postgres:
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "AGAIN_S", 0.02)
     monkeypatch.setattr(hub_module, "LOOKING_S", 0.01)
-
-
-@asynccontextmanager
-async def client_of(servers: Cluster) -> AsyncIterator[Client]:
-    """Give a connection to servers with an empty stream."""
-    client = await connect(servers.urls)
-    try:
-        with suppress(StreamError):
-            await samples_stream._ask(client, "STREAM.DELETE.samples", {})
-        await create_stream(client, replicas=1)
-        yield client
-    finally:
-        await client.close()
 
 
 def message(first: int, count: int = 5) -> bytes:

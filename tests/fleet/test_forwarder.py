@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from nats.aio.client import Client
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from sample_streams import client_of
 from spooled import exchanges_in, numbered, rows_of
 
 from multidrop.fleet import forwarder as forwarder_module
@@ -47,19 +48,6 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.02)
-
-
-@asynccontextmanager
-async def client_of(servers: Cluster) -> AsyncIterator[Client]:
-    """Give a connection to servers with an empty stream."""
-    client = await connect(servers.urls)
-    try:
-        with suppress(StreamError):
-            await samples_stream._ask(client, "STREAM.DELETE.samples", {})
-        await create_stream(client, replicas=1)
-        yield client
-    finally:
-        await client.close()
 
 
 @asynccontextmanager

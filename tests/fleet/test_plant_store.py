@@ -95,7 +95,7 @@ def test_a_family_file_goes_with_its_line(tmp_path: Path) -> None:
     assert (tmp_path / "gateway" / "hall" / "families" / "own.toml").exists()
 
 
-@pytest.mark.parametrize("name", ["../escape.toml", "/tmp/escape.toml", "a/../../b.toml"])
+@pytest.mark.parametrize("name", ["../escape.toml", "/escape.toml", "a/../../b.toml"])
 def test_a_record_writes_no_file_outside_of_its_folder(tmp_path: Path, name: str) -> None:
     value = {"line": {"name": "hall"}, "files": {name: "text"}}
     with pytest.raises(ValueError, match="outside of its folder"):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from nats.aio.msg import Msg
 
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.servers import Path
+from multidrop.fleet.servers import ServerPath
 
 NONE_YET = 0  # the revision of a key without a record
 BATCH = 1000  # records asked for at a time
@@ -45,7 +45,7 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
     }
 
 
-async def ask(path: Path, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
+async def ask(path: ServerPath, subject: str, data: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return what JetStream says to a request about streams; FleetError with its own words for an error."""
     message = await path.request(f"$JS.API.{subject}", json.dumps(data).encode() if data else b"")
     said: dict[str, Any] = json.loads(message.data)
@@ -69,7 +69,7 @@ class ServerError(FleetError):
 class Bucket:
     """One bucket; the path on which it is reached is looked up each time."""
 
-    def __init__(self, name: str, path: Callable[[], Path]) -> None:
+    def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
 

@@ -7,7 +7,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from nats.aio.msg import Msg
@@ -21,7 +21,7 @@ from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.member import Member
 from multidrop.fleet.samples_stream import connect
-from multidrop.fleet.servers import paths_of
+from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import check_buckets, open_all
 from multidrop.fleet.spool import Spool
 
@@ -42,7 +42,7 @@ class FleetGateway:
         self,
         name: str,
         urls: Sequence[str],
-        folder: FilePath,
+        folder: Path,
         *,
         options: Mapping[str, Any] | None = None,
         spool_bytes: int = SPOOL_BYTES,
@@ -152,7 +152,7 @@ class FleetGateway:
         }
 
 
-async def ask_gateway(path: Any, gateway: str, wanted: str) -> dict[str, Any]:
+async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, Any]:
     """Return a gateway's answer to "state" or "drain". Raises FleetError where it gives none."""
     try:
         message = await path.request(names.gateway_subject(gateway), wanted.encode())

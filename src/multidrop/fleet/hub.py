@@ -164,7 +164,7 @@ class SampleHub:
                     is_end = True
                     break
                 await asyncio.sleep(LOOKING_S)
-                if not messages and not found:
+                if not messages:
                     self._check_end(await about(self._client))
                     end_if_cancelled()
                 continue

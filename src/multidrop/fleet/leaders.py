@@ -9,7 +9,7 @@ from typing import Any
 from multidrop.fleet import names
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.servers import Path
+from multidrop.fleet.servers import ServerPath
 
 
 def home_of(place: int, cluster: Mapping[str, Any]) -> str:
@@ -24,7 +24,7 @@ def is_ready(server: str, cluster: Mapping[str, Any]) -> bool:
     return bool(server in peers and peers[server].get("current") and not peers[server].get("offline"))
 
 
-async def bring_leaders_home(path: Path) -> int:
+async def bring_leaders_home(path: ServerPath) -> int:
     """Ask leaders that are not at home to step down for who is; return how many."""
     moved = 0
     for group in (names.LEASES, names.OWNERS):

@@ -9,7 +9,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet import lease_rules
@@ -45,7 +45,7 @@ class LifeLock:
     Raises FleetError when another process of this machine holds it.
     """
 
-    def __init__(self, path: FilePath) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path.resolve()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("a+b")
@@ -75,7 +75,7 @@ class LifeLock:
 def machine_id() -> str:
     """Return this machine's own id; "" where it has none, which proves nothing."""
     with suppress(OSError):
-        return FilePath("/etc/machine-id").read_text().strip()
+        return Path("/etc/machine-id").read_text().strip()
     return ""
 
 

@@ -56,11 +56,6 @@ def may_send(now: int, until: int) -> bool:
     return now < until
 
 
-def killed_at(until: int, terms: Terms) -> int:
-    """Return when the kernel's timer ends a holder that did not let go in time."""
-    return until + terms.guard // 2
-
-
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
     """Return what is known of a record after it was read."""
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)

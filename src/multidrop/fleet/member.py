@@ -33,7 +33,7 @@ from multidrop.fleet.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.observer import Observer
 from multidrop.fleet.ownership import NOBODY, decide, owner_of, owner_value
-from multidrop.fleet.servers import Path
+from multidrop.fleet.servers import ServerPath
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -72,7 +72,7 @@ class Member:
     def __init__(
         self,
         name: str,
-        paths: Sequence[Path],
+        paths: Sequence[ServerPath],
         lines: Lines,
         mastership: MayPoll,
         *,
@@ -126,10 +126,10 @@ class Member:
         """Say whether lines are taken and kept: there is a lease, and time to close them before it ends."""
         return bool(self.lease.session) and self.lease.left_s > SILENT_S and not self._is_leaving
 
-    def _path(self, number: int) -> Path:
+    def _path(self, number: int) -> ServerPath:
         return self.paths[number]
 
-    def best(self) -> Path:
+    def best(self) -> ServerPath:
         """Return the path whose lease was renewed last, or before there is one any that is open."""
         path = self.paths[self.lease.best]
         return path if path.is_open else next((one for one in self.paths if one.is_open), path)

@@ -9,10 +9,10 @@ from multidrop.fleet.buckets import Bucket, Follower
 from multidrop.fleet.lease_rules import USUAL
 from multidrop.fleet.observer import Observer
 from multidrop.fleet.ownership import owner_of
-from multidrop.fleet.servers import Path
+from multidrop.fleet.servers import ServerPath
 
 
-async def read_fleet(path: Path) -> dict[str, Any]:
+async def read_fleet(path: ServerPath) -> dict[str, Any]:
     """Return gateways with a session that nobody ended, and lines with their masters.
 
     A gateway that died a moment ago is still there, until another one has ended its session.

@@ -10,7 +10,7 @@ import asyncio
 import json
 import tomllib
 from collections.abc import Mapping
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantLine, load_plant
@@ -21,7 +21,7 @@ AT_ONCE = 64
 SOCKETS = ("socket://", "tcp://")
 
 
-def read_plant(path: FilePath) -> tuple[Plant, dict[str, Any]]:
+def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     """Return the plant of a file, and the record of each line by its name.
 
     Raises ValueError (PlantError for mistakes of the file) for what a fleet cannot poll: a port that only
@@ -39,7 +39,7 @@ def read_plant(path: FilePath) -> tuple[Plant, dict[str, Any]]:
     return plant, {table["name"]: _description(table, path.parent) for table in document["line"]}
 
 
-def _description(table: Mapping[str, Any], folder: FilePath) -> dict[str, Any]:
+def _description(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     files: dict[str, str] = {}
     for model in {drive["model"] for drive in table["drive"]}:
         if ".py" in model:
@@ -52,15 +52,15 @@ def _description(table: Mapping[str, Any], folder: FilePath) -> dict[str, Any]:
     return {"line": dict(table), "files": files}
 
 
-def _family_files(folder: FilePath, model: str) -> dict[str, str]:
+def _family_files(folder: Path, model: str) -> dict[str, str]:
     """Return a family's file, and the CSV tables beside it that it names."""
     family = (folder / model).resolve()
     text = family.read_text("utf-8")
     found = {model: text}
     for other in family.parent.glob("*.csv"):
         if other.name in text:
-            found[str(FilePath(model).parent / other.name)] = other.read_text("utf-8")
-    if any(FilePath(name).is_absolute() or ".." in FilePath(name).parts for name in found):
+            found[str(Path(model).parent / other.name)] = other.read_text("utf-8")
+    if any(Path(name).is_absolute() or ".." in Path(name).parts for name in found):
         raise ValueError(f"the family {model} must be in the plant file's folder, or below it")
     return found
 
@@ -88,7 +88,7 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
     return {"new": len(came), "changed": len(changed), "removed": len(gone), "kept": kept}
 
 
-def line_of(record: Record, folder: FilePath) -> PlantLine:
+def line_of(record: Record, folder: Path) -> PlantLine:
     """Return the line that a record describes; its files are written below the folder.
 
     Raises ValueError for a record that is none.
@@ -96,7 +96,7 @@ def line_of(record: Record, folder: FilePath) -> PlantLine:
     value, home = record.value, folder / record.key
     home.mkdir(parents=True, exist_ok=True)
     for name, text in value["files"].items():
-        path = FilePath(name)
+        path = Path(name)
         if path.is_absolute() or ".." in path.parts:
             raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)

@@ -17,10 +17,11 @@ from typing import Any, NamedTuple
 from nats.aio.client import Client
 from nats.errors import Error, NoRespondersError
 
+from multidrop.fleet.servers import OLDEST
+
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
-OLDEST_SERVER = (2, 12)
 ANSWER_S = 5.0  # for an answer: a new leader takes 4 to 9 s, so that is asked again
 NO_MESSAGE, WRONG_SEQUENCE = 10037, 10071  # error codes of JetStream
 
@@ -90,11 +91,11 @@ async def connect(servers: list[str], **options: Any) -> Client:
             await client.close()
         raise StreamError(f"no server of NATS answers at {', '.join(servers)}: {_text(last)}") from failure
     version = client.connected_server_version
-    if (version.major, version.minor) < OLDEST_SERVER:
+    if (version.major, version.minor) < OLDEST:
         await client.close()
         raise StreamError(
             f"the server of NATS at {', '.join(servers)} is {version.major}.{version.minor}.{version.patch}: "
-            f"a fleet needs {'.'.join(map(str, OLDEST_SERVER))} or newer"
+            f"a fleet needs {'.'.join(map(str, OLDEST))} or newer"
         )
     return client
 

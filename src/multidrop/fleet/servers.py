@@ -22,7 +22,7 @@ PONG_S = 0.7  # a server that takes longer is left for another one
 KEEP_S = 1.0  # between looks at a connection
 
 
-class Path:
+class ServerPath:
     """One connection, at its home where that server lives, else at any other."""
 
     def __init__(self, urls: Sequence[str], options: Mapping[str, Any] | None = None) -> None:
@@ -106,9 +106,6 @@ class Path:
         if self._client is not None:
             await self._client.subscribe(subject, cb=called)
 
-    async def unsubscribe_all(self) -> None:
-        self._subscriptions.clear()
-
     async def request(
         self,
         subject: str,
@@ -124,11 +121,6 @@ class Path:
             raise FleetError(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
-
-    async def publish(self, subject: str, data: bytes) -> None:
-        """Send a message to whoever listens."""
-        with suppress(NatsError, OSError):
-            await self._connected().publish(subject, data)
 
     async def collect(self, subject: str, data: bytes, is_last: Callable[[Msg], bool]) -> list[Msg]:
         """Return all answers up to one that says that it is the last. Raises Unsure as `request` does."""
@@ -204,6 +196,6 @@ def _cut(client: Client) -> None:
         writer.transport.abort()
 
 
-def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[Path]:
+def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
     """Return three paths: each has another of the servers as its home, where there are so many."""
-    return [Path([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
+    return [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]

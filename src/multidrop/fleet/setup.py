@@ -11,7 +11,7 @@ from multidrop.fleet import names
 from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
 from multidrop.fleet.errors import Conflict, FleetError, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
-from multidrop.fleet.servers import Path
+from multidrop.fleet.servers import ServerPath
 
 CONTEST = "contest"
 ROUNDS = 40  # 2.9.10 fails in the first few of them
@@ -20,7 +20,7 @@ MOST_REPLICAS = 3
 WAIT_S = 10.0  # an election takes 4 to 9 s
 
 
-async def set_up(paths: Sequence[Path]) -> dict[str, Any]:
+async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     """Make what is missing, and return what there is. Raises FleetError, in one sentence.
 
     Buckets that are there stay as they are.
@@ -35,7 +35,7 @@ async def set_up(paths: Sequence[Path]) -> dict[str, Any]:
     return {"servers": servers, "replicas": replicas, "buckets": list(names.BUCKETS)}
 
 
-async def open_all(paths: Sequence[Path]) -> None:
+async def open_all(paths: Sequence[ServerPath]) -> None:
     """Connect all paths. Raises FleetError where none is reached, or a server is too old."""
     results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
     failures = [result for result in results if isinstance(result, Exception)]
@@ -44,7 +44,7 @@ async def open_all(paths: Sequence[Path]) -> None:
         raise (too_old or failures)[0]
 
 
-async def check_buckets(path: Path) -> None:
+async def check_buckets(path: ServerPath) -> None:
     """Raise FleetError where there is no fleet in these servers yet, or no quorum."""
     for bucket in names.BUCKETS:
         try:
@@ -59,7 +59,7 @@ async def check_buckets(path: Path) -> None:
             raise no_quorum(path, failure) from None
 
 
-def no_quorum(path: Path, failure: Exception) -> FleetError:
+def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
     """Return the sentence for a cluster that does not decide anything."""
     return FleetError(
         f"the NATS servers around {path.url} have no quorum: more than half of them must run and reach each "
@@ -67,7 +67,7 @@ def no_quorum(path: Path, failure: Exception) -> FleetError:
     )
 
 
-async def _create(path: Path, settings: Mapping[str, Any]) -> None:
+async def _create(path: ServerPath, settings: Mapping[str, Any]) -> None:
     ends = asyncio.get_running_loop().time() + WAIT_S
     while True:
         try:
@@ -93,7 +93,7 @@ async def _create(path: Path, settings: Mapping[str, Any]) -> None:
                 raise no_quorum(path, failure) from None
 
 
-async def _contest(paths: Sequence[Path], replicas: int) -> None:
+async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
     """Let several claimants ask for the same revision, again and again: one alone may get it."""
     settings = bucket_settings(CONTEST, replicas)
     await _create(paths[0], settings)
@@ -116,7 +116,7 @@ async def _contest(paths: Sequence[Path], replicas: int) -> None:
         await ask(paths[0], f"STREAM.DELETE.{settings['name']}")
 
 
-def _itself(path: Path) -> Path:
+def _itself(path: ServerPath) -> ServerPath:
     return path
 
 
