@@ -19,6 +19,7 @@ from multidrop.fleet import member as member_module  # noqa: E402
 from multidrop.fleet import names  # noqa: E402
 from multidrop.fleet.buckets import Bucket  # noqa: E402
 from multidrop.fleet.lease import boottime_ns  # noqa: E402
+from multidrop.fleet.line_keeper import SILENT_S  # noqa: E402
 from multidrop.fleet.member import Member, MemberState  # noqa: E402
 from multidrop.fleet.plant_store import store  # noqa: E402
 from multidrop.fleet.servers import paths_of  # noqa: E402
@@ -167,7 +168,7 @@ def test_lines_come_change_and_go_with_the_plant(fleet: Cluster) -> None:
             assert all(
                 member.polled[line] == before[line] for line in LINES if line not in ("line-1", "line-2")
             )
-            owned = [name for one in member.owners.values() for name, record in one.records.items()]
+            owned = [name for one in member.records.owners.values() for name, record in one.records.items()]
             assert "line-new" in owned
             del records["line-new"]
             await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
@@ -184,15 +185,15 @@ def test_a_node_that_dies_costs_nothing(fleet: Cluster) -> None:
         async with gateways(fleet, "a", "b") as running:
             member = running.members["a"]
             await asyncio.sleep(2.5)  # leaders and paths come home
-            before, moves = dict(member.polled), member.moves
+            before, moves = dict(member.polled), member.keeper.moves
             least = member.lease.left_s
             fleet.nodes[1].kill()
             ends = time.monotonic() + 11
             while time.monotonic() < ends:
                 least = min(least, *(one.lease.left_s for one in running.members.values()))
                 await asyncio.sleep(0.02)
-            assert least > member_module.SILENT_S
-            assert (member.polled, member.moves) == (before, moves)
+            assert least > SILENT_S
+            assert (member.polled, member.keeper.moves) == (before, moves)
             fleet.nodes[1].start()
             await asyncio.to_thread(fleet.wait)
             await until(lambda: all(path.url == path.urls[0] for path in member.paths), "home again")

@@ -140,8 +140,8 @@ class FleetGateway:
             "margin_s": round(member.lease.left_s, 3),
             "paths": [path.server_name for path in self.paths],
             "lines": len(member.polled),
-            "moves": member.moves,
-            "troubles": dict(sorted(member.troubles.items())),
+            "moves": member.keeper.moves,
+            "troubles": dict(sorted(member.keeper.troubles.items())),
             "trouble": member.lease.trouble,
             "spool": {
                 "bytes": spool.stored,

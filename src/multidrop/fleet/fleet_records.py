@@ -1,0 +1,61 @@
+"""Fleet records: what a gateway reads of its fleet again and again: sessions, owners of lines, the plant."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import Bucket, Follower, Record
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.lease_rules import Terms
+from multidrop.fleet.observer import Observer
+from multidrop.fleet.servers import ServerPath
+
+FOLLOW_S = 0.2
+
+
+class FleetRecords:
+    """The records of all buckets, as far as they were read; `on_change` is called when some have changed."""
+
+    def __init__(
+        self, me: str, path: Callable[[], ServerPath], terms: Terms, on_change: Callable[[], object]
+    ) -> None:
+        self.observer = Observer(me, [Bucket(bucket, path) for bucket in names.LEASES], terms)
+        self.owners = {bucket: Follower(Bucket(bucket, path)) for bucket in names.OWNERS}
+        self.plant = Follower(Bucket(names.PLANT, path))
+        self._on_change = on_change
+        self._read: set[str] = set()  # buckets that were read at least once
+
+    @property
+    def are_complete(self) -> bool:
+        """Say whether each bucket was read once."""
+        return len(self._read) == len(names.BUCKETS)
+
+    def owner(self, line: str) -> Record | None:
+        """Return the record of a line's master."""
+        return self.owners[names.owner_bucket(line)].records.get(line)
+
+    def lines(self) -> list[str]:
+        """Return the lines of the plant."""
+        return [
+            name for name, record in self.plant.records.items() if record.value and "line" in record.value
+        ]
+
+    def works(self) -> list[Coroutine[Any, Any, None]]:
+        """Return what reads them for ever, a coroutine for each bucket, so that none waits for another."""
+        looks: dict[str, Callable[[], Awaitable[Any]]] = {names.PLANT: self.plant.look}
+        looks |= {name: partial(self.observer.look, path) for path, name in enumerate(names.LEASES)}
+        looks |= {name: follower.look for name, follower in self.owners.items()}
+        return [self._follow(name, look) for name, look in looks.items()]
+
+    async def _follow(self, name: str, look: Callable[[], Awaitable[Any]]) -> None:
+        while True:
+            with suppress(FleetError):
+                if await look() or name not in self._read:
+                    self._on_change()
+                self._read.add(name)
+            await asyncio.sleep(FOLLOW_S)

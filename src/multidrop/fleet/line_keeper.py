@@ -1,0 +1,173 @@
+"""Line keeper: the work on a gateway's lines. Each is claimed, polled, let go and given away, one at a time.
+
+A line is polled only while its record names us and our present session, and while the lease is valid. Half a
+second before it runs out all lines are let go.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from contextlib import suppress
+from typing import Any, Protocol
+
+from multidrop.fleet import names
+from multidrop.fleet.buckets import Record
+from multidrop.fleet.errors import Conflict, FleetError
+from multidrop.fleet.fleet_records import FleetRecords
+from multidrop.fleet.lease import Lease
+from multidrop.fleet.ownership import NOBODY, owner_of, owner_value
+
+_log = logging.getLogger("multidrop.fleet")
+
+SILENT_S = 0.5  # before the lease runs out: time for closing; the timer leaves guard / 2 more
+TAKE_AGAIN_S = 2.0  # after a line that could not be taken
+CLAIMS_AT_ONCE = 64
+LINES_AT_ONCE = 32
+
+
+class Lines(Protocol):
+    """The lines that this gateway polls."""
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line and poll it. Raises OSError or ValueError where that fails; it is tried again."""
+
+    async def let_go(self, line: str) -> None:
+        """Poll the line no more, and close it: when this returns nothing of ours is sent on it."""
+
+
+class LineKeeper:
+    """The lines that one gateway polls, and what is under way on each of them.
+
+    `on_change` is called when something is to be looked at anew.
+    """
+
+    def __init__(
+        self, lines: Lines, lease: Lease, records: FleetRecords, on_change: Callable[[], object]
+    ) -> None:
+        self.lines = lines
+        self.polled: dict[str, int] = {}  # lines, with the revision of their description
+        self.troubles: dict[str, str] = {}  # lines that could not be taken, and why
+        self.moves = 0
+        self.releasing: set[str] = set()  # ours, and to be given away
+        self._lease = lease
+        self._records = records
+        self._on_change = on_change
+        self._is_leaving = False
+        self._at_work: dict[str, asyncio.Task[None]] = {}  # by line: it is taken, let go or claimed
+        self._again_at: dict[str, float] = {}
+        self._failure: BaseException | None = None
+        self._has_failed = asyncio.Event()
+        self._claims = asyncio.Semaphore(CLAIMS_AT_ONCE)
+        self._openings = asyncio.Semaphore(LINES_AT_ONCE)
+
+    @property
+    def may_poll(self) -> bool:
+        """Say whether lines are taken and kept: there is a lease, and time to close them before it ends."""
+        return bool(self._lease.session) and self._lease.left_s > SILENT_S and not self._is_leaving
+
+    @property
+    def is_silent(self) -> bool:
+        """Say whether no line is open, or about to be."""
+        return not self.polled and not self._at_work
+
+    def is_mine(self, line: str) -> bool:
+        return owner_of(self._records.owner(line)) == (self._lease.name, self._lease.session)
+
+    async def fail(self) -> None:
+        """Wait until a line could not be let go, and raise what was wrong: the process must end."""
+        await self._has_failed.wait()
+        assert self._failure is not None
+        raise self._failure
+
+    # ---- all lines ----
+
+    def claim(self, claims: Mapping[str, int]) -> None:
+        """Claim lines, each at the revision of its record that was judged."""
+        for line, revision in claims.items():
+            if line not in self._at_work:
+                self._start(line, self._write_owner(line, self._lease.name, revision))
+
+    def reconcile(self) -> None:
+        """Let go of what is not ours any more, take what is, and give away what was let go."""
+        valid = self.may_poll
+        mine = {
+            line: self._records.plant.records[line].revision
+            for line in self._records.lines()
+            if valid and line not in self.releasing and self.is_mine(line)
+        }
+        now = time.monotonic()
+        for line, revision in list(self.polled.items()):
+            if mine.get(line) != revision and line not in self._at_work:
+                self._start(line, self._let_go(line))
+        for line in mine.keys() - self.polled.keys() - self._at_work.keys():
+            if now >= self._again_at.get(line, 0.0):
+                self._start(line, self._take(line))
+        if valid:
+            for line in self.releasing - self.polled.keys() - self._at_work.keys():
+                record = self._records.owner(line)
+                if record and self.is_mine(line):
+                    self._start(line, self._write_owner(line, NOBODY, record.revision))
+
+    async def let_all_go(self) -> None:
+        """Let go of all lines, whatever is under way. Raises what kept a line from it."""
+        self._is_leaving = True
+        try:
+            while not self.is_silent:
+                if self._failure:
+                    raise self._failure
+                self.reconcile()
+                await asyncio.gather(*self._at_work.values(), return_exceptions=True)
+        finally:
+            self._is_leaving = False
+
+    # ---- one line ----
+
+    def _start(self, line: str, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._at_work[line] = task
+        task.add_done_callback(lambda done: self._done(line, done))
+
+    def _done(self, line: str, task: asyncio.Task[None]) -> None:
+        self._at_work.pop(line, None)
+        self._on_change()
+        failure = None if task.cancelled() else task.exception()
+        if failure and not self._failure:
+            self._failure = failure  # a line that is not closed for certain
+            self._has_failed.set()
+
+    async def _write_owner(self, line: str, gateway: str, revision: int) -> None:
+        """Claim a line, or give it away; only the server decides, by the revision."""
+        follower = self._records.owners[names.owner_bucket(line)]
+        value = owner_value(gateway, self._lease.session if gateway else 0, time.time_ns() // 1_000_000)
+        async with self._claims:
+            if not self.may_poll:
+                return
+            with suppress(Conflict, FleetError):  # what became of it will be read
+                stored = await follower.bucket.put(line, value, revision)
+                follower.take(Record(line, stored, value))
+                self.moves += 1
+        if gateway and line in self._records.plant.records:
+            await self._take(line)
+
+    async def _take(self, line: str) -> None:
+        record = self._records.plant.records[line]
+        async with self._openings:
+            if not (self.may_poll and self.is_mine(line)):
+                return
+            try:
+                await self.lines.take(line, record.value)
+            except (OSError, ValueError) as failure:
+                self.troubles[line] = str(failure)
+                self._again_at[line] = time.monotonic() + TAKE_AGAIN_S
+                asyncio.get_running_loop().call_later(1.01 * TAKE_AGAIN_S, self._on_change)
+                _log.warning("line %s is not taken, and tried again: %s", line, failure)
+            else:
+                self.troubles.pop(line, None)
+                self.polled[line] = record.revision
+
+    async def _let_go(self, line: str) -> None:
+        await self.lines.let_go(line)
+        self.polled.pop(line, None)
