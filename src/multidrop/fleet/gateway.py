@@ -76,7 +76,7 @@ class FleetGateway:
         self.forwarder = Forwarder(self.spool, client)
         forwarding = asyncio.create_task(self.forwarder.run())
         try:
-            await self.paths[0].subscribe(names.gateway_subject(self.name), self._answer)
+            await self.paths[0].subscribe(names.gateway_subject(self.name, "*"), self._answer)
             self.lines.poller.on_batch(self.spool.append)
             with self.lines.poller:
                 member = asyncio.create_task(self.member.run())
@@ -121,8 +121,7 @@ class FleetGateway:
 
     async def _answer(self, message: Msg) -> None:
         """Answer a request about this gateway."""
-        wanted = message.data.decode("utf-8", "replace")
-        if wanted == "drain":
+        if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
             _log.warning("%s: asked to give all lines away", self.name)
         with suppress(Exception):  # whoever asked may have gone
@@ -155,7 +154,7 @@ class FleetGateway:
 async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, Any]:
     """Return a gateway's answer to "state" or "drain". Raises FleetError where it gives none."""
     try:
-        message = await path.request(names.gateway_subject(gateway), wanted.encode())
+        message = await path.request(names.gateway_subject(gateway, wanted))
     except FleetError:
         raise FleetError(
             f"no gateway called {gateway} answers; `multidrop fleet status` lists them"

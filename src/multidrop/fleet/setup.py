@@ -8,9 +8,10 @@ from functools import partial
 from typing import Any
 
 from multidrop.fleet import names
-from multidrop.fleet.buckets import NONE_YET, Bucket, ServerError, ask, bucket_settings
+from multidrop.fleet.buckets import NONE_YET, ServerError, ask, bucket_settings
 from multidrop.fleet.errors import Conflict, FleetError, TooOld, Unsure
 from multidrop.fleet.leaders import bring_leaders_home
+from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.servers import ServerPath
 
 CONTEST = "contest"
@@ -98,11 +99,15 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
     settings = bucket_settings(CONTEST, replicas)
     await _create(paths[0], settings)
     try:
-        claimants = [Bucket(CONTEST, partial(_itself, path)) for path in paths if path.is_open]
+        ways = [path for path in paths if path.is_open]
+        claimants = [
+            LeaseBucket(CONTEST, partial(_itself, ways[at % len(ways)]), f"claimant-{at}")
+            for at in range(CLAIMANTS)
+        ]
         revision, unsure = NONE_YET, 0
         while revision == NONE_YET or unsure < ROUNDS:
             unsure += 1
-            claims = [_claim(claimants[at % len(claimants)], revision, at) for at in range(CLAIMANTS)]
+            claims = [_claim(claimant, revision) for claimant in claimants]
             granted = [found for found in await asyncio.gather(*claims) if found is not None]
             if len(granted) > 1:
                 raise FleetError(
@@ -120,8 +125,8 @@ def _itself(path: ServerPath) -> ServerPath:
     return path
 
 
-async def _claim(bucket: Bucket, revision: int, claimant: int) -> int | None:
+async def _claim(claimant: LeaseBucket, revision: int) -> int | None:
     try:
-        return await bucket.put(CONTEST, claimant, revision)
+        return await claimant.put(CONTEST, {}, revision)
     except (Conflict, FleetError):
         return None
