@@ -327,6 +327,61 @@ def test_who_was_cut_off_itself_ends_nobody_for_what_it_saw_meanwhile() -> None:
     asyncio.run(main())
 
 
+def test_an_end_by_another_counts_when_the_lease_must_have_run_out() -> None:
+    """Its writer may be hasty, wrong, or worse: until then the ended one may still send."""
+
+    async def main() -> None:
+        trial = Trial()
+        lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
+        assert await lease.try_to_begin()
+        await look(observer)
+        for bucket in trial.buckets:
+            bucket.store("a", {**bucket.records["a"].value, "session": 9, "ended": True, "by": "rogue"})
+        trial.clock.pass_s(1.0)
+        await look(observer)
+        await look(late)
+        assert lease.is_valid
+        assert not observer.is_over("a", 1)
+        assert not observer.is_over("a", 9)
+        trial.clock.pass_s(USUAL.patience / SECOND - 1.0)  # since the observer saw the last renewal
+        assert observer.is_over("a", 1)
+        assert observer.sessions() == {}
+        assert not late.is_over("a", 1)
+        trial.clock.pass_s(1.0)
+        assert late.is_over("a", 1)
+
+    asyncio.run(main())
+
+
+def test_an_end_of_ones_own_session_counts_at_once() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, observer = trial.lease(), trial.observer()
+        assert await lease.try_to_begin()
+        await look(observer)
+        await lease.end()
+        await look(observer)
+        assert observer.is_over("a", 1)
+        assert await trial.lease().try_to_begin()
+
+    asyncio.run(main())
+
+
+def test_a_gateway_of_this_name_waits_where_another_one_wrote_the_end() -> None:
+    async def main() -> None:
+        trial = Trial()
+        lease, second = trial.lease(), trial.lease()
+        assert await lease.try_to_begin()
+        for bucket in trial.buckets:
+            bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+        assert not await second.try_to_begin()
+        assert lease.is_valid
+        trial.clock.pass_s(USUAL.patience / SECOND)
+        assert await second.try_to_begin()
+
+    asyncio.run(main())
+
+
 def test_a_gateway_with_one_stale_path_is_left_alone() -> None:
     """Its path would stay ended for as long as it lives."""
 

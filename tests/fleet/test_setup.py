@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 
-from multidrop.fleet import servers, setup
+from multidrop.fleet import lease_bucket, servers, setup
 from multidrop.fleet.buckets import ask
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.servers import paths_of
@@ -75,6 +75,15 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
         sentence = re.escape("claimants at once; no lease is safe there")
         with pytest.raises(FleetError, match=sentence):
             asyncio.run(_init(old.urls))
+
+
+def test_servers_that_do_not_look_at_all_writers_records_are_refused(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such ones would give a lease to its gateway and to who ends it."""
+    monkeypatch.setattr(lease_bucket.LeaseBucket, "_all_of", lease_bucket.LeaseBucket._subject)
+    with pytest.raises(FleetError, match="gave one revision of a key to 6 of 6 claimants at once"):
+        asyncio.run(_init(nats.urls))
 
 
 @pytest.mark.slow

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from nats.aio.msg import Msg
 
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.record_shapes import largest, parsed
 from multidrop.fleet.servers import ServerPath
 
 NONE_YET = 0  # the revision of a key without a record
 BATCH = 1000  # records asked for at a time
+MOST_STRANGE = 1000  # records of a bucket that are told of
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
 
+_log = logging.getLogger("multidrop.fleet")
+
 
 class Record(NamedTuple):
-    """A key's newest value, and the sequence at which the server stored it; None: removed."""
+    """A key's newest value, and the sequence at which the server stored it.
+
+    The value is None for a record that was removed, and for one that is none of ours.
+    """
 
     key: str
     revision: int
@@ -28,7 +36,10 @@ class Record(NamedTuple):
 
 
 def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
-    """Return the stream that a bucket is: the newest record of each key, on disk, on so many servers."""
+    """Return the stream that a bucket is: the newest record of each subject, on disk, on so many servers.
+
+    Nobody removes records: neither by a request, nor by a header of a new one.
+    """
     return {
         "name": f"KV_{name}",
         "subjects": [f"$KV.{name}.>"],
@@ -36,8 +47,10 @@ def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
         "discard": "new",
         "storage": "file",
         "num_replicas": replicas,
-        "allow_rollup_hdrs": True,
+        "allow_rollup_hdrs": False,
         "deny_delete": True,
+        "deny_purge": True,
+        "max_msg_size": largest(name),
         "allow_direct": True,
         "max_bytes": -1,
         "max_msgs": -1,
@@ -72,15 +85,19 @@ class Bucket:
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
+        self._strange: set[str] = set()  # keys whose record is none of ours, as was told
 
     async def put(self, key: str, value: Any, revision: int) -> int:
         """Replace the record at this very revision, and return the new one.
 
         Raises Conflict where it has another, Unsure where it may or may not have been replaced.
         """
-        headers = {"Nats-Expected-Last-Subject-Sequence": str(revision)}
+        headers = {
+            "Nats-Expected-Last-Subject-Sequence": str(revision),
+            "Nats-Expected-Last-Subject-Sequence-Subject": self._all_of(key),
+        }
         data = b"" if value is None else json.dumps(value, separators=(",", ":")).encode()
-        message = await self.path().request(f"$KV.{self.name}.{key}", data, headers)
+        message = await self.path().request(self._subject(key), data, headers)
         said = json.loads(message.data)
         error = said.get("error")
         if error is None:
@@ -91,7 +108,7 @@ class Bucket:
 
     async def get(self, key: str) -> Record:
         """Return the record as the bucket's leader has it; revision 0 for none."""
-        wanted = {"last_by_subj": f"$KV.{self.name}.{key}"}
+        wanted = {"last_by_subj": self._all_of(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
         except ServerError as failure:
@@ -99,7 +116,7 @@ class Bucket:
                 return Record(key, NONE_YET, None)
             raise
         found = said["message"]
-        return Record(key, int(found["seq"]), _value(base64.b64decode(found.get("data", ""))))
+        return self._record(found["subject"], int(found["seq"]), base64.b64decode(found.get("data", "")))
 
     async def changes(self, after: int) -> list[Record]:
         """Return the records with a higher revision, as any of the servers has them: some may be old.
@@ -109,7 +126,33 @@ class Bucket:
         wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": f"$KV.{self.name}.>"}
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode(), _is_end)
-        return [_record(message, self.name) for message in messages]
+        return [self._of(message) for message in messages]
+
+    def _subject(self, key: str) -> str:
+        """Return the subject on which a record is written."""
+        return f"$KV.{self.name}.{key}"
+
+    def _all_of(self, key: str) -> str:
+        """Return all subjects whose newest message is the key's record."""
+        return self._subject(key)
+
+    def _of(self, message: Msg) -> Record:
+        headers = message.headers or {}
+        return self._record(headers["Nats-Subject"], int(headers["Nats-Sequence"]), message.data)
+
+    def _record(self, subject: str, revision: int, data: bytes) -> Record:
+        key = subject.removeprefix(f"$KV.{self.name}.")
+        return Record(key, revision, self._value(key, data))
+
+    def _value(self, key: str, data: bytes) -> Any:
+        """Return the value, or None and a warning for what is none of ours: once, until it is again."""
+        value, mistake = parsed(self.name, key, data)
+        if not mistake:
+            self._strange.discard(key)
+        elif key not in self._strange and len(self._strange) < MOST_STRANGE:
+            self._strange.add(key)
+            _log.warning("the record %s of the bucket %s is left out: %s", key, self.name, mistake)
+        return value
 
 
 class Follower:
@@ -143,17 +186,3 @@ class Follower:
 def _is_end(message: Msg) -> bool:
     headers = message.headers or {}
     return headers.get("Status") in ("204", "404", "408")
-
-
-def _record(message: Msg, bucket: str) -> Record:
-    headers = message.headers or {}
-    key = headers["Nats-Subject"].removeprefix(f"$KV.{bucket}.")
-    return Record(key, int(headers["Nats-Sequence"]), _value(message.data))
-
-
-def _value(data: bytes) -> Any:
-    """Return the value; None for a record that was removed, or that is no JSON of ours."""
-    try:
-        return json.loads(data) if data else None
-    except ValueError:
-        return None

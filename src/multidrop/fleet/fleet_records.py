@@ -11,6 +11,7 @@ from typing import Any
 from multidrop.fleet import names
 from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import FleetError
+from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import Terms
 from multidrop.fleet.observer import Observer
 from multidrop.fleet.servers import ServerPath
@@ -24,7 +25,7 @@ class FleetRecords:
     def __init__(
         self, me: str, path: Callable[[], ServerPath], terms: Terms, on_change: Callable[[], object]
     ) -> None:
-        self.observer = Observer(me, [Bucket(bucket, path) for bucket in names.LEASES], terms)
+        self.observer = Observer(me, [LeaseBucket(bucket, path, me) for bucket in names.LEASES], terms)
         self.owners = {bucket: Follower(Bucket(bucket, path)) for bucket in names.OWNERS}
         self.plant = Follower(Bucket(names.PLANT, path))
         self._on_change = on_change

@@ -145,7 +145,11 @@ class Lease:
 
     async def begin(self) -> None:
         """Begin a session, as soon as every one before it is over."""
+        told = ""
         while not await self.try_to_begin():
+            if self.trouble != told:
+                _log.warning("%s does not poll: %s", self.name, self.trouble)
+            told = self.trouble
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:
@@ -183,16 +187,16 @@ class Lease:
     def _is_free(self, path: int, record: Record) -> bool:
         """Say whether the session in this record is over, or its end may be written at this revision."""
         value = record.value
-        if record.revision == NONE_YET or value is None or value["ended"]:
+        if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
-        if self._lock is not None and self._lock.proves_death(value):
+        if value and self._lock is not None and self._lock.proves_death(value):
             return True
         now = self._clock()
         watched = self._watched[path] = lease_rules.watch(self._watched[path], record.revision, now)
         return lease_rules.is_stale(watched, now, self.terms)
 
     def _rival(self, known: Mapping[int, Record]) -> str:
-        others = [record.value for record in known.values() if record.value and not record.value["ended"]]
+        others = [record.value for record in known.values() if record.value]
         host = others[0].get("host", "?") if others else "?"
         return f"a gateway called {self.name} is registered on {host}; waiting until its lease has run out"
 

@@ -24,11 +24,12 @@ from typing import Any
 
 from multidrop.fleet import names
 from multidrop.fleet.balance import Balance
-from multidrop.fleet.buckets import Bucket, Record
+from multidrop.fleet.buckets import Record
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.fleet_records import FleetRecords
 from multidrop.fleet.leaders import bring_leaders_home
 from multidrop.fleet.lease import Lease, LifeLock, MayPoll
+from multidrop.fleet.lease_bucket import LeaseBucket
 from multidrop.fleet.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.line_keeper import LineKeeper, Lines
 from multidrop.fleet.ownership import decide, owner_of
@@ -67,7 +68,7 @@ class Member:
         self.paths = paths
         self.mastership = mastership
         self.is_draining = False
-        own = [Bucket(bucket, partial(self._path, at)) for at, bucket in enumerate(names.LEASES)]
+        own = [LeaseBucket(bucket, partial(self._path, at), name) for at, bucket in enumerate(names.LEASES)]
         self.lease = Lease(name, own, mastership, lock=lock, terms=terms, note=self._note)
         self.records = FleetRecords(name, self.best, terms, self._mark_dirty)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)

@@ -13,11 +13,16 @@ BUCKETS = (*LEASES, *OWNERS, PLANT)
 
 def checked_name(kind: str, name: str) -> str:
     """Return the name. Raises ValueError for one that a subject cannot have."""
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+    if not isinstance(name, str) or not is_name(name):
         raise ValueError(
             f"the {kind}'s name {name!r} may have letters, digits, _ and - alone: write gateway-1"
         )
     return name
+
+
+def is_name(text: str) -> bool:
+    """Say whether a subject can have this as one of its parts."""
+    return re.fullmatch(r"[A-Za-z0-9_-]+", text) is not None
 
 
 def owner_bucket(line: str) -> str:
@@ -30,6 +35,16 @@ def command_subject(line: str) -> str:
     return f"cmd.{line}"
 
 
-def gateway_subject(gateway: str) -> str:
-    """Return the subject on which a gateway takes requests about itself."""
-    return f"gateway.{gateway}"
+def do_subject(gateway: str, run: str) -> str:
+    """Return the subject on which one run of a gateway's process is told to do what it has offered."""
+    return f"do.{gateway}.{run}"
+
+
+def stop_subject(line: str) -> str:
+    """Return the subject on which a line's master takes stops."""
+    return f"stop.{line}"
+
+
+def gateway_subject(gateway: str, wanted: str) -> str:
+    """Return the subject of a request about a gateway itself: "state", "drain", or "*" for all it takes."""
+    return f"gateway.{gateway}.{wanted}"

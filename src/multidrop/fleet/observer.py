@@ -1,4 +1,8 @@
-"""Observer: watches the sessions of all gateways, and ends those that nobody renews."""
+"""Observer: watches the sessions of all gateways, and ends those that nobody renews.
+
+An end that a gateway wrote of its own session counts at once. One that another gateway wrote counts when the
+lease must have run out by our own clock too: nobody's haste, wrong clock or malice makes a second master.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,8 @@ from multidrop.fleet.buckets import Bucket, Follower, Record
 from multidrop.fleet.errors import Conflict, FleetError
 from multidrop.fleet.lease import boottime_ns
 from multidrop.fleet.lease_rules import SeenRevision, Terms
+
+BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for who only looks: every end counts at once
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -43,28 +49,47 @@ class Observer:
 
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
-        watched[record.key] = lease_rules.watch(watched.get(record.key), record.revision, self._clock())
+        before = watched.get(record.key)
+        if before is not None and is_ended_by_another(record):  # it was not renewed: its time runs on
+            watched[record.key] = before._replace(revision=record.revision)
+        else:
+            watched[record.key] = lease_rules.watch(before, record.revision, self._clock())
 
     def records(self, gateway: str) -> list[Record | None]:
         return [follower.records.get(gateway) for follower in self.paths]
 
     def is_over(self, gateway: str, session: int) -> bool:
         """Say whether this session was ended on as many paths as it takes."""
-        return lease_rules.is_over(
-            sum(_has_ended(record, session) for record in self.records(gateway)), self.terms
-        )
+        now = self._clock()
+        ended = [self._has_ended(path, record, session, now) for path, record in self._of(gateway)]
+        return lease_rules.is_over(sum(ended), self.terms)
 
     def sessions(self) -> dict[str, dict[str, Any]]:
         """Return each gateway that has a session that is not over, with its newest record."""
-        names = {name for follower in self.paths for name in follower.records}
         found = {}
-        for name in sorted(names):
-            values = [record.value for record in self.records(name) if record and record.value]
-            session = max((value["session"] for value in values), default=0)
-            present = [value for value in values if value["session"] == session and not value["ended"]]
+        now = self._clock()
+        for name in sorted({name for follower in self.paths for name in follower.records}):
+            records = self._of(name)
+            session = max((record.value["session"] for _, record in records), default=0)
+            present = [
+                record.value
+                for path, record in records
+                if record.value["session"] == session and not self._has_ended(path, record, session, now)
+            ]
             if len(present) >= self.terms.needed and not self.is_over(name, session):
                 found[name] = present[0]
         return found
+
+    def _of(self, gateway: str) -> list[tuple[int, Record]]:
+        """Return the records of a gateway, with their paths, but for those that are removed or strange."""
+        records = enumerate(self.records(gateway))
+        return [(path, record) for path, record in records if record and record.value is not None]
+
+    def _has_ended(self, path: int, record: Record, session: int, now: int) -> bool:
+        value = record.value
+        if value["session"] < session or (value["session"] == session and not value["ended"]):
+            return False
+        return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     # ---- dead gateways ----
 
@@ -112,8 +137,6 @@ class Observer:
         return False
 
 
-def _has_ended(record: Record | None, session: int) -> bool:
-    if record is None or record.value is None:
-        return False
-    found = record.value["session"]
-    return bool(found > session or (found == session and record.value["ended"]))
+def is_ended_by_another(record: Record) -> bool:
+    """Say whether somebody else than the gateway itself has written the end of its session."""
+    return bool(record.value and record.value["ended"] and record.value.get("by", record.key) != record.key)

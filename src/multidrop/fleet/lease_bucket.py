@@ -1,0 +1,36 @@
+"""LeaseBucket: sessions of gateways, with subjects by which servers know who wrote a record.
+
+The subject of a record is `<gateway>.<writer>`; the newest of all writers' counts, and each is replaced at
+its revision alone. A gateway may write in its own name only, so what another one writes is the end of a
+session, whatever it says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from multidrop.fleet.buckets import Bucket, Record
+from multidrop.fleet.servers import ServerPath
+
+
+class LeaseBucket(Bucket):
+    """A bucket of leases, written to in the name of `writer`."""
+
+    def __init__(self, name: str, path: Callable[[], ServerPath], writer: str) -> None:
+        super().__init__(name, path)
+        self.writer = writer
+
+    def _subject(self, key: str) -> str:
+        return f"$KV.{self.name}.{key}.{self.writer}"
+
+    def _all_of(self, key: str) -> str:
+        return f"$KV.{self.name}.{key}.*"
+
+    def _record(self, subject: str, revision: int, data: bytes) -> Record:
+        key, _, writer = subject.removeprefix(f"$KV.{self.name}.").rpartition(".")
+        value = self._value(key, data)
+        if value is not None:
+            value = {name: one for name, one in value.items() if name != "by"}
+            if writer != key:
+                value |= {"ended": True, "by": writer}
+        return Record(key, revision, value)

@@ -1,0 +1,219 @@
+"""Records that are damaged or hostile: each is left out with a warning, and harms no other."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fleets import Hall, NotedMastership
+from nats_clusters import Cluster, cluster
+from peers import require_module
+
+require_module("nats")
+
+from multidrop.fleet import member as member_module  # noqa: E402
+from multidrop.fleet import names  # noqa: E402
+from multidrop.fleet.buckets import Bucket, ServerError  # noqa: E402
+from multidrop.fleet.lease import boottime_ns  # noqa: E402
+from multidrop.fleet.lease_bucket import LeaseBucket  # noqa: E402
+from multidrop.fleet.member import Member  # noqa: E402
+from multidrop.fleet.plant_store import store  # noqa: E402
+from multidrop.fleet.record_shapes import LARGE, SMALL, parsed  # noqa: E402
+from multidrop.fleet.servers import ServerPath, paths_of  # noqa: E402
+from multidrop.fleet.setup import open_all, set_up  # noqa: E402
+
+LEASE = {
+    **{
+        "session": 1,
+        "began": 0,
+        "pid": 1,
+        "nonce": "n",
+        "host": "h",
+        "machine": "m",
+        "lock": "",
+        "lock_id": "",
+    },
+    **{"ended": False, "draining": False},
+}
+OWNER = {"gateway": "gw-9", "session": 1, "since": 0}
+LINE = {"line": {"name": "line-1"}, "files": {}}
+PATIENCE_S = 30.0
+
+STRANGE: dict[str, tuple[str, str, bytes, str]] = {
+    "no JSON": ("lease_0", "gw-1", b"\xff{", "it is no JSON"),
+    "deep": ("plant", "line-1", b"[" * 500_000, "it is no JSON"),
+    "a number of 10,000 digits": ("own_0", "line-1", b"9" * 10_000, "it is no JSON"),
+    "a list": ("lease_0", "gw-1", b"[1]", "it is no table"),
+    "nothing in it": ("lease_0", "gw-1", b"{}", "it has no 'session'"),
+    "a text for a number": (
+        *("own_1", "line-1", json.dumps({**OWNER, "session": "1"}).encode()),
+        "its 'session' is not a whole number",
+    ),
+    "true for a number": (
+        *("lease_1", "gw-1", json.dumps({**LEASE, "session": True}).encode()),
+        "its 'session' is not a whole number",
+    ),
+    "a number for a text": (
+        *("lease_1", "gw-1", json.dumps({**LEASE, "nonce": 7}).encode()),
+        "its 'nonce' is not a text",
+    ),
+    "null for true": (
+        *("lease_1", "gw-1", json.dumps({**LEASE, "ended": None}).encode()),
+        "its 'ended' is not true or false",
+    ),
+    "a key that is no name": ("own_1", "a/../b", json.dumps(OWNER).encode(), "its key is no name"),
+    "another line": (
+        "plant",
+        "line-2",
+        json.dumps(LINE).encode(),
+        "it describes another line than its key names",
+    ),
+    "a file of numbers": (
+        *("plant", "line-1", json.dumps({**LINE, "files": {"own.toml": 1}}).encode()),
+        "one of its files is no text",
+    ),
+    "huge": (
+        *("lease_0", "gw-1", b" " * (SMALL + 1)),
+        f"it has {SMALL + 1} bytes, and {SMALL} are the most",
+    ),
+    "a huge plant": (
+        "plant",
+        "line-1",
+        b" " * (LARGE + 1),
+        f"it has {LARGE + 1} bytes, and {LARGE} are the most",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_what_is_none_of_ours_is_no_record(name: str) -> None:
+    bucket, key, data, mistake = STRANGE[name]
+    assert parsed(bucket, key, data) == (None, mistake)
+
+
+@pytest.mark.parametrize(
+    ("bucket", "key", "value"), [("lease_2", "gw-1", LEASE), ("own_0", "l", OWNER), ("plant", "line-1", LINE)]
+)
+def test_what_is_ours_may_have_more_than_it_must(bucket: str, key: str, value: dict[str, Any]) -> None:
+    assert parsed(bucket, key, json.dumps(value).encode()) == (value, "")
+    more = {**value, "of another version": [1, 2]}
+    assert parsed(bucket, key, json.dumps(more).encode()) == (more, "")
+    assert parsed(bucket, key, b"") == (None, "")  # removed
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    """Return one server with a fleet's buckets."""
+    with cluster(tmp_path_factory.mktemp("nats"), 1) as running:
+        asyncio.run(_with_path(running, _set_up))
+        yield running
+
+
+async def _set_up(path: ServerPath) -> None:
+    await set_up([path])
+
+
+async def _with_path(running: Cluster, work: Callable[[ServerPath], Any]) -> None:
+    path = paths_of(running.urls)[0]
+    await path.open()
+    try:
+        await asyncio.wait_for(work(path), PATIENCE_S)
+    finally:
+        await path.close()
+
+
+def test_a_strange_record_is_told_of_once_and_others_are_read(
+    one: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_2", lambda: path)
+        await path.request("$KV.own_2.bad", b"{}")
+        stored = await bucket.put("good", OWNER, 0)
+        for _ in range(3):
+            found = {record.key: record.value for record in await bucket.changes(0)}
+            assert found == {"bad": None, "good": OWNER}
+        assert (await bucket.get("bad")).value is None
+        assert (await bucket.get("good")).revision == stored
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(_with_path(one, work))
+    told = [record.getMessage() for record in caplog.records]
+    assert told == ["the record bad of the bucket own_2 is left out: it has no 'gateway'"]
+
+
+def test_the_servers_take_no_huge_record_and_no_header_that_removes_others(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        bucket = Bucket("own_2", lambda: path)
+        await bucket.put("stays", OWNER, 0)
+        for data, headers in ((b" " * (SMALL + 1), None), (b"{}", {"Nats-Rollup": "all"})):
+            answer = json.loads((await path.request("$KV.own_2.rogue", data, headers)).data)
+            assert "error" in answer
+        assert (await bucket.get("stays")).value == OWNER
+
+    asyncio.run(_with_path(one, work))
+
+
+def test_what_another_gateway_writes_is_an_end_and_nothing_else(one: Cluster) -> None:
+    async def work(path: ServerPath) -> None:
+        own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
+        revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
+        assert (await rogue.get("gw-1")).value == LEASE  # nobody else has written it
+        await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
+        ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
+        assert (await own.get("gw-1")).value == ended
+        assert [record.value for record in await own.changes(revision)] == [ended]
+
+    asyncio.run(_with_path(one, work))
+
+
+@pytest.mark.long
+def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each bucket has one of each before the gateway begins, and gets one of each while it works."""
+    monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
+
+    async def strew(path: ServerPath, suffix: str) -> None:
+        for bucket in names.BUCKETS:
+            for number, (_, _, data, _) in enumerate(STRANGE.values()):
+                key = f"gw-{number}.rogue" if bucket in names.LEASES else f"line-{number}"
+                await path.request(f"$KV.{bucket}.{key}{suffix}", data[:SMALL])
+
+    async def work(path: ServerPath) -> None:
+        paths = paths_of(one.urls)
+        await open_all(paths)
+        await strew(path, "-before")
+        await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
+        mastership = NotedMastership(boottime_ns)
+        member = Member("gw-a", paths, Hall().add("gw-a", mastership), mastership)
+        task = asyncio.create_task(member.run())
+
+        async def until_polled(session: int) -> None:
+            while list(member.polled) != ["line-1"] or member.lease.session != session:
+                await asyncio.wait([task], timeout=0.05)
+                assert not task.done(), task.exception()
+
+        await until_polled(1)
+        await strew(path, "-again")
+        await asyncio.wait([task], timeout=1.0)
+        await until_polled(1)
+        for bucket in names.LEASES[:2]:  # our own ones: that costs a session, and no more
+            await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
+        await until_polled(2)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        for other in paths:
+            await other.close()
+
+    asyncio.run(_with_path(one, work))
+
+
+def test_a_refusal_of_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
+    async def work(path: ServerPath) -> None:
+        with pytest.raises(ServerError, match="NATS refuses: "):
+            await Bucket("nothing", lambda: path).get("gw-1")
+
+    asyncio.run(_with_path(one, work))
