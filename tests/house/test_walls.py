@@ -17,7 +17,7 @@ OUTSIDE = {
 }
 # from the ground up: a room imports from itself and from those below it
 FLOORS = [
-    {"errors", "printable", "iso_time", "interpreter"},
+    {"errors", "exposition", "printable", "iso_time", "interpreter"},
     {"toml_check"},
     {"core"},
     {"drive"},
