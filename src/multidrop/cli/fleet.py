@@ -35,7 +35,9 @@ DRAIN_S = 30.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", metavar="ACTION", choices=ACTIONS, help=", ".join(ACTIONS))
+    parser.add_argument(
+        "action", metavar="ACTION", choices=[*ACTIONS, "demo"], help=", ".join([*ACTIONS, "demo"])
+    )
     parser.add_argument("what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init")
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
@@ -49,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
+    if arguments.action == "demo":
+        from multidrop.cli.fleet_demo.command import run_demo
+
+        return run_demo()
     with logging_to(warn, "multidrop.fleet", logging.INFO if arguments.action == "serve" else logging.ERROR):
         return int(asyncio.run(ACTIONS[arguments.action](arguments)))
 

@@ -6,7 +6,6 @@ Everything that matters is in words as well as in colours. What is old is dim, a
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import Any
 
 from rich.text import Text
@@ -22,16 +21,16 @@ from multidrop.cli.support.fleet_tables import (
 from multidrop.printable import printable
 
 OLD_S = 3.0  # an older look is not shown as the present
-NOTES = 3  # lines of what happened, and of troubles
+NOTES = 4  # lines of what happened, and of troubles
 MOVES = 8  # rows of the moves with their head, where lines need the room
 
 
-def picture(told: Told, size: tuple[int, int], head: str, notes: Sequence[str] = ()) -> list[Text]:
-    """Draw gateways, lines and moves of what `fleet watch --json` prints; `notes` stand at the foot."""
+def picture(told: Told, size: tuple[int, int], head: str) -> list[Text]:
+    """Draw gateways, lines and moves of what `fleet watch --json` prints; "notes" stand at the foot."""
     width, height = size
     is_old = told["age_s"] is None or told["age_s"] > OLD_S
     top = [_title(told, head, width), _warning(told, width)]
-    foot = [Text(_cut(note, width)) for note in (*notes[-NOTES:], "Ctrl-C ends it")]
+    foot = [Text(_cut(note, width)) for note in (*told.get("notes", ())[-NOTES:], "Ctrl-C ends it")]
     room = max(0, height - len(top) - len(foot))
     body = [_row(text, width, is_old) for text in _body(told, room)[:room]]
     return [*top, *body, *[Text()] * (room - len(body)), *foot][:height]
