@@ -64,6 +64,8 @@ from multidrop.errors import PortLost as PortLost
 from multidrop.errors import Refused as Refused
 from multidrop.errors import Unconfirmed as Unconfirmed
 from multidrop.errors import Unsupported as Unsupported
+from multidrop.exposition import MetricFamily as MetricFamily
+from multidrop.exposition import expose_metrics as expose_metrics
 from multidrop.family_file.loader import FamilyError as FamilyError
 from multidrop.family_file.loader import load_family as load_family
 from multidrop.history.buckets import Buckets as Buckets

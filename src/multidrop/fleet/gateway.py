@@ -20,6 +20,7 @@ from multidrop.fleet.forwarder import Forwarder
 from multidrop.fleet.lease import LifeLock
 from multidrop.fleet.lease_rules import SECOND, USUAL
 from multidrop.fleet.member import Member
+from multidrop.fleet.moves import TOLD
 from multidrop.fleet.record_shapes import misshapen
 from multidrop.fleet.samples_stream import connect
 from multidrop.fleet.servers import ServerPath, paths_of
@@ -146,9 +147,14 @@ class FleetGateway:
             "moves": member.keeper.moves,
             "troubles": dict(sorted(member.keeper.troubles.items())),
             "trouble": member.lease.trouble,
+            "last_moves": [move.as_json() for move in member.records.moves.newest(TOLD)],
             "spool": {
                 "bytes": spool.stored,
+                "rows": spool.written,
+                "waiting": spool.waiting,
                 "lost": spool.lost,
+                "sent": forwarder.sent if forwarder else 0,
+                "lag_s": self.forwarder.lag_s() if self.forwarder else None,
                 "behind": None if last is None else max(0, spool.newest - last),
                 "trouble": spool.trouble or (forwarder.trouble if forwarder else None),
             },

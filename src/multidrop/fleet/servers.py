@@ -140,7 +140,8 @@ class ServerPath:
     ) -> Msg:
         """Return the answer.
 
-        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where nobody was.
+        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where nobody
+        was.
         """
         client = self._connected()
         try:
