@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from math import inf
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from simulated_bus import SimulatedBus, one
 
 from multidrop.control.time_limit import written_before
 from multidrop.drives import InvtCHE
-from multidrop.errors import Expired
+from multidrop.errors import Expired, Overtaken
 
 
 @pytest.fixture
@@ -21,7 +22,8 @@ def line(monkeypatch: pytest.MonkeyPatch) -> SimulatedBus:
 
 
 def within(line: SimulatedBus, seconds: float) -> AbstractContextManager[None]:
-    return written_before(round((line.seconds + seconds) * 1e9))
+    until_ns = (line.seconds + seconds) * 1e9
+    return written_before(lambda: until_ns)
 
 
 def written(line: SimulatedBus) -> list[str]:
@@ -70,7 +72,21 @@ def test_a_stop_is_sent_whenever_it_is(line: SimulatedBus) -> None:
     assert len(written(line)) > before
 
 
-@pytest.mark.parametrize("until_ns", [0.5, True, "1", None])
-def test_what_is_no_time_is_refused(until_ns: Any) -> None:
-    with pytest.raises(TypeError, match=r"is no time of CLOCK_MONOTONIC"), written_before(until_ns):
+def test_the_limit_is_asked_for_when_a_stop_would_end_the_call(line: SimulatedBus) -> None:
+    """Whoever notes a stop before it is called, and looks at the note in `limit`, misses none."""
+    drive = line.bus.drives[0]
+    before = len(written(line))
+
+    def limit() -> float:
+        drive.stop()  # at the latest moment
+        return inf
+
+    with written_before(limit), pytest.raises(Overtaken):
+        drive.set_frequency(20)
+    assert written(line)[before:] == written(line)[-1:]  # the stop
+
+
+@pytest.mark.parametrize("limit", [0.5, True, "1", None])
+def test_what_is_no_function_is_refused(limit: Any) -> None:
+    with pytest.raises(TypeError, match=r"is no function that returns a time"), written_before(limit):
         pass

@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli import fleet_commands
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
 from multidrop.cli.support.output import logging_to, print_text, warn
@@ -27,16 +28,20 @@ DRAIN_S = 30.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", metavar="ACTION", choices=ACTIONS, help=", ".join(ACTIONS))
-    parser.add_argument("what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init")
+    parser.add_argument(
+        "what", metavar="NAME", nargs="?", help="a gateway's name; PLANT.toml for init; a DRIVE for commands"
+    )
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
     parser.add_argument("--folder", metavar="DIR", type=Path, help="where a gateway keeps its spool and lock")
     parser.add_argument("--keep", metavar="SIZE", default="10 GB", help="most that the spool takes: 10 GB")
+    fleet_commands.add_command_arguments(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    fleet_commands.check_words(arguments)
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
     with logging_to(warn, "multidrop.fleet", logging.INFO if arguments.action == "serve" else logging.ERROR):
@@ -235,10 +240,19 @@ async def _lines(arguments: argparse.Namespace) -> int:
     return await _with_paths(arguments, work)
 
 
+# ---- commands to drives ----
+
+
+async def _command(arguments: argparse.Namespace) -> int:
+    action = fleet_commands.ACTIONS[arguments.action]
+    return await action(arguments, _urls(arguments), _state_folder())
+
+
 ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "init": _init,
     "serve": _serve,
     "drain": _drain,
     "status": _status,
     "lines": _lines,
+    **dict.fromkeys(fleet_commands.ACTIONS, _command),
 }

@@ -2,32 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from math import inf
 
-_until_ns: ContextVar[float] = ContextVar("multidrop time limit", default=inf)
+Limit = Callable[[], float]
+
+
+def _none() -> float:
+    return inf
+
+
+_limit: ContextVar[Limit] = ContextVar("multidrop time limit", default=_none)
 
 
 def present_limit_ns() -> float:
     """Return the time (CLOCK_MONOTONIC, ns) until which what is called now may be sent; inf without one."""
-    return _until_ns.get()
+    return _limit.get()()
 
 
 @contextmanager
-def written_before(until_ns: int) -> Iterator[None]:
-    """Write nothing of what is called within the block after this time of CLOCK_MONOTONIC, in ns.
+def written_before(limit: Limit) -> Iterator[None]:
+    """Write nothing of what is called within the block after the time that `limit` returns.
 
-    `time.monotonic_ns()` reads that clock. A write or a verb that is late is not sent, and raises Expired.
-    Time that its own reads and waits may take is not counted, as for a bus's own `expiry`; the shorter of the
-    two counts. Stops are sent whenever it is. It holds for this thread and what it calls, or this task of
-    asyncio and `asyncio.to_thread`. Raises TypeError for what is no whole number.
+    That is a time of CLOCK_MONOTONIC in ns, as `time.monotonic_ns()` has it; 0 is always past. It is asked
+    for as each call begins, when a stop that is called from then on ends that call: so whoever notes a stop,
+    and lets `limit` return 0 since, misses none. What is late is not sent, and raises Expired. Time that its
+    own reads and waits may take is not counted, as for a bus's own `expiry`; the earlier one counts. Stops
+    are sent whenever it is. It holds for this thread and what it calls, or this task of asyncio and
+    `asyncio.to_thread`. Raises TypeError for what is no function.
     """
-    if isinstance(until_ns, bool) or not isinstance(until_ns, int):
-        raise TypeError(f"until_ns = {until_ns!r} is no time of CLOCK_MONOTONIC: give time.monotonic_ns() + n")
-    token = _until_ns.set(min(_until_ns.get(), until_ns))
+    if not callable(limit):
+        raise TypeError(f"limit = {limit!r} is no function that returns a time of CLOCK_MONOTONIC in ns")
+    outer = _limit.get()
+    token = _limit.set(lambda: min(outer(), limit()))
     try:
         yield
     finally:
-        _until_ns.reset(token)
+        _limit.reset(token)

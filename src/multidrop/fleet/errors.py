@@ -11,6 +11,10 @@ class TooOld(FleetError):
     """A server that may give one lease to two gateways."""
 
 
+class NobodyThere(FleetError):
+    """A request that nobody takes: it was delivered to nobody, for certain."""
+
+
 class Unsure(FleetError):
     """A request without an answer in time: it may have been carried out, or still be."""
 

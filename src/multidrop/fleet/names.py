@@ -30,6 +30,16 @@ def command_subject(line: str) -> str:
     return f"cmd.{line}"
 
 
+def do_subject(gateway: str, run: str) -> str:
+    """Return the subject on which one run of a gateway's process is told to do what it has offered."""
+    return f"do.{gateway}.{run}"
+
+
+def stop_subject(line: str) -> str:
+    """Return the subject on which a line's master takes stops."""
+    return f"stop.{line}"
+
+
 def gateway_subject(gateway: str) -> str:
     """Return the subject on which a gateway takes requests about itself."""
     return f"gateway.{gateway}"

@@ -10,9 +10,10 @@ from typing import Any
 import nats
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
@@ -31,7 +32,9 @@ class ServerPath:
         self._options = options or {}
         self._client: Client | None = None
         self._leaving: set[asyncio.Task[None]] = set()
-        self._subscriptions: dict[str, Callable[[Msg], Any]] = {}
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
+        self._standing: dict[str, Subscription] = {}  # at the present server
+        self._changing = asyncio.Lock()
 
     @property
     def is_open(self) -> bool:
@@ -88,10 +91,11 @@ class ServerPath:
 
     async def _move(self, url: str) -> None:
         client = await connect(url, self._options)
-        for subject, called in self._subscriptions.items():
-            await client.subscribe(subject, cb=called)
-        self._leave()
-        self._client, self.url = client, url
+        async with self._changing:
+            standing: dict[str, Subscription] = {}
+            await self._bring(client, standing)
+            self._leave()
+            self._client, self.url, self._standing = client, url, standing
 
     def _leave(self) -> None:
         if self._client is not None:
@@ -102,9 +106,27 @@ class ServerPath:
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
         """Call a coroutine function with each message, wherever this path moves."""
-        self._subscriptions[subject] = called
-        if self._client is not None:
-            await self._client.subscribe(subject, cb=called)
+        self._wanted[subject] = called
+        await self._follow_wanted()
+
+    async def unsubscribe(self, subject: str) -> None:
+        """Take no more messages; nothing happens where none were taken."""
+        self._wanted.pop(subject, None)
+        await self._follow_wanted()
+
+    async def _follow_wanted(self) -> None:
+        async with self._changing:
+            if self._client is not None:
+                with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
+                    await self._bring(self._client, self._standing)
+
+    async def _bring(self, client: Client, standing: dict[str, Subscription]) -> None:
+        """Subscribe to all that is wanted there now, and to nothing else."""
+        while standing.keys() != self._wanted.keys():
+            for subject in self._wanted.keys() - standing.keys():
+                standing[subject] = await client.subscribe(subject, cb=self._wanted[subject])
+            for subject in standing.keys() - self._wanted.keys():
+                await standing.pop(subject).unsubscribe()
 
     async def request(
         self,
@@ -113,12 +135,15 @@ class ServerPath:
         headers: dict[str, str] | None = None,
         answer_s: float = ANSWER_S,
     ) -> Msg:
-        """Return the answer. Raises Unsure where none comes in time, FleetError where nobody was asked."""
+        """Return the answer. Raises Unsure where none comes in time, FleetError where nobody was asked.
+
+        That is NobodyThere where the server says so.
+        """
         client = self._connected()
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
-            raise FleetError(f"nobody answers {subject} at {self.url}") from None
+            raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
 
