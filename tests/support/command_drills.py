@@ -168,7 +168,7 @@ class CommandDrill:
     async def ask(self, commands: int, seconds: float, seed: int = 1, *, is_attacked: bool = True) -> Verdict:
         """Ask for so many commands in so many seconds, attack meanwhile, and judge."""
         dice = random.Random(seed)
-        await self._await_masters()
+        await self.await_masters()
         askers = [self._asker(drive, commands, seconds, dice.random()) for drive in self.sims]
         attack = asyncio.create_task(self._attack(random.Random(seed), is_attacked=is_attacked))
         try:
@@ -180,7 +180,8 @@ class CommandDrill:
         assert isinstance(deeds, Counter), deeds
         return self._judge(asked, deeds)
 
-    async def _await_masters(self) -> None:
+    async def await_masters(self) -> None:
+        """Wait until each line has a master that answers."""
         ends = time.monotonic() + PATIENCE_S
         async with FleetCommands(self.nats.urls, by="drill", log=self.folder / "ready.jsonl") as asker:
             for drive in self.sims:

@@ -188,13 +188,7 @@ class FleetCommands:
     async def _lines_of(self, drives: Sequence[str] | None, line: str) -> dict[str, list[str] | None]:
         if line:
             return {line: None if drives is None else list(drives)}
-        try:
-            await self._plant.look()
-        except FleetError as failure:
-            if not self._plant.records:
-                raise FleetError(
-                    f"the stop was NOT sent: the fleet's plant cannot be read ({failure}); {HARD_WIRED}"
-                ) from None
+        await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
         if drives is None:
             return dict.fromkeys(self._described())
         found: dict[str, list[str] | None] = {}
@@ -250,8 +244,16 @@ class FleetCommands:
         return found
 
     async def _line_of(self, drive: str) -> str:
-        await self._plant.look()
+        await self._read_plant("nothing was sent")
         return self._find(drive)
+
+    async def _read_plant(self, otherwise: str) -> None:
+        """Read what has changed of the plant; what was read before will do: the line's master knows more."""
+        try:
+            await self._plant.look()
+        except FleetError as failure:
+            if not self._plant.records:
+                raise FleetError(f"{otherwise}: the fleet's plant cannot be read: {failure}") from None
 
     def _find(self, drive: str) -> str:
         lines = self._described()
