@@ -55,6 +55,7 @@ CLIENTS = {  # rooms that use public names alone, and the commands that import t
     "gateway": {"cli/serve.py"},
     "fleet": {
         "cli/fleet.py",
+        "cli/fleet_commands.py",
         "cli/fleet_demo/command.py",
         "cli/fleet_rights.py",
         "cli/fleet_watch.py",

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from multidrop.cli import fleet_commands
 from multidrop.cli.fleet_rights import write_rights
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.extras import require_extra
@@ -54,10 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--key", metavar="FILE", type=Path, help="with rights: its key, there")
     parser.add_argument("--metrics", metavar="HOST:PORT", help="answer GET /metrics there, with serve")
+    fleet_commands.add_command_arguments(parser)
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    fleet_commands.check_words(arguments)
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
     if arguments.action == "demo":
@@ -237,6 +240,14 @@ async def _watch(arguments: argparse.Namespace) -> int:
     return await _with_paths(arguments, partial(watch, is_json=arguments.json))
 
 
+# ---- commands to drives ----
+
+
+async def _command(arguments: argparse.Namespace) -> int:
+    action = fleet_commands.ACTIONS[arguments.action]
+    return await action(arguments, _urls(arguments), _state_folder())
+
+
 ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "rights": _rights,
     "init": _init,
@@ -245,4 +256,5 @@ ACTIONS: dict[str, Callable[[argparse.Namespace], Any]] = {
     "status": _status,
     "lines": _lines,
     "watch": _watch,
+    **dict.fromkeys(fleet_commands.ACTIONS, _command),
 }

@@ -19,6 +19,10 @@ class NoRight(FleetError):
     """A request that these credentials do not allow: it was certainly not carried out."""
 
 
+class NobodyThere(FleetError):
+    """A request that nobody takes: it was delivered to nobody, for certain."""
+
+
 class Unsure(FleetError):
     """A request without an answer in time: it may have been carried out, or still be."""
 

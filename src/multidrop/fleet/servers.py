@@ -11,9 +11,10 @@ from typing import Any
 import nats
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, NotAdmitted, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
 
@@ -39,7 +40,9 @@ class ServerPath:
         self._denials = Denials()
         self._trouble = ""  # that was told
         self._leaving: set[asyncio.Task[None]] = set()
-        self._subscriptions: dict[str, Callable[[Msg], Any]] = {}
+        self._wanted: dict[str, Callable[[Msg], Any]] = {}  # by subject
+        self._standing: dict[str, Subscription] = {}  # at the present server
+        self._changing = asyncio.Lock()
 
     @property
     def is_open(self) -> bool:
@@ -105,10 +108,11 @@ class ServerPath:
     async def _move(self, url: str) -> None:
         denials = Denials()
         client = await connect(url, self._options, denials)
-        for subject, called in self._subscriptions.items():
-            await client.subscribe(subject, cb=called)
-        self._leave()
-        self._client, self.url, self._denials = client, url, denials
+        async with self._changing:
+            standing: dict[str, Subscription] = {}
+            await self._bring(client, standing)
+            self._leave()
+            self._client, self.url, self._standing, self._denials = client, url, standing, denials
 
     def _leave(self) -> None:
         if self._client is not None:
@@ -119,9 +123,27 @@ class ServerPath:
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
         """Call a coroutine function with each message, wherever this path moves."""
-        self._subscriptions[subject] = called
-        if self._client is not None:
-            await self._client.subscribe(subject, cb=called)
+        self._wanted[subject] = called
+        await self._follow_wanted()
+
+    async def unsubscribe(self, subject: str) -> None:
+        """Take no more messages; nothing happens where none were taken."""
+        self._wanted.pop(subject, None)
+        await self._follow_wanted()
+
+    async def _follow_wanted(self) -> None:
+        async with self._changing:
+            if self._client is not None:
+                with suppress(NatsError, OSError):  # it is left soon, and all is brought to the next server
+                    await self._bring(self._client, self._standing)
+
+    async def _bring(self, client: Client, standing: dict[str, Subscription]) -> None:
+        """Subscribe to all that is wanted there now, and to nothing else."""
+        while standing.keys() != self._wanted.keys():
+            for subject in self._wanted.keys() - standing.keys():
+                standing[subject] = await client.subscribe(subject, cb=self._wanted[subject])
+            for subject in standing.keys() - self._wanted.keys():
+                await standing.pop(subject).unsubscribe()
 
     async def check_subscription(self, subject: str) -> None:
         """Raise NoRight where these credentials do not allow to hear what was subscribed to."""
@@ -141,13 +163,13 @@ class ServerPath:
         """Return the answer.
 
         Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where nobody
-        was.
+        was, and that is NobodyThere where the server says so.
         """
         client = self._connected()
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
-            raise FleetError(f"nobody answers {subject} at {self.url}") from None
+            raise NobodyThere(f"nobody answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             self._denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"))
             raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
