@@ -23,7 +23,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _gathered() -> Iterator[None]:
-    """Gather it here, and not in the test of another room that is next; once a file, for it takes 70 ms."""
+    """Gather it here, and not in a file of another room that is next."""
     yield
     gc.collect()
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from examples import usually
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from peers import require_module
 
@@ -53,7 +54,9 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
-@pytest.mark.parametrize("words", [["init"], ["status"], ["lines"], ["drain", "gw-1"], ["serve", "gw-1"]])
+@pytest.mark.parametrize(
+    "words", usually(["status"], ["init"], ["lines"], ["drain", "gw-1"], ["serve", "gw-1"])
+)
 def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}" in said
