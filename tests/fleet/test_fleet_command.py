@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from commands import Run
+from examples import usually
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from peers import require_module
 
@@ -55,15 +56,15 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ["init"],
+    usually(
         ["status"],
+        ["stop", "pump-1"],
+        ["init"],
         ["lines"],
         ["drain", "gw-1"],
         ["serve", "gw-1"],
-        ["stop", "pump-1"],
         ["write", "pump-1", "frequency", "20", "--yes"],
-    ],
+    ),
 )
 def test_no_server(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
