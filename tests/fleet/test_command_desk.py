@@ -12,6 +12,8 @@ import pytest
 from command_desks import LINE, Desks, desks
 from peers import require_module
 
+from multidrop import read_audit
+
 require_module("nats")
 
 from multidrop.fleet.command_desk import MOST_WRITES  # noqa: E402
@@ -42,7 +44,7 @@ def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks) -> None:
+def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []  # an offer sends nothing
     answer = asyncio.run(desk.do(token))
@@ -52,6 +54,8 @@ def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks) 
     begun, over = desk.notes
     assert (begun["step"], begun["by"], begun["what"]) == ("begun", "anna", "pump: frequency = 20.00 Hz")
     assert (over["step"], over["outcome"], over["id"]) == ("over", "done", begun["id"])
+    [frame] = read_audit(tmp_path / "audit.jsonl")
+    assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
 def test_a_doubled_do_is_carried_out_once_and_gets_the_same_answer(desk: Desks) -> None:

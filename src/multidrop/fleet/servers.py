@@ -215,7 +215,15 @@ async def _close(client: Client) -> None:
 
 
 def _cut(client: Client) -> None:
-    """Close the socket: nats-py leaves it open where it is cancelled, or the server does not answer."""
+    """Close the socket, and end what hears messages.
+
+    nats-py leaves both where it is cancelled, or the server is gone; what became of its reading is not asked.
+    """
+    for subscription in client._subs.values():
+        subscription._stop_processing()
+    reading = client._reading_task
+    if reading is not None and reading.done() and not reading.cancelled():
+        reading.exception()
     writer = getattr(client._transport, "_io_writer", None)
     if writer is not None and writer.transport is not None:
         writer.transport.abort()
