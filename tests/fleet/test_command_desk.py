@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,26 @@ def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutc
     answer = asyncio.run(desk.do(token))
     assert answer.outcome is outcome
     assert len(setpoints(desk)) == (outcome is DONE)
+    assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
+
+
+def test_what_is_held_up_on_its_way_to_the_drive_is_not_sent(desk: Desks) -> None:
+    """The library has the rest of the second, and no more."""
+    token = desk.offered()
+    offer = desk.desk.offers.find(token)
+    assert offer is not None
+    work = offer.prepared.work
+
+    def held_up() -> CommandAnswer:
+        time.sleep(0.2)
+        return work()
+
+    offer.prepared = offer.prepared._replace(work=held_up)
+    desk.clock.pass_s(0.95)
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is NOT_SENT
+    assert "did not come within" in answer.text
+    assert desk.writes == []
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
