@@ -11,8 +11,12 @@ class TooOld(FleetError):
     """A server that may give one lease to two gateways."""
 
 
-class NobodyThere(FleetError):
-    """A request that nobody takes: it was delivered to nobody, for certain."""
+class NotDelivered(FleetError):
+    """A request that reached nobody, for certain."""
+
+
+class NobodyThere(NotDelivered):
+    """A request of which the server says that nobody takes it."""
 
 
 class Unsure(FleetError):

@@ -13,7 +13,7 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, NobodyThere, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 
 OLDEST = (2, 12)  # 2.9.10 grants one revision to several claimants (nats-server issue 4320)
@@ -135,9 +135,10 @@ class ServerPath:
         headers: dict[str, str] | None = None,
         answer_s: float = ANSWER_S,
     ) -> Msg:
-        """Return the answer. Raises Unsure where none comes in time, FleetError where nobody was asked.
+        """Return the answer.
 
-        That is NobodyThere where the server says so.
+        Raises Unsure where none comes in time, and NotDelivered where nobody was asked, for certain: that is
+        NobodyThere where the server says so.
         """
         client = self._connected()
         try:
@@ -169,7 +170,7 @@ class ServerPath:
 
     def _connected(self) -> Client:
         if self._client is None or not self._client.is_connected:
-            raise FleetError(f"no connection to {self.urls[0]}")
+            raise NotDelivered(f"no connection to {self.urls[0]}")
         return self._client
 
     async def close(self) -> None:
