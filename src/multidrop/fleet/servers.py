@@ -93,7 +93,11 @@ class ServerPath:
         client = await connect(url, self._options)
         async with self._changing:
             standing: dict[str, Subscription] = {}
-            await self._bring(client, standing)
+            try:
+                await self._bring(client, standing)
+            except (NatsError, OSError) as failure:
+                await _close(client)
+                raise FleetError(f"{url} was lost again at once: {failure}") from None
             self._leave()
             self._client, self.url, self._standing = client, url, standing
 
@@ -124,7 +128,8 @@ class ServerPath:
         """Subscribe to all that is wanted there now, and to nothing else."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
-                standing[subject] = await client.subscribe(subject, cb=self._wanted[subject])
+                if called := self._wanted.get(subject):  # it may be unwanted by now
+                    standing[subject] = await client.subscribe(subject, cb=called)
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()
 
