@@ -44,7 +44,7 @@ def main() -> int:
         ("told wrongly", found.wrongly),
         ("told unknown, and carried out", found.unknown_sent),
         ("carried out, and in no gateway's log", found.unnoted),
-        ("oldest when its drive had it, s since its offer was asked for", f"{found.oldest_s:.2f}"),
+        ("oldest when its drive had it, s since its offer came", f"{found.oldest_s:.2f}"),
     ]
     tables.show(("judged by the drives", ""), rows)
     return 1 if found.twice or found.wrongly or found.unnoted else 0

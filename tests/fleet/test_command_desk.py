@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import pytest
 from command_desks import LINE, Desks, desks
 from peers import require_module
+
+from multidrop import read_audit
 
 require_module("nats")
 
@@ -42,7 +45,7 @@ def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks) -> None:
+def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []  # an offer sends nothing
     answer = asyncio.run(desk.do(token))
@@ -52,6 +55,8 @@ def test_a_command_is_offered_then_done_and_noted_before_and_after(desk: Desks) 
     begun, over = desk.notes
     assert (begun["step"], begun["by"], begun["what"]) == ("begun", "anna", "pump: frequency = 20.00 Hz")
     assert (over["step"], over["outcome"], over["id"]) == ("over", "done", begun["id"])
+    [frame] = read_audit(tmp_path / "audit.jsonl")
+    assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
 def test_a_doubled_do_is_carried_out_once_and_gets_the_same_answer(desk: Desks) -> None:
@@ -80,6 +85,26 @@ def test_a_late_do_is_not_sent(desk: Desks, seconds: float, outcome: CommandOutc
     answer = asyncio.run(desk.do(token))
     assert answer.outcome is outcome
     assert len(setpoints(desk)) == (outcome is DONE)
+    assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
+
+
+def test_what_is_held_up_on_its_way_to_the_drive_is_not_sent(desk: Desks) -> None:
+    """The library has the rest of the second, and no more."""
+    token = desk.offered()
+    offer = desk.desk.offers.find(token)
+    assert offer is not None
+    work = offer.prepared.work
+
+    def held_up() -> CommandAnswer:
+        time.sleep(0.2)
+        return work()
+
+    offer.prepared = offer.prepared._replace(work=held_up)
+    desk.clock.pass_s(0.95)
+    answer = asyncio.run(desk.do(token))
+    assert answer.outcome is NOT_SENT
+    assert "did not come within" in answer.text
+    assert desk.writes == []
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import asyncio
 import importlib.util
 import json
 from collections.abc import Callable
@@ -188,3 +190,28 @@ def test_what_is_made_and_shown(run: Run, nats: Cluster, tmp_path: Path) -> None
     assert "1 lines, 1 without a master" in out
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
+
+
+def test_an_interruption_says_what_it_leaves_open(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from multidrop.cli import fleet_commands
+
+    class Endless:
+        async def __aenter__(self) -> Endless:
+            return self
+
+        async def __aexit__(self, *error: object) -> None:
+            """Nothing was opened."""
+
+        async def stop(self, *what: object, **more: object) -> None:
+            task = asyncio.current_task()
+            assert task is not None
+            task.cancel()  # as Ctrl-C does
+            await asyncio.sleep(60)
+
+    monkeypatch.setattr(fleet_commands, "_asker", lambda *given: Endless())
+    arguments = argparse.Namespace(what="pump-1", words=[], all=False, line=None, json=False)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(fleet_commands._stop(arguments, [], Path()))  # type: ignore[arg-type]
+    assert "the stop of pump-1: it is not known whether it was sent" in capsys.readouterr().err

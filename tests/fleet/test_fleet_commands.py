@@ -18,7 +18,7 @@ from multidrop.fleet import fleet_commands as asker_module  # noqa: E402
 from multidrop.fleet.buckets import Record  # noqa: E402
 from multidrop.fleet.command_log import read_command_log  # noqa: E402
 from multidrop.fleet.command_words import CommandAnswer, CommandOutcome  # noqa: E402
-from multidrop.fleet.errors import FleetError, NobodyThere, Unsure  # noqa: E402
+from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure  # noqa: E402
 from multidrop.fleet.fleet_commands import FleetCommands  # noqa: E402
 
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
@@ -103,7 +103,8 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
     return asker.write("pump-1", "frequency", 20.0)
 
 
-NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), FleetError("no connection")
+NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
+ANY = FleetError("no right")  # which does not say that nobody was asked
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
 WRITES: dict[
@@ -129,6 +130,9 @@ WRITES: dict[
         1,
     ),
     "the master dies at it": (ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[NOBODY]), UNKNOWN, 1),
+    "any other failure": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY, IT_IS_DONE]), DONE, 1),
+    "any other failure of all": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY]), UNKNOWN, 1),
+    "no right to ask": (ScriptedPath(cmd=[ANY]), NOT_SENT, 0),
     "all is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST]), UNKNOWN, 1),
     "an answer of nobody's": (ScriptedPath(cmd=[OFFER], do=[b"[]"], ask=[IT_IS_DONE]), DONE, 1),
 }
@@ -161,7 +165,7 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
     "no server": (
         ScriptedPath(stop=[CUT]),
         NOT_SENT,
-        "the stop of pump-1 was NOT sent: no NATS server is reached; use the hard-wired stop",
+        "the stop of pump-1 was NOT sent: no connection; use the hard-wired stop",
     ),
     "an answer that is lost": (ScriptedPath(stop=[LOST, IT_IS_DONE]), DONE, "as it is"),
     "a master that dies, and the next one": (
@@ -175,6 +179,7 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
         "it is not known whether the stop of pump-1 was sent: its gateway gives no answer any more; "
         "use the hard-wired stop",
     ),
+    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "it is not known whether the stop"),
     "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "it is not known whether the stop"),
 }
 

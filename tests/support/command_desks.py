@@ -96,7 +96,8 @@ class Desks:
 @contextmanager
 def desks(folder: Path, may: Mapping[str, Any] = MAY) -> Iterator[Desks]:
     sim = simulated(YD1000(address=1, name="pump"))
-    with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path) as bus:
+    audit = folder / "audit.jsonl"
+    with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path, audit=audit) as bus:
         bus.attach(YD1000(address=1, name="pump"))
         made = Desks(bus, sim, folder, may)
         try:

@@ -43,7 +43,7 @@ class Asked(NamedTuple):
     drive: str
     raw: int | None
     way: str
-    offered_s: float  # monotonic, before the offer was asked for
+    offered_s: float  # monotonic, when the offer came
     told: CommandOutcome
     sent: int  # how often its drive got it
 
@@ -58,7 +58,7 @@ class Verdict(NamedTuple):
     wrongly: int
     unknown_sent: int
     unnoted: int  # carried out, and not in a gateway's log
-    oldest_s: float  # from before the offer until the drive had it
+    oldest_s: float  # from when the offer came until the drive had the write
 
 
 class RoughCommands(FleetCommands):
@@ -67,13 +67,13 @@ class RoughCommands(FleetCommands):
     def __init__(self, urls: Sequence[str], log: Path, dice: random.Random) -> None:
         super().__init__(urls, by="drill", log=log)
         self._dice = dice
-        self.ways: dict[str, str] = {}  # by token
         self.way = "plain"
+        self.offered_s = 0.0
         self._copies: set[asyncio.Task[None]] = set()
 
     async def _do(self, offered: Offered) -> CommandAnswer:
         way = self._dice.choices(("plain", "doubled", "doubled later", "late"), (6, 2, 1, 1))[0]
-        self.way = way
+        self.way, self.offered_s = way, time.monotonic()
         if way == "late":
             await asyncio.sleep(self._dice.uniform(0.8, 1.6))
         if way == "doubled":
@@ -199,21 +199,20 @@ class CommandDrill:
         found = []
         async with RoughCommands(self.nats.urls, self.folder / f"{drive}.asked.jsonl", dice) as asker:
             for raw in range(1, number + 1):
-                begun = time.monotonic()
                 if raw % STOP_EVERY == 0:
-                    found.append(await self._stop(asker, drive, begun))
+                    found.append(await self._stop(asker, drive))
                 else:
                     asker.way = "no offer"
                     answer = await asker.write(drive, "frequency", raw / 100)
-                    found.append(Asked(drive, raw, asker.way, begun, answer.outcome, 0))
+                    found.append(Asked(drive, raw, asker.way, asker.offered_s, answer.outcome, 0))
                 await asyncio.sleep(dice.uniform(0, 2 * seconds / number))
             await asker.settle()
         return found
 
-    async def _stop(self, asker: FleetCommands, drive: str, begun: float) -> Asked:
+    async def _stop(self, asker: FleetCommands, drive: str) -> Asked:
         before = self.stops(drive)
         answer = await asker.stop([drive])
-        return Asked(drive, None, "stop", begun, answer.outcome, self.stops(drive) - before)
+        return Asked(drive, None, "stop", 0.0, answer.outcome, self.stops(drive) - before)
 
     def _judge(self, asked: Sequence[Asked], deeds: Counter[str]) -> Verdict:
         seen = {drive: self.setpoints(drive) for drive in self.sims}

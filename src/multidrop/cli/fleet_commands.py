@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import getpass
 import json
 import os
 import socket
 import sys
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.confirm import confirm
 from multidrop.cli.support.nats import nats_options
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_text, warn
 
 if TYPE_CHECKING:
     from multidrop.fleet.command_words import CommandAnswer
@@ -110,7 +111,9 @@ async def _command(
         agreed = preview.text
         confirm(f"{agreed}; gateway {preview.gateway} is to do it?", arguments)
     async with _asker(arguments, urls, folder) as asker:
-        return _show(arguments, await asker.carry_out(asker.request(drive, **what), agreed))
+        request = asker.request(drive, **what)
+        with _annotating(request.words):
+            return _show(arguments, await asker.carry_out(request, agreed))
 
 
 async def _stop(arguments: argparse.Namespace, urls: Sequence[str], folder: Path) -> int:
@@ -118,7 +121,18 @@ async def _stop(arguments: argparse.Namespace, urls: Sequence[str], folder: Path
     if bool(drives) == arguments.all:
         raise ValueError("stop takes either drives or --all: `multidrop fleet stop pump-1`")
     async with _asker(arguments, urls, folder) as asker:
-        return _show(arguments, await asker.stop(drives or None, line=arguments.line or ""))
+        with _annotating(f"the stop of {', '.join(drives) or 'all drives'}"):
+            return _show(arguments, await asker.stop(drives or None, line=arguments.line or ""))
+
+
+@contextmanager
+def _annotating(what: str) -> Iterator[None]:
+    """Say what an interruption leaves open: Ctrl-C cancels what waits for the answer."""
+    try:
+        yield
+    except asyncio.CancelledError:
+        warn(f"{what}: it is not known whether it was sent; look at the drive, and at the gateway's log")
+        raise
 
 
 def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:

@@ -13,6 +13,8 @@ from typing import Any
 
 from multidrop import read_audit
 
+_sync = getattr(os, "fdatasync", os.fsync)  # an asker may be on a system without it
+
 
 class CommandLog:
     """The log in this file, which only grows. Raises OSError where it cannot be opened.
@@ -44,7 +46,7 @@ class CommandLog:
         whole = (b"\n" if self._is_truncated() else b"") + line.encode() + b"\n"
         if self._file.write(whole) < len(whole):
             raise OSError(f"{self.path}: there was room for a part of a record only")
-        os.fdatasync(self._file.fileno())
+        _sync(self._file.fileno())
 
     def _is_truncated(self) -> bool:
         if self._file.seek(0, os.SEEK_END) == 0:

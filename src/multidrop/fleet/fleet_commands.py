@@ -25,7 +25,7 @@ from multidrop.fleet.command_words import (
     read_offer,
     worst,
 )
-from multidrop.fleet.errors import FleetError, NobodyThere, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, NotDelivered, Unsure
 from multidrop.fleet.servers import ServerPath, paths_of
 from multidrop.fleet.setup import open_all
 
@@ -121,7 +121,7 @@ class FleetCommands:
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
         """Ask on one path after another; an offer alone does nothing, so this may be asked again."""
-        why = "no NATS server is reached"
+        why = ""
         for path in self._paths:
             try:
                 message = await path.request(names.command_subject(line), encode(request))
@@ -130,8 +130,8 @@ class FleetCommands:
                 why = f"no gateway is master of line {line} now"
             except Unsure:
                 why = f"the master of line {line} gives no answer"
-            except FleetError:
-                continue
+            except FleetError as failure:
+                why = why or str(failure)
             except ValueError as mistake:
                 why = f"a gateway of line {line} answers no words of ours: {mistake}"
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
@@ -142,11 +142,11 @@ class FleetCommands:
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
             answer = read_answer(message.data)
-        except (Unsure, ValueError):
-            answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
-        except FleetError:  # nobody was told
+        except NotDelivered:
             why = f"{offered.text} was not sent: {offered.gateway} is gone since its offer"
             return CommandAnswer(CommandOutcome.NOT_SENT, why)
+        except (FleetError, ValueError):  # it may have been told
+            answer = CommandAnswer(CommandOutcome.UNDER_WAY, "")
         asked = json.dumps({"ask": offered.token}).encode()
         lost = (
             f"{offered.text}: it is not known whether it was sent: {offered.gateway} gives no answer any more"
@@ -163,9 +163,9 @@ class FleetCommands:
                 message = await self._paths[at % len(self._paths)].request(subject, asked)
                 answer = read_answer(message.data)
                 ends = loop.time() + LOST_S
-            except (FleetError, ValueError):
+            except (FleetError, ValueError) as failure:
                 if loop.time() > ends:
-                    return CommandAnswer(CommandOutcome.UNKNOWN, lost)
+                    return CommandAnswer(CommandOutcome.UNKNOWN, f"{lost} ({failure})")
                 await asyncio.sleep(AGAIN_S)
         return answer
 
@@ -213,17 +213,17 @@ class FleetCommands:
 
     async def _first_of_stop(self, line: str, request: StopRequest, what: str) -> CommandAnswer:
         """Return the first answer; at once where no gateway is the line's master, which is certain."""
-        why, is_certain = "no NATS server is reached", True
+        why, is_certain = "", True
         for path in self._paths:
             try:
                 message = await path.request(names.stop_subject(line), encode(request))
                 return read_answer(message.data)
             except NobodyThere:
                 why = f"no gateway is master of line {line}"
-            except (Unsure, ValueError):
+            except NotDelivered as failure:
+                why = why or str(failure)
+            except (FleetError, ValueError):
                 is_certain = False
-            except FleetError:
-                continue
         if is_certain:
             return CommandAnswer(CommandOutcome.NOT_SENT, f"{what} was NOT sent: {why}; {HARD_WIRED}")
         return CommandAnswer(CommandOutcome.UNDER_WAY, "")

@@ -14,7 +14,7 @@ from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
-from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, TooOld, Unsure
+from multidrop.fleet.errors import FleetError, NobodyThere, NotAdmitted, NotDelivered, TooOld, Unsure
 from multidrop.fleet.lease_rules import PATHS
 from multidrop.fleet.refusals import Denials, failure_to_connect
 
@@ -110,7 +110,11 @@ class ServerPath:
         client = await connect(url, self._options, denials)
         async with self._changing:
             standing: dict[str, Subscription] = {}
-            await self._bring(client, standing)
+            try:
+                await self._bring(client, standing)
+            except (NatsError, OSError) as failure:
+                await _close(client)
+                raise FleetError(f"{url} was lost again at once: {failure}") from None
             self._leave()
             self._client, self.url, self._standing, self._denials = client, url, standing, denials
 
@@ -141,7 +145,8 @@ class ServerPath:
         """Subscribe to all that is wanted there now, and to nothing else."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
-                standing[subject] = await client.subscribe(subject, cb=self._wanted[subject])
+                if called := self._wanted.get(subject):  # it may be unwanted by now
+                    standing[subject] = await client.subscribe(subject, cb=called)
             for subject in standing.keys() - self._wanted.keys():
                 await standing.pop(subject).unsubscribe()
 
@@ -162,8 +167,8 @@ class ServerPath:
     ) -> Msg:
         """Return the answer.
 
-        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where nobody
-        was, and that is NobodyThere where the server says so.
+        Raises Unsure where none comes in time, NoRight where it may not be asked or heard, and NotDelivered
+        where nobody was asked, for certain: that is NobodyThere where the server says so.
         """
         client = self._connected()
         try:
@@ -197,7 +202,7 @@ class ServerPath:
 
     def _connected(self) -> Client:
         if self._client is None or not self._client.is_connected:
-            raise FleetError(f"no connection to {self.urls[0]}")
+            raise NotDelivered(f"no connection to {self.urls[0]}")
         return self._client
 
     async def close(self) -> None:
@@ -245,7 +250,15 @@ async def _close(client: Client) -> None:
 
 
 def _cut(client: Client) -> None:
-    """Close the socket: nats-py leaves it open where it is cancelled, or the server does not answer."""
+    """Close the socket, and end what hears messages.
+
+    nats-py leaves both where it is cancelled, or the server is gone; what became of its reading is not asked.
+    """
+    for subscription in client._subs.values():
+        subscription._stop_processing()
+    reading = client._reading_task
+    if reading is not None and reading.done() and not reading.cancelled():
+        reading.exception()
     writer = getattr(client._transport, "_io_writer", None)
     if writer is not None and writer.transport is not None:
         writer.transport.abort()
