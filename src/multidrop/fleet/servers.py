@@ -140,7 +140,7 @@ class ServerPath:
     ) -> Msg:
         """Return the answer.
 
-        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where nobody was.
+        Raises Unsure where none comes in time, NoRight where it may not be asked, FleetError where none was.
         """
         client = self._connected()
         try:
